@@ -1,0 +1,1 @@
+"""How good a trajectory or a map is, against a reference."""

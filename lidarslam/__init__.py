@@ -1,0 +1,1 @@
+"""The application: recordings in, trajectories and maps out."""

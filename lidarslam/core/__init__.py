@@ -1,0 +1,1 @@
+"""The vocabulary every other package speaks: geometry, scans, trajectories, errors."""

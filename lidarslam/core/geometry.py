@@ -1,0 +1,121 @@
+"""Rigid motions SE(3) as float64 matrices of shape (..., 4, 4).
+
+Free functions, no mutation, broadcasting over leading dimensions. A tangent vector is `(rotation vector, translation
+part)`, rotation first, as GTSAM orders it: `xi = (omega, v)`, shape (..., 6).
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+# Below this angle the closed forms lose digits to cancellation and their Taylor series are exact to rounding.
+_SMALL_ANGLE = 1e-4
+
+
+def make_transform(R: ArrayLike, t: ArrayLike) -> FloatArray:
+    """Assemble rotations (..., 3, 3) and translations (..., 3) into transforms (..., 4, 4)."""
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def inverse(T: FloatArray) -> FloatArray:
+    """Invert rigid transforms (..., 4, 4): `inverse(T_a_b)` is `T_b_a`."""
+    R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
+    return make_transform(R_inv, -(R_inv @ T[..., :3, 3:4])[..., 0])
+
+
+def transform_points(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
+    """Take points (..., N, 3) from frame b to frame a."""
+    return points_b @ np.swapaxes(T_a_b[..., :3, :3], -1, -2) + T_a_b[..., None, :3, 3]
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): `skew(v) @ w == cross(v, w)`."""
+    K = np.zeros((*v.shape[:-1], 3, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return K
+
+
+def rotation_angle(T: FloatArray) -> FloatArray:
+    """Angle in [0, pi], radians, of rotations or transforms (..., >=3, >=3).
+
+    Computed as atan2(|vee(R - R^T)|, trace(R) - 1), which keeps its digits at both ends, unlike arccos of the trace.
+    """
+    R = T[..., :3, :3]
+    sine = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    cosine = np.trace(R, axis1=-2, axis2=-1) - 1.0
+    return np.asarray(np.arctan2(np.linalg.norm(sine, axis=-1), cosine), dtype=np.float64)
+
+
+def _series(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3, finite at zero."""
+    small = angle < _SMALL_ANGLE
+    a = np.where(small, 1.0, angle)
+    a2 = angle**2
+    sin_a, half = np.sin(a), np.sin(0.5 * a)
+    return (
+        np.where(small, 1.0 - a2 / 6.0, sin_a / a),
+        np.where(small, 0.5 - a2 / 24.0, 2.0 * half * half / a**2),
+        np.where(small, 1.0 / 6.0 - a2 / 120.0, (a - sin_a) / a**3),
+    )
+
+
+def exp(xi: ArrayLike) -> FloatArray:
+    """SE(3) exponential of tangent vectors (..., 6), rotation first (Rodrigues' formula and the left Jacobian)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    omega, v = xi[..., :3], xi[..., 3:]
+    K = skew(omega)
+    K2 = K @ K
+    s, c, j = (x[..., None, None] for x in _series(np.linalg.norm(omega, axis=-1)))
+    identity = np.eye(3)
+    V = identity + c * K + j * K2
+    return make_transform(identity + s * K + c * K2, (V @ v[..., None])[..., 0])
+
+
+def log(T: FloatArray) -> FloatArray:
+    """SE(3) logarithm (..., 6) of transforms (..., 4, 4), rotation first; the inverse of `exp` for angles below pi."""
+    flat = T.reshape(-1, 4, 4)  # SciPy goes through quaternions, which stay accurate close to pi
+    omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec().reshape(*T.shape[:-2], 3)
+    angle = np.linalg.norm(omega, axis=-1)
+    s, c, _ = _series(angle)
+    small = angle < _SMALL_ANGLE
+    a2 = np.where(small, 1.0, angle**2)
+    coefficient = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - s / (2.0 * c)) / a2)
+    K = skew(omega)
+    V_inv = np.eye(3) - 0.5 * K + coefficient[..., None, None] * (K @ K)
+    return np.concatenate([omega, (V_inv @ T[..., :3, 3:4])[..., 0]], axis=-1)
+
+
+def interpolate(T_w_a: FloatArray, T_w_b: FloatArray, fraction: ArrayLike) -> FloatArray:
+    """Move from `T_w_a` (fraction 0) to `T_w_b` (fraction 1) at constant body velocity; other fractions extrapolate.
+
+    Transforms (..., 4, 4), fractions (...), all broadcast together.
+    """
+    fraction = np.asarray(fraction, dtype=np.float64)
+    return T_w_a @ exp(fraction[..., None] * log(inverse(T_w_a) @ T_w_b))
+
+
+def is_rigid(T: FloatArray, tolerance: float = 1e-5) -> bool:
+    """Whether every (4, 4) of the array is finite, orthonormal, right-handed and has the bottom row 0 0 0 1."""
+    R = T[..., :3, :3]
+    return bool(
+        np.isfinite(T).all()
+        and np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0) < tolerance
+        and (np.linalg.det(R) > 0.0).all()
+        and np.abs(T[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) < tolerance
+    )
+
+
+def orthonormalize(T: FloatArray) -> FloatArray:
+    """The nearest rigid transforms to (..., 4, 4): the rotation part projected by SVD, as text files round it."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    U = np.array(U)
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return make_transform(U @ Vt, T[..., :3, 3])

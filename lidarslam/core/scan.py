@@ -1,0 +1,106 @@
+"""One sweep of a LiDAR, and what a recording of sweeps can do."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+
+# No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
+_MAX_RANGE_M = 10_000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One sweep, in the LiDAR frame (x forward, z up).
+
+    Attributes:
+        points: (N, 3) float64, metres, finite, none at the origin.
+        stamp: seconds; the instant the scan's pose belongs to.
+        time_offsets: (N,) float64, seconds from the stamp at which each point was measured; None when unknown or
+            when the points are already motion compensated to the stamp.
+        rings: (N,) int32, the laser each point came from; None when unknown.
+        dropped: how many points of the raw sweep were left out as invalid.
+    """
+
+    points: FloatArray
+    stamp: float
+    time_offsets: FloatArray | None = None
+    rings: NDArray[np.int32] | None = None
+    dropped: int = 0
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(f"Scan.points must be (N, 3), got {self.points.shape}")
+        for name, values in (("time_offsets", self.time_offsets), ("rings", self.rings)):
+            if values is not None and values.shape != (len(self.points),):
+                raise ValueError(f"Scan.{name} must be ({len(self.points)},), got {values.shape}")
+        if not np.isfinite(self.stamp):
+            raise ValueError(f"Scan.stamp must be finite, got {self.stamp}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def from_raw(
+        cls,
+        points: ArrayLike,
+        stamp: float,
+        time_offsets: ArrayLike | None = None,
+        rings: ArrayLike | None = None,
+    ) -> Self:
+        """Make a scan of what a driver delivers, leaving out invalid points together with their times and rings.
+
+        Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
+        the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite.
+        """
+        xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        offsets = None if time_offsets is None else np.asarray(time_offsets, dtype=np.float64).reshape(-1)
+        lasers = None if rings is None else np.asarray(rings).astype(np.int32).reshape(-1)
+        for name, values in (("time_offsets", offsets), ("rings", lasers)):
+            if values is not None and len(values) != len(xyz):
+                raise ValueError(f"{name} has {len(values)} entries for {len(xyz)} points")
+        # NaN and infinity fail the comparisons too, so one pass finds every invalid point.
+        largest = np.abs(xyz).max(axis=1, initial=0.0)
+        valid = (largest > 0.0) & (largest < _MAX_RANGE_M)
+        if offsets is not None:
+            valid &= np.isfinite(offsets)
+        dropped = int(len(xyz) - np.count_nonzero(valid))
+        if dropped:
+            xyz = xyz[valid]
+            offsets = None if offsets is None else offsets[valid]
+            lasers = None if lasers is None else lasers[valid]
+        return cls(xyz, float(stamp), offsets, lasers, dropped)
+
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":
+        """The scan with only the chosen points (a mask or indices), times and rings in step."""
+        return Scan(
+            self.points[chosen],
+            self.stamp,
+            None if self.time_offsets is None else self.time_offsets[chosen],
+            None if self.rings is None else self.rings[chosen],
+            self.dropped,
+        )
+
+
+class ScanSequence(Protocol):
+    """One recording: scans in the order of time, streamed, so that memory does not grow with its length."""
+
+    @property
+    def name(self) -> str:
+        """A short name for tables and windows."""
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at the truth's own stamps (the world is the truth's); None when the recording has none."""
+
+    def __len__(self) -> int:
+        """How many scans the recording holds."""
+
+    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`; the ones between are not decoded."""

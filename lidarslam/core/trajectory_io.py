@@ -1,0 +1,94 @@
+"""TUM and KITTI text files <-> trajectories; the only file that knows a quaternion's order.
+
+TUM: `stamp tx ty tz qx qy qz qw`, a pose a line, `#` comments. KITTI: twelve numbers a line, the first three rows
+of the pose matrix, no stamps.
+"""
+
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
+from lidarslam.core.trajectory import Trajectory
+
+
+def parse_numbers(path: Path, columns: int) -> FloatArray:
+    """The (N, columns) numbers of a text file; commas count as blanks.
+
+    Raises:
+        InputError: the file is missing, is not text, or a line does not hold that many numbers.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from error
+    rows = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#", 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            raise InputError(f"{path}:{number}: expected {columns} numbers, got {line.strip()[:60]!r}") from None
+        if len(row) != columns:
+            raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}")
+        rows.append(row)
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file; lines may stand in any order, of equal stamps the first is kept.
+
+    Raises:
+        InputError: the file is missing or a line is not a pose.
+    """
+    table = parse_numbers(path, columns=8)
+    if not len(table):
+        raise InputError(f"{path}: holds no pose; expected lines `stamp tx ty tz qx qy qz qw`")
+    norms = np.linalg.norm(table[:, 4:], axis=1)
+    if not np.isfinite(table).all() or (np.abs(norms - 1.0) > 0.05).any():
+        raise InputError(f"{path}: holds numbers that are no poses; expected `stamp tx ty tz qx qy qz qw`")
+    _, first = np.unique(table[:, 0], return_index=True)
+    table = table[first]
+    R = Rotation.from_quat(table[:, 4:]).as_matrix()
+    return Trajectory(table[:, 0], make_transform(R, table[:, 1:4]))
+
+
+def format_tum(trajectory: Trajectory) -> str:
+    """The trajectory as TUM text, nine decimals, quaternions with qw >= 0."""
+    quaternions = Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_quat(canonical=True)
+    table = np.column_stack([trajectory.stamps, trajectory.positions, quaternions])
+    out = StringIO()
+    np.savetxt(out, table, fmt="%.9f")
+    return out.getvalue()
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a TUM file."""
+    path.write_text(format_tum(trajectory), encoding="utf-8")
+
+
+def read_kitti_poses(path: Path) -> FloatArray:
+    """Read the poses (N, 4, 4) of a KITTI file, in whatever frame it holds them.
+
+    Raises:
+        InputError: the file is missing or a line is not a pose.
+    """
+    rows = parse_numbers(path, columns=12).reshape(-1, 3, 4)
+    if not len(rows):
+        raise InputError(f"{path}: holds no pose; expected twelve numbers a line")
+    T = make_transform(rows[:, :, :3], rows[:, :, 3])
+    if not np.isfinite(T).all() or (np.abs(np.linalg.det(T[:, :3, :3]) - 1.0) > 1e-2).any():
+        raise InputError(f"{path}: holds rows that are no poses; expected the first three rows of a rigid transform")
+    return orthonormalize(T)
+
+
+def format_kitti(poses: FloatArray) -> str:
+    """Poses (N, 4, 4) as KITTI text."""
+    out = StringIO()
+    np.savetxt(out, poses[:, :3].reshape(-1, 12), fmt="%.9e")
+    return out.getvalue()

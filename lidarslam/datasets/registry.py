@@ -1,0 +1,92 @@
+"""Which readers there are, and which one reads a given source; a reader's module is imported when it is used."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.recording import Recording
+
+SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One row of the table.
+
+    Attributes:
+        module: has `open_recording(source: Path, config: ReaderConfig) -> Recording`.
+        reads: the layout, in words.
+        recognises: a look at names only, no file is opened.
+    """
+
+    module: str
+    reads: str
+    recognises: Callable[[Path], bool]
+
+
+def _is_kitti_odometry(source: Path) -> bool:
+    return (source / "sequences").is_dir() or ((source / "velodyne").is_dir() and (source / "calib.txt").is_file())
+
+
+def _is_kitti_raw(source: Path) -> bool:
+    return (source / "velodyne_points" / "data").is_dir()
+
+
+def _is_rosbag(source: Path) -> bool:
+    if source.is_dir():
+        return (source / "metadata.yaml").is_file()
+    return source.suffix in (".bag", ".db3", ".mcap")
+
+
+def _is_scan_folder(source: Path) -> bool:
+    return source.is_dir() and any(entry.suffix.lower() in SCAN_SUFFIXES for entry in source.iterdir())
+
+
+READERS: dict[str, Reader] = {
+    "kitti-odometry": Reader(
+        "lidarslam.datasets.kitti_odometry",
+        "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
+        _is_kitti_odometry,
+    ),
+    "kitti-raw": Reader(
+        "lidarslam.datasets.kitti_raw", "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder", _is_kitti_raw
+    ),
+    "rosbag": Reader("lidarslam.datasets.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "scan-folder": Reader(
+        "lidarslam.datasets.scan_folder", "a folder of .bin, .pcd, .ply or .npy scans", _is_scan_folder
+    ),
+}
+
+
+def choose_reader(source: Path, name: str | None = None) -> str:
+    """The name of the reader for a source: the given one, else the first in the table that recognises it.
+
+    Raises:
+        InputError: no such source, no such reader, or no reader recognises the source.
+    """
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder")
+    if name is not None:
+        if name not in READERS:
+            raise InputError(f"no reader is called {name!r}; there are: {', '.join(READERS)}")
+        return name
+    for candidate, reader in READERS.items():
+        if reader.recognises(source):
+            return candidate
+    layouts = "; ".join(reader.reads for reader in READERS.values())
+    raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
+
+
+def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
+    """Open a recording; scans are read later, one at a time.
+
+    Raises:
+        InputError: the source cannot be read by the chosen reader.
+    """
+    config = config or ReaderConfig()
+    module = import_module(READERS[choose_reader(source, config.name)].module)
+    return cast(Recording, module.open_recording(source, config))

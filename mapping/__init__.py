@@ -1,0 +1,1 @@
+"""From motions to maps: deskewing, the global map, and what corrects both."""

@@ -1,0 +1,1 @@
+"""Scan-to-scan motion: every method behind one protocol."""
