@@ -1,0 +1,187 @@
+"""The command line: every command parses, imports what it needs, calls one function, and says what came of it."""
+
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.core.errors import LidarSlamError
+
+EXIT_MENDABLE = 1
+EXIT_LOST = 3
+
+
+class _Command(click.Command):
+    """Keeps the line breaks of the examples in its help."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        if self.epilog:
+            formatter.write_paragraph()
+            with formatter.section("Example"):
+                for line in self.epilog.strip().splitlines():
+                    formatter.write(f"{'':>{formatter.current_indent}}{line.strip()}\n")
+
+
+class _Group(click.Group):
+    """Turns what the user can mend into one line on standard error and exit status 1."""
+
+    command_class = _Command
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except LidarSlamError as error:
+            click.echo(f"lidarslam: {error}", err=True)
+            ctx.exit(EXIT_MENDABLE)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="lidarslam", message="%(prog)s %(version)s")
+@click.option("-v", "--verbose", is_flag=True, help="Say more about what is going on.")
+def main(verbose: bool) -> None:
+    """Trajectories and maps from recorded LiDAR runs, and how good they are."""
+    level = logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="lidarslam: %(message)s", stream=sys.stderr)
+
+
+_PATH = click.Path(path_type=Path)
+_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+_SOURCE = click.argument("source", type=_PATH)
+_Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def _options(*decorators: _Decorator) -> _Decorator:
+    def apply(function: Callable[..., Any]) -> Callable[..., Any]:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return apply
+
+
+_config_options = _options(
+    click.option("--config", "config_file", type=_FILE, help="YAML file with whatever differs from the defaults."),
+    click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One value; may be repeated."),
+)
+_reader_options = _options(
+    click.option("--reader", metavar="NAME", help="Reader to use instead of the one that recognises the source."),
+    click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag that holds several."),
+    click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
+)
+
+
+def _resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
+    """The configuration, with the options that have a name of their own applied last."""
+    from lidarslam.config import load_config
+
+    named = [f"reader.{key}={_quoted(value)}" for key, value in reader.items() if value is not None]
+    return load_config(config_file, [*settings, *named])
+
+
+def _quoted(value: str) -> str:
+    """As YAML text, so that sequence 04 stays 04."""
+    return "'" + value.replace("'", "''") + "'"
+
+
+@main.command(epilog="lidarslam info recordings/2011_09_26_drive_0005_sync")
+@_SOURCE
+@_reader_options
+@_config_options
+def info(
+    source: Path,
+    reader: str | None,
+    topic: str | None,
+    sequence: str | None,
+    config_file: Path | None,
+    settings: tuple[str, ...],
+) -> None:
+    """Say what a recording holds, and what was inferred about it."""
+    from lidarslam.datasets.registry import open_recording
+    from lidarslam.info import format_info
+
+    config = _resolve(config_file, settings, name=reader, topic=topic, sequence=sequence)
+    click.echo(format_info(source, open_recording(source, config.reader).describe()))
+
+
+@main.command(
+    epilog="""lidarslam run KITTI --sequence 04 --out runs/04
+    lidarslam run office.mcap --out runs/office --rerun save
+    lidarslam run office.mcap --out runs/wheels --prior wheel_odometry.tum"""
+)
+@_SOURCE
+@click.option("--out", type=_PATH, required=True, metavar="RUN", help="Directory that the results are written to.")
+@click.option(
+    "--odometry",
+    type=click.Choice(["kiss-icp", "constant-velocity"]),
+    help="Where the motion between scans comes from.  [default: kiss-icp]",
+)
+@click.option("--prior", type=_FILE, metavar="TUM_FILE", help="A trajectory of another program as the odometry.")
+@click.option(
+    "--mapping/--no-mapping", default=False, help="Correct the odometry against the map.  [default: no-mapping]"
+)
+@click.option(
+    "--pose-graph/--no-pose-graph", default=False, help="Close loops in a pose graph.  [default: no-pose-graph]"
+)
+@click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan.")
+@click.option("--stop", type=click.IntRange(min=0), help="Scan to stop before.")
+@click.option("--step", type=click.IntRange(min=1), default=1, show_default=True, help="Take every n-th scan.")
+@click.option(
+    "--rerun",
+    type=click.Choice(["off", "save", "spawn"]),
+    default="off",
+    show_default=True,
+    help="Write a Rerun recording beside the results; spawn opens a window too.",
+)
+@click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
+@_reader_options
+@_config_options
+@click.pass_context
+def run(ctx: click.Context, source: Path, out: Path, **options: Any) -> None:
+    """Build trajectory and map of a recording."""
+    from lidarslam.progress import show_progress
+    from lidarslam.run import RunRequest, execute
+    from lidarslam.summary_text import format_outcome
+
+    settings = _method_settings(options.pop("odometry"), options["prior"], options.pop("settings"))
+    _refuse_missing_parts(options.pop("mapping"), options.pop("pose_graph"))
+    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
+    config = _resolve(options.pop("config_file"), settings, **reader)
+    with show_progress(source.name) as progress:
+        outcome = execute(RunRequest(source, out, config, **options), progress)
+    click.echo(format_outcome(out, outcome))
+    if outcome.summary.lost_scans:
+        ctx.exit(EXIT_LOST)
+
+
+def _method_settings(odometry: str | None, prior: Path | None, settings: tuple[str, ...]) -> tuple[str, ...]:
+    if prior is not None:
+        if odometry is not None:
+            raise click.UsageError("--prior is an odometry of its own; leave --odometry out")
+        odometry = "external"
+    return settings if odometry is None else (*settings, f"odometry.method={odometry}")
+
+
+def _refuse_missing_parts(mapping: bool, pose_graph: bool) -> None:
+    from lidarslam.core.errors import ConfigError
+
+    if mapping:
+        raise ConfigError("scan-to-map refinement is not part of this version; run with --no-mapping")
+    if pose_graph:
+        raise ConfigError("the pose graph is not part of this version; run with --no-pose-graph")
+
+
+@main.command(epilog="lidarslam config --set odometry.kiss_icp.voxel_size_m=0.5")
+@_config_options
+def config(config_file: Path | None, settings: tuple[str, ...]) -> None:
+    """Print the resolved configuration as YAML."""
+    from lidarslam.config import dump_yaml, load_config
+
+    click.echo(dump_yaml(load_config(config_file, settings)), nl=False)
+
+
+if __name__ == "__main__":
+    main()

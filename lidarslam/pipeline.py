@@ -1,0 +1,169 @@
+"""One scan after another through odometry and into the map: no files, no printing, no window.
+
+Odometry is where the time goes, and one scan's motion must be known before the next can be estimated. What follows
+from a motion (checking it, compensating the sweep, adding it to the map) happens on a second thread meanwhile.
+"""
+
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from mapping.config import GlobalMapConfig
+from mapping.deskew import deskew
+from mapping.global_map import GlobalMap, voxel_size_for
+from odometry.consistency import Consistency, ConsistencyCheck
+from odometry.interface import Motion, Odometry
+
+
+@dataclass(frozen=True, eq=False)
+class ScanResult:
+    """What became of one scan.
+
+    Attributes:
+        stamp: seconds.
+        T_world_lidar: (4, 4), the final pose at the stamp; the world is the first scan's LiDAR frame.
+        T_odom_lidar: (4, 4), what the odometry alone says.
+        status: whether to believe the pose, and `message` why not.
+        points: (N, 3) in the LiDAR frame at the stamp, motion compensated, cropped to the map's range.
+        points_read, points_dropped: valid points of the raw scan, and how many were left out as invalid.
+        points_used: how many the motion rests on.
+        residual_m, inlier_ratio: how the scan lies on the previous one; None when that cannot be told.
+        stage_ms: wall time of each stage.
+    """
+
+    stamp: float
+    T_world_lidar: FloatArray
+    T_odom_lidar: FloatArray
+    status: Status
+    message: str
+    points: FloatArray
+    points_read: int
+    points_dropped: int
+    points_used: int
+    residual_m: float | None
+    inlier_ratio: float | None
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+class Pipeline:
+    """Turns a stream of scans into a stream of results and a global map."""
+
+    def __init__(self, odometry: Odometry, check: ConsistencyCheck, config: GlobalMapConfig) -> None:
+        self._odometry = odometry
+        self._check = check
+        self._config = config
+        self._T_odom_lidar = np.eye(4)
+        self._previous_stamp: float | None = None
+        self._waiting: Scan | None = None  # the first scan, until a motion says how to compensate it
+        self.global_map: GlobalMap | None = None
+
+    def run(self, scans: Iterable[Scan]) -> Iterator[ScanResult]:
+        """Process the scans in order; each result comes while the next scan's odometry is at work."""
+        job: Future[ScanResult] | None = None
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
+            scans = iter(scans)
+            while True:
+                started = time.perf_counter()
+                scan = next(scans, None)
+                if scan is None:
+                    break
+                read = time.perf_counter()
+                motion = self._odometry.estimate(scan)
+                stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
+                interval_s = 0.0 if self._previous_stamp is None else scan.stamp - self._previous_stamp
+                self._previous_stamp = scan.stamp
+                self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
+                if job is not None:
+                    yield job.result()
+                job = pool.submit(self._follow, scan, motion, self._T_odom_lidar, interval_s, stage_ms)
+            if job is not None:
+                yield job.result()
+        if self._waiting is not None:  # there never was a second scan
+            self._add(self._crop(self._waiting).points, np.eye(4))
+
+    def _follow(
+        self, scan: Scan, motion: Motion, T_odom_lidar: FloatArray, interval_s: float, stage_ms: dict[str, float]
+    ) -> ScanResult:
+        """Everything that follows from a motion: compensate the sweep, check the motion, add to the map."""
+        started = time.perf_counter()
+        points = self._compensate(self._crop(scan), motion.T_prev_curr, interval_s)
+        compensated = time.perf_counter()
+        fit = self._check.check(points, motion.T_prev_curr)
+        checked = time.perf_counter()
+        status, message = _judge(motion, fit)
+        self._map(scan, points, motion.T_prev_curr, T_odom_lidar, interval_s, status)
+        stage_ms["deskew"] = _ms(started, compensated)
+        stage_ms["check"] = _ms(compensated, checked)
+        stage_ms["map"] = _ms(checked, time.perf_counter())
+        return ScanResult(
+            stamp=scan.stamp,
+            T_world_lidar=T_odom_lidar,
+            T_odom_lidar=T_odom_lidar,
+            status=status,
+            message=message,
+            points=points,
+            points_read=len(scan),
+            points_dropped=scan.dropped,
+            points_used=motion.points_used,
+            residual_m=fit.residual_m,
+            inlier_ratio=fit.inlier_ratio,
+            stage_ms=stage_ms,
+        )
+
+    def _crop(self, scan: Scan) -> Scan:
+        """The points within the map's range."""
+        squared = np.einsum("ij,ij->i", scan.points, scan.points)
+        return scan.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
+
+    def _compensate(self, scan: Scan, T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
+        if scan.time_offsets is None:
+            return scan.points
+        return deskew(scan.points, scan.time_offsets, T_prev_curr, interval_s)
+
+    def _map(
+        self,
+        scan: Scan,
+        points: FloatArray,
+        T_prev_curr: FloatArray,
+        T_world_lidar: FloatArray,
+        interval_s: float,
+        status: Status,
+    ) -> None:
+        """Add the scan to the map, unless it is lost: a pose that is not believed must not draw walls.
+
+        The first scan waits for the second, whose motion says how to compensate it.
+        """
+        if interval_s == 0.0:
+            self._waiting = scan
+            return
+        if self._waiting is not None:
+            first, self._waiting = self._waiting, None
+            self._add(self._compensate(self._crop(first), T_prev_curr, interval_s), np.eye(4))
+        if status is not Status.LOST:
+            self._add(points, T_world_lidar)
+
+    def _add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
+        if self.global_map is None:
+            self.global_map = GlobalMap(self._config.voxel_size_m or voxel_size_for(points))
+        self.global_map.add(points, T_world_lidar)
+
+
+def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
+    """A motion that was not measured is lost, whatever it fits; else the fit decides."""
+    if motion.failure is not None:
+        return Status.LOST, motion.failure
+    if fit.status is Status.OK:
+        return Status.OK, ""
+    if fit.inlier_ratio is None:
+        return fit.status, "too few planes to check the motion against the previous scan"
+    return fit.status, f"only {100.0 * fit.inlier_ratio:.0f} % of the scan lies on the previous one"
+
+
+def _ms(start: float, end: float) -> float:
+    return 1e3 * (end - start)

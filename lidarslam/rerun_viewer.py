@@ -1,0 +1,144 @@
+"""Runs in Rerun; the only file that imports it."""
+
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from lidarslam.config import ViewerConfig
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline import ScanResult
+
+_SCAN_TIMELINE = "scan"
+_TIME_TIMELINE = "time"
+
+# Okabe and Ito's palette, distinguishable under every common colour blindness.
+_STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
+_REFERENCE_COLOUR = (0, 158, 115)
+_SCAN_COLOUR = (240, 228, 66)
+_PLOTS = (("ms", "ms per scan"), ("residual", "residual [m]"), ("inliers", "inlier ratio"))
+
+
+class RerunViewer:
+    """Logs a run to a file, to a window, or both.
+
+    Args:
+        name: shown as the recording's name.
+        config: how much is shown.
+        save: the .rrd file to write, or None.
+        spawn: whether to open a window.
+    """
+
+    def __init__(self, name: str, config: ViewerConfig, save: Path | None = None, spawn: bool = False) -> None:
+        self._config = config
+        self._recording = rr.RecordingStream("lidarslam")
+        self._last_position: FloatArray | None = None
+        if spawn:
+            self._recording.spawn(connect=False)
+        sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [rr.FileSink(save)]
+        if spawn:
+            sinks.append(rr.GrpcSink())
+        self._recording.set_sinks(*sinks, default_blueprint=_blueprint())
+        self._recording.send_recording_name(name)
+        self._log_static()
+
+    def wants_map(self, index: int) -> bool:
+        """Every so many scans."""
+        return index % self._config.map_every == 0
+
+    def show_reference(self, reference: Trajectory) -> None:
+        """The whole true path, at once."""
+        path = rr.LineStrips3D([reference.positions], colors=[_REFERENCE_COLOUR], labels=["ground truth"])
+        self._recording.log("world/ground_truth", path, static=True)
+
+    def show_scan(self, index: int, result: ScanResult) -> None:
+        """The scan at its pose, one more piece of the trajectory, one more value in every plot."""
+        self._recording.set_time(_SCAN_TIMELINE, sequence=index)
+        self._recording.set_time(_TIME_TIMELINE, timestamp=result.stamp)
+        T = result.T_world_lidar
+        self._recording.log("world/lidar", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        points = _every_nth(result.points, self._config.scan_points)
+        self._recording.log(
+            "world/lidar/scan", rr.Points3D(points, colors=[_SCAN_COLOUR], radii=[rr.Radius.ui_points(1.5)])
+        )
+        self._log_path(T[:3, 3], result.status)
+        values = {
+            "ms": sum(result.stage_ms.values()),
+            "residual": result.residual_m,
+            "inliers": result.inlier_ratio,
+        }
+        for plot, value in values.items():
+            if value is not None:
+                self._recording.log(f"plots/{plot}", rr.Scalars(value))
+        if result.message:
+            level = rr.TextLogLevel.ERROR if result.status is Status.LOST else rr.TextLogLevel.WARN
+            self._recording.log("log", rr.TextLog(result.message, level=level))
+
+    def show_map(self, points: FloatArray) -> None:
+        """The part of the map around the sensor, coloured by height."""
+        if self._last_position is not None:
+            near = np.linalg.norm(points - self._last_position, axis=1) < self._config.map_radius_m
+            points = points[near]
+        points = _every_nth(points, self._config.map_points)
+        cloud = rr.Points3D(points, colors=height_colours(points), radii=[rr.Radius.ui_points(1.0)])
+        self._recording.log("world/map", cloud)
+
+    def close(self) -> None:
+        """Wait until everything is written."""
+        self._recording.flush()
+        self._recording.disconnect()
+
+    def _log_static(self) -> None:
+        self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for plot, title in _PLOTS:
+            self._recording.log(f"plots/{plot}", rr.SeriesLines(names=[title]), static=True)
+
+    def _log_path(self, position: FloatArray, status: Status) -> None:
+        """Only the newest piece: the view shows all pieces up to the present, so the recording grows linearly."""
+        if self._last_position is not None:
+            piece = rr.LineStrips3D([np.stack([self._last_position, position])], colors=[_STATUS_COLOURS[status]])
+            self._recording.log("world/trajectory", piece)
+        self._last_position = position.copy()
+
+
+def _blueprint() -> rrb.Blueprint:
+    """A 3D view beside time series, with the panels that newcomers do not need folded."""
+    whole_past = [
+        rrb.VisibleTimeRange(
+            timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+        )
+        for timeline in (_SCAN_TIMELINE, _TIME_TIMELINE)
+    ]
+    space = rrb.Spatial3DView(
+        origin="/world",
+        name="Trajectory and map",
+        overrides={"world/trajectory": [rrb.VisibleTimeRanges(whole_past)]},
+    )
+    plots = [rrb.TimeSeriesView(origin=f"/plots/{plot}", name=title) for plot, title in _PLOTS]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            space, rrb.Vertical(*plots, rrb.TextLogView(origin="/log", name="Messages")), column_shares=[3, 1]
+        ),
+        rrb.TimePanel(timeline=_SCAN_TIMELINE),
+        collapse_panels=True,
+    )
+
+
+def _every_nth(points: FloatArray, count: int) -> FloatArray:
+    return points[:: max(1, -(-len(points) // count))]
+
+
+def height_colours(points: FloatArray) -> NDArray[np.uint8]:
+    """Colours (N, 3) from dark blue over green to yellow with the height of points (N, 3), outliers clipped."""
+    if not len(points):
+        return np.empty((0, 3), dtype=np.uint8)
+    low, high = np.percentile(points[:, 2], [2.0, 98.0])
+    level = np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0)
+    stops = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)
+    position = np.linspace(0.0, 1.0, len(stops))
+    channels = [np.interp(level, position, stops[:, channel]) for channel in range(3)]
+    return np.stack(channels, axis=1).astype(np.uint8)

@@ -1,0 +1,135 @@
+"""A run in a few numbers."""
+
+import resource
+import sys
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from lidarslam.core.tracking import Status
+from lidarslam.scan_log import STAGES, ScanLog
+
+
+@dataclass(frozen=True)
+class Milliseconds:
+    """Time per scan: half of the scans take no longer than the median, 95 % no longer than p95."""
+
+    median: float
+    p95: float
+
+
+@dataclass(frozen=True)
+class LostStretch:
+    """Successive scans on which tracking was lost: indices, stamps and the first one's reason."""
+
+    first: int
+    last: int
+    first_stamp: float
+    last_stamp: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What summary.json holds; the contract names the keys.
+
+    `ms_per_scan["total"]` is the time from one finished scan to the next. Stages run beside one another, so they add up
+    to more.
+    """
+
+    scans: int
+    length_m: float
+    duration_s: float
+    ms_per_scan: dict[str, Milliseconds]
+    realtime_factor: float | None
+    peak_rss_mb: float
+    lost: tuple[LostStretch, ...]
+    degraded_scans: int
+    loop_closures: int
+    map_points: int
+    warnings: tuple[str, ...]
+
+    @property
+    def lost_scans(self) -> int:
+        """How many scans were lost."""
+        return sum(stretch.last - stretch.first + 1 for stretch in self.lost)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        return {
+            "scans": self.scans,
+            "length_m": self.length_m,
+            "duration_s": self.duration_s,
+            "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
+            "realtime_factor": self.realtime_factor,
+            "peak_rss_mb": self.peak_rss_mb,
+            "lost_scans": self.lost_scans,
+            "lost": [vars(stretch) for stretch in self.lost],
+            "degraded_scans": self.degraded_scans,
+            "loop_closures": self.loop_closures,
+            "map_points": self.map_points,
+            "warnings": list(self.warnings),
+        }
+
+
+def summarise(log: ScanLog, total_ms: list[float], map_points: int, skipped: int) -> RunSummary:
+    """Sum a run up.
+
+    Args:
+        log: its scans.
+        total_ms: wall time of each scan, from the one before finished to this one finished.
+        map_points: points of the written map.
+        skipped: scans left out because their stamp was not after the one before.
+    """
+    trajectory = log.trajectory
+    stages = {"total": total_ms} | dict(zip(STAGES, np.array(log.stage_ms).T, strict=True))
+    elapsed_s = sum(total_ms) / 1e3
+    return RunSummary(
+        scans=len(log),
+        length_m=trajectory.length_m,
+        duration_s=trajectory.duration_s,
+        ms_per_scan={
+            stage: Milliseconds(float(np.median(values)), float(np.percentile(values, 95.0)))
+            for stage, values in stages.items()
+        },
+        realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
+        peak_rss_mb=_peak_rss_mb(),
+        lost=_lost_stretches(log),
+        degraded_scans=log.statuses.count(Status.DEGRADED),
+        loop_closures=0,
+        map_points=map_points,
+        warnings=_warnings(log, skipped),
+    )
+
+
+def _lost_stretches(log: ScanLog) -> tuple[LostStretch, ...]:
+    stretches = []
+    for status, group in groupby(range(len(log)), key=lambda index: log.statuses[index]):
+        indices = list(group)
+        if status is Status.LOST:
+            first, last = indices[0], indices[-1]
+            stretches.append(LostStretch(first, last, log.stamps[first], log.stamps[last], log.messages[first]))
+    return tuple(stretches)
+
+
+def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
+    warnings = list(log.warnings)
+    if skipped:
+        warnings.append(f"{skipped} scans were left out: their stamps are not after the scan before")
+    if log.points_dropped:
+        share = log.points_dropped / max(1, len(log))
+        warnings.append(
+            f"{log.points_dropped} invalid points (NaN, at the origin, out of range) were left out, {share:.0f} a scan"
+        )
+    if degraded := log.statuses.count(Status.DEGRADED):
+        warnings.append(f"{degraded} scans fit the scan before badly (status degraded in scans.csv)")
+    return tuple(warnings)
+
+
+def _peak_rss_mb() -> float:
+    """Peak memory of this process and its largest ended child; the kernel counts kilobytes, macOS bytes."""
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    usages = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usages) * unit / 2**20

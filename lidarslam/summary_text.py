@@ -1,0 +1,40 @@
+"""What `lidarslam run` prints at the end."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from lidarslam.run import RunOutcome
+from lidarslam.run_directory import SCANS_CSV
+
+
+def format_outcome(out: Path, outcome: RunOutcome) -> str:
+    """A run in a few lines: what was built, how fast, how good, what went wrong, and where it all lies."""
+    return "\n".join(_lines(out, outcome))
+
+
+def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
+    summary = outcome.summary
+    yield f"{summary.scans:,} scans, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
+    speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
+    total = summary.ms_per_scan["total"]
+    yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
+    yield f"map of {summary.map_points:,} points"
+    if outcome.metrics is not None:
+        yield from _accuracy(outcome)
+    for warning in summary.warnings:
+        yield f"warning: {warning}"
+    for stretch in summary.lost:
+        scans = f"scan {stretch.first}" if stretch.first == stretch.last else f"scans {stretch.first} to {stretch.last}"
+        yield f"LOST on {scans}: {stretch.reason}"
+    if summary.lost_scans:
+        yield f"tracking was lost on {summary.lost_scans} of {summary.scans} scans; {SCANS_CSV} has every scan's status"
+    yield f"written to {out}"
+
+
+def _accuracy(outcome: RunOutcome) -> Iterator[str]:
+    assert outcome.metrics is not None
+    errors = outcome.metrics.errors
+    yield f"against ground truth: ATE {errors.ate_rmse_m:.3f} m, {errors.ate_rotation_rmse_deg:.2f} deg"
+    if outcome.metrics.kitti is not None:
+        drift = outcome.metrics.kitti.overall
+        yield f"KITTI drift {drift.translation_percent:.2f} %, {100.0 * drift.rotation_deg_per_m:.2f} deg per 100 m"

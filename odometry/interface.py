@@ -1,0 +1,36 @@
+"""The one protocol behind which every odometry stands."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What an odometry says of one scan.
+
+    Attributes:
+        T_prev_curr: (4, 4), from this scan's LiDAR frame to the previous one's, each at its stamp; identity for the
+            first scan.
+        points_used: how many points of the scan the estimate rests on; 0 for a prediction.
+        failure: why the motion is only a prediction, None when it was measured.
+    """
+
+    T_prev_curr: FloatArray
+    points_used: int
+    failure: str | None = None
+
+
+class Odometry(Protocol):
+    """Says, scan after scan, how the sensor moved since the last one."""
+
+    def estimate(self, scan: Scan) -> Motion:
+        """The motion since the previous scan given to this method; a scan that cannot be used gives a prediction."""
+
+    def correct(self, T_prev_curr: FloatArray) -> None:
+        """Hand back the last scan's motion as a map corrected it; the next prediction starts from there."""
+
+    def close(self) -> None:
+        """Let go of whatever the method holds."""

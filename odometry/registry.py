@@ -1,0 +1,31 @@
+"""Which odometry methods there are; a method's module is imported when it is chosen."""
+
+from lidarslam.core.errors import ConfigError
+from lidarslam.core.trajectory import Trajectory
+from odometry.config import OdometryConfig
+from odometry.interface import Odometry
+
+
+def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
+    """The configured method, ready for the first scan.
+
+    Args:
+        config: names the method and sets it.
+        prior: T_odom_lidar, for the method `external`.
+
+    Raises:
+        ConfigError: the method is `external` and there is no prior, or the other way round.
+    """
+    if (config.method == "external") != (prior is not None):
+        raise ConfigError("a prior trajectory and odometry.method=external go together; give both or neither")
+    if prior is not None:
+        from odometry.external import ExternalOdometry
+
+        return ExternalOdometry(prior)
+    if config.method == "kiss-icp":
+        from odometry.kiss import KissOdometry
+
+        return KissOdometry(config.kiss_icp)
+    from odometry.constant_velocity import ConstantVelocity
+
+    return ConstantVelocity()
