@@ -1,0 +1,174 @@
+"""One test a law of SE(3)."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from lidarslam.core import geometry as g
+
+# From below the switch to Taylor series to just short of pi, where the logarithm stops being unique.
+ANGLES = [0.0, 1e-12, 1e-8, 0.99e-4, 1.01e-4, 1e-3, 0.5, 2.0, 3.0, np.pi - 1e-3, np.pi - 1e-6, np.pi - 1e-9]
+
+finite = st.floats(-3.0, 3.0, allow_nan=False, width=32)
+tangents = arrays(np.float64, 6, elements=finite)
+quick = settings(max_examples=60, deadline=None)
+
+
+def turn(angle: float, seed: int = 0) -> np.ndarray:
+    """A tangent vector which turns by the angle about some axis and moves by some metres."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    return np.concatenate([angle * axis / np.linalg.norm(axis), rng.normal(0.0, 5.0, 3)])
+
+
+def hat(xi: np.ndarray) -> np.ndarray:
+    """The (4, 4) matrix whose exponential `exp` is."""
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = g.skew(xi[:3])
+    matrix[:3, 3] = xi[3:]
+    return matrix
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_log_inverts_exp(angle):
+    for seed in range(5):
+        xi = turn(angle, seed)
+        np.testing.assert_allclose(g.log(g.exp(xi)), xi, atol=1e-8 if angle > 3.1 else 1e-12)
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, np.pi, np.pi + 1e-6, 5.0, 100.0])
+def test_exp_inverts_log_for_every_angle(angle):
+    for seed in range(5):
+        T = g.exp(turn(angle, seed))
+        np.testing.assert_allclose(g.exp(g.log(T)), T, atol=1e-9)
+
+
+@given(tangents)
+@quick
+def test_exp_is_the_matrix_exponential(xi):
+    np.testing.assert_allclose(g.exp(xi), scipy.linalg.expm(hat(xi)), atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_is_the_matrix_exponential_at_the_ends(angle):
+    xi = turn(angle)
+    np.testing.assert_allclose(g.exp(xi), scipy.linalg.expm(hat(xi)), atol=1e-12)
+
+
+@given(tangents, tangents)
+@quick
+def test_exp_is_rigid_and_composes(xi, other):
+    T_a_b, T_b_c = g.exp(xi), g.exp(other)
+    assert g.is_rigid(T_a_b @ T_b_c, 1e-12)
+
+
+@given(tangents, tangents)
+@quick
+def test_conjugation_moves_the_tangent_vector_by_the_adjoint(xi, other):
+    T = g.exp(other)
+    R, t = T[:3, :3], T[:3, 3]
+    moved = np.concatenate([R @ xi[:3], g.skew(t) @ R @ xi[:3] + R @ xi[3:]])
+    np.testing.assert_allclose(T @ g.exp(xi) @ g.inverse(T), g.exp(moved), atol=1e-10)
+
+
+@given(tangents)
+@quick
+def test_inverse_is_the_inverse(xi):
+    T = g.exp(xi)
+    np.testing.assert_allclose(g.inverse(T) @ T, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(g.inverse(T), g.exp(-xi), atol=1e-12)
+    np.testing.assert_allclose(g.inverse(T), np.linalg.inv(T), atol=1e-12)
+
+
+@given(tangents, tangents)
+@quick
+def test_transform_points_composes_and_goes_from_b_to_a(xi, other):
+    points_c = np.arange(12.0).reshape(4, 3)
+    T_a_b, T_b_c = g.exp(xi), g.exp(other)
+    in_steps = g.transform_points(T_a_b, g.transform_points(T_b_c, points_c))
+    np.testing.assert_allclose(in_steps, g.transform_points(T_a_b @ T_b_c, points_c), atol=1e-11)
+    homogeneous = np.column_stack([points_c, np.ones(4)]) @ (T_a_b @ T_b_c).T
+    np.testing.assert_allclose(in_steps, homogeneous[:, :3], atol=1e-11)
+
+
+def test_skew_is_the_cross_product(rng):
+    v, w = rng.normal(size=(2, 5, 3))
+    np.testing.assert_allclose((g.skew(v) @ w[..., None])[..., 0], np.cross(v, w))
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, np.pi])
+def test_rotation_angle_keeps_its_digits_at_both_ends(angle):
+    T = g.exp(turn(angle))
+    assert g.rotation_angle(T) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+    assert g.rotation_angle(T[:3, :3]) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+
+
+def test_interpolation_meets_both_ends_and_halves_the_motion():
+    T_w_a, T_w_b = g.exp(turn(2.0, 1)), g.exp(turn(2.5, 2))
+    np.testing.assert_array_equal(g.interpolate(T_w_a, T_w_b, 0.0), T_w_a)
+    np.testing.assert_allclose(g.interpolate(T_w_a, T_w_b, 1.0), T_w_b, atol=1e-12)
+    T_w_m = g.interpolate(T_w_a, T_w_b, 0.5)
+    np.testing.assert_allclose(g.inverse(T_w_a) @ T_w_m, g.inverse(T_w_m) @ T_w_b, atol=1e-12)
+
+
+@given(tangents, st.floats(-2.0, 3.0))
+@quick
+def test_interpolation_keeps_the_body_velocity(xi, fraction):
+    xi = xi / 2.0  # below half a turn, so that the shorter way round is the one taken
+    T_w_a = g.exp(turn(1.0))
+    found = g.interpolate(T_w_a, T_w_a @ g.exp(xi), fraction)
+    np.testing.assert_allclose(found, T_w_a @ g.exp(fraction * xi), atol=1e-9)
+
+
+def test_every_function_broadcasts_over_leading_dimensions(rng):
+    xi = rng.normal(size=(2, 3, 6))
+    T = g.exp(xi)
+    points = rng.normal(size=(7, 3))
+    assert T.shape == (2, 3, 4, 4)
+    assert g.inverse(T).shape == (2, 3, 4, 4)
+    assert g.log(T).shape == (2, 3, 6)
+    assert g.rotation_angle(T).shape == (2, 3)
+    assert g.transform_points(T, points).shape == (2, 3, 7, 3)
+    assert g.interpolate(T[0, 0], T, np.full((2, 3), 0.3)).shape == (2, 3, 4, 4)
+    assert g.interpolate(T[0, 0], T[0, 1], [0.1, 0.2]).shape == (2, 4, 4)
+    assert g.make_transform(np.eye(3), rng.normal(size=(5, 3))).shape == (5, 4, 4)
+    assert g.log(np.zeros((0, 4, 4))).shape == (0, 6)
+    for index in np.ndindex(2, 3):
+        np.testing.assert_allclose(T[index], g.exp(xi[index]), atol=1e-14)
+        np.testing.assert_allclose(g.log(T)[index], g.log(T[index]), atol=1e-14)
+        np.testing.assert_allclose(
+            g.transform_points(T, points)[index], g.transform_points(T[index], points), atol=1e-14
+        )
+
+
+def test_nothing_is_changed_in_place():
+    T = g.exp(turn(1.0))
+    T.setflags(write=False)
+    points = np.ones((3, 3))
+    points.setflags(write=False)
+    g.log(g.orthonormalize(g.interpolate(T, g.inverse(T), 0.5)))
+    g.transform_points(T, points)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.01, 1.0, 1.0, 1.0]), np.diag([1.0, 1.0, 1.0, 2.0]), np.eye(4) * np.nan],
+    ids=["mirrored", "scaled", "bottom row", "not a number"],
+)
+def test_is_rigid_refuses(broken):
+    assert g.is_rigid(np.eye(4))
+    assert not g.is_rigid(np.stack([np.eye(4), broken]))
+
+
+def test_orthonormalize_returns_the_nearest_rotation(rng):
+    T = g.exp(rng.normal(size=(50, 6)))
+    np.testing.assert_allclose(g.orthonormalize(T), T, atol=1e-14)
+    rounded = np.round(T, 4)
+    mended = g.orthonormalize(rounded)
+    assert g.is_rigid(mended, 1e-12)
+    np.testing.assert_allclose(mended, T, atol=2e-4)
+    distance = np.linalg.norm(mended - rounded, axis=(1, 2))
+    assert (distance <= np.linalg.norm(T - rounded, axis=(1, 2)) + 1e-12).all()

@@ -1,0 +1,97 @@
+"""Scans keep their points, times and rings in step, whatever a driver delivers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from lidarslam.core.scan import Scan
+
+INVALID = [[np.nan, 1, 1], [1, np.inf, 1], [1, 1, -np.inf], [0, 0, 0], [1e30, 1, 1], [1, -1e30, 1]]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("invalid", INVALID)
+def test_invalid_points_are_dropped_with_their_times_and_rings(invalid, dtype):
+    points = np.array([[1, 2, 3], invalid, [4, 5, 6], [0, 0, 7]], dtype=dtype)
+    scan = Scan.from_raw(points, 5.0, time_offsets=[0.0, 0.1, 0.2, 0.3], rings=[0, 1, 2, 3])
+    assert scan.points.dtype == np.float64
+    np.testing.assert_array_equal(scan.points, [[1, 2, 3], [4, 5, 6], [0, 0, 7]])
+    np.testing.assert_array_equal(scan.time_offsets, [0.0, 0.2, 0.3])
+    np.testing.assert_array_equal(scan.rings, [0, 2, 3])
+    assert scan.rings.dtype == np.int32
+    assert (len(scan), scan.dropped, scan.stamp) == (3, 1, 5.0)
+
+
+def test_points_without_a_finite_time_are_dropped():
+    scan = Scan.from_raw(np.ones((3, 3)), 0.0, time_offsets=[0.0, np.nan, np.inf], rings=[4, 5, 6])
+    assert scan.rings.tolist() == [4]
+    assert scan.dropped == 2
+
+
+def test_rings_of_invalid_points_may_be_missing():
+    scan = Scan.from_raw([[1.0, 1, 1], [np.nan] * 3, [2, 2, 2]], 0.0, rings=np.array([3.0, np.nan, 5.0]))
+    assert scan.rings.tolist() == [3, 5]
+
+
+def test_organised_clouds_are_flattened_row_by_row():
+    cloud = np.arange(1.0, 25.0).reshape(2, 4, 3)
+    cloud[0, 1] = np.nan
+    rings = np.repeat([[0], [1]], 4, axis=1)
+    times = np.tile([0.0, 0.1, 0.2, 0.3], (2, 1))
+    scan = Scan.from_raw(cloud, 0.0, times, rings)
+    assert len(scan) == 7
+    assert scan.rings.tolist() == [0, 0, 0, 1, 1, 1, 1]
+    assert scan.time_offsets.tolist() == [0.0, 0.2, 0.3, 0.0, 0.1, 0.2, 0.3]
+    np.testing.assert_array_equal(scan.points[1], [7, 8, 9])
+
+
+@pytest.mark.parametrize("points", [[], np.zeros((0, 3)), np.zeros((5, 3)), np.full((2, 2, 3), np.nan)])
+def test_a_scan_may_come_out_empty(points):
+    scan = Scan.from_raw(points, 0.0)
+    assert scan.points.shape == (0, 3)
+    assert scan.time_offsets is None
+    assert scan.rings is None
+
+
+@pytest.mark.parametrize("field", ["time_offsets", "rings"])
+@pytest.mark.parametrize("entries", [2, 4])
+def test_mismatched_lengths_are_refused(field, entries):
+    with pytest.raises(ValueError, match=rf"{field} has {entries} entries for 3 points"):
+        Scan.from_raw(np.ones((3, 3)), 0.0, **{field: np.zeros(entries)})
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (6, 2), (3, 3, 4)])
+def test_points_that_are_not_triples_are_refused_even_when_their_count_divides_by_three(shape):
+    with pytest.raises(ValueError, match=r"points must be \(\.\.\., 3\), got"):
+        Scan.from_raw(np.ones(shape), 0.0)
+
+
+def test_construction_is_checked():
+    points = np.ones((4, 3))
+    with pytest.raises(ValueError, match=r"\(N, 3\), got \(4, 2\)"):
+        Scan(points[:, :2], 0.0)
+    with pytest.raises(ValueError, match=r"time_offsets must be \(4,\), got \(3,\)"):
+        Scan(points, 0.0, time_offsets=np.zeros(3))
+    with pytest.raises(ValueError, match=r"rings must be \(4,\), got \(4, 1\)"):
+        Scan(points, 0.0, rings=np.zeros((4, 1), dtype=np.int32))
+    with pytest.raises(ValueError, match="stamp must be finite, got nan"):
+        Scan(points, np.nan)
+
+
+def test_a_scan_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Scan(np.ones((1, 3)), 0.0).stamp = 1.0
+
+
+@pytest.mark.parametrize("chosen", [np.array([True, False, True, False]), np.array([0, 2])], ids=["mask", "indices"])
+def test_select_keeps_everything_in_step(chosen):
+    scan = Scan.from_raw(
+        np.arange(1.0, 16.0).reshape(5, 3) * [[1], [1], [0], [1], [1]], 3.0, np.arange(5.0), np.arange(5)
+    )
+    part = scan.select(chosen)
+    np.testing.assert_array_equal(part.points, [[1, 2, 3], [10, 11, 12]])
+    assert part.time_offsets.tolist() == [0.0, 3.0]
+    assert part.rings.tolist() == [0, 3]
+    assert (part.stamp, part.dropped) == (3.0, 1)
+    assert Scan(np.ones((4, 3)), 0.0).select(chosen).rings is None

@@ -1,0 +1,81 @@
+"""The alignment finds a known rigid motion, also where positions alone cannot tell it."""
+
+import numpy as np
+import pytest
+
+from evaluation.alignment import align, align_se3
+from lidarslam.core.geometry import exp, inverse, is_rigid, rotation_angle
+from lidarslam.core.trajectory import Trajectory
+
+MOTIONS = [(0.0,) * 6, (0.3, -0.2, 2.5, 10.0, -4.0, 1.0), (3.1, 0.1, 0.2, -500.0, 20.0, 3.0)]
+
+
+def assert_same(T_a: np.ndarray, T_b: np.ndarray, tolerance: float = 1e-6) -> None:
+    np.testing.assert_allclose(T_a, T_b, atol=tolerance)
+
+
+@pytest.mark.parametrize("xi", MOTIONS)
+@pytest.mark.parametrize("shape", ["drive", "plane", "line", "line and turning", "still", "still and turning"])
+def test_a_known_motion_is_found_for_every_shape_of_path(xi, shape, random_drive, straight_drive):
+    estimate = {
+        "drive": lambda: random_drive(4, scans=120),
+        "plane": lambda: straight_drive(120, (0.0, 0.0, 0.02, 1.0, 0.0, 0.0)),
+        "line": lambda: straight_drive(120),
+        "line and turning": lambda: straight_drive(120, (0.05, 0.0, 0.0, 1.0, 0.0, 0.0)),
+        "still": lambda: straight_drive(120, (0.0,) * 6),
+        "still and turning": lambda: straight_drive(120, (0.0, 0.0, 0.05, 0.0, 0.0, 0.0)),
+    }[shape]()
+    T_reference_estimate = exp(xi)
+    found = align(estimate, estimate.transformed(T_reference_estimate))
+    assert is_rigid(found, 1e-9)
+    assert_same(found, T_reference_estimate)
+
+
+@pytest.mark.parametrize(("step_m", "sigma_m"), [(0.1, 0.01), (2.0, 0.2)], ids=["corridor", "motorway"])
+def test_a_straight_noisy_path_does_not_roll(step_m, sigma_m, straight_drive, rng):
+    drive = straight_drive(400, (0.0, 0.0, 0.0, step_m, 0.0, 0.0))
+    poses = np.stack([drive.T_world_lidar] * 2)
+    poses[..., :3, 3] += rng.normal(0.0, sigma_m, (2, 400, 3))
+    found = align(*(Trajectory(drive.stamps, noisy_poses) for noisy_poses in poses))
+    assert np.rad2deg(rotation_angle(found)) < 0.1
+
+
+def test_a_mirrored_estimate_is_not_answered_with_a_reflection(random_drive):
+    reference = random_drive(2)
+    poses = reference.T_world_lidar.copy()
+    poses[:, 1, 3] *= -1.0
+    assert is_rigid(align_se3(poses, reference.T_world_lidar), 1e-9)
+
+
+def test_no_other_rigid_motion_is_better(random_drive, noisy, rng):
+    reference = random_drive(5)
+    estimate = noisy(reference, 6, sigma=0.05)
+
+    def error(T_reference_estimate: np.ndarray) -> float:
+        return float(np.sum((estimate.transformed(T_reference_estimate).positions - reference.positions) ** 2))
+
+    best = align(estimate, reference)
+    others = [error(exp(xi) @ best) for xi in rng.normal(0.0, 1e-3, (100, 6))]
+    assert error(best) < min(others)
+
+
+def test_first_pose_and_none(random_drive):
+    estimate, reference = random_drive(7), random_drive(8).transformed(exp(MOTIONS[1]))
+    T_reference_estimate = align(estimate, reference, "first_pose")
+    assert_same(T_reference_estimate @ estimate.T_world_lidar[0], reference.T_world_lidar[0], 1e-12)
+    assert np.array_equal(align(estimate, reference, "none"), np.eye(4))
+
+
+def test_the_result_maps_the_estimate_to_the_reference_and_not_back(random_drive):
+    estimate = random_drive(9)
+    reference = estimate.transformed(exp(MOTIONS[1]))
+    T_reference_estimate = align(estimate, reference)
+    assert_same(T_reference_estimate @ estimate.T_world_lidar, reference.T_world_lidar)
+    assert_same(inverse(T_reference_estimate) @ reference.T_world_lidar, estimate.T_world_lidar)
+
+
+def test_misuse_is_refused(random_drive):
+    with pytest.raises(ValueError, match="got 400 and 30"):
+        align(random_drive(1), random_drive(1, scans=30))
+    with pytest.raises(ValueError, match="'sim3'"):
+        align(random_drive(1), random_drive(1), "sim3")

@@ -1,0 +1,112 @@
+"""Drift over segments beside closed forms, KISS-ICP's implementation and a literal loop."""
+
+import math
+
+import numpy as np
+import pytest
+from kiss_icp.metrics import sequence_error
+
+from evaluation.association import associate
+from evaluation.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, kitti_drift, segment_errors, short_drift
+from lidarslam.core.geometry import exp
+from lidarslam.core.trajectory import Trajectory
+
+# KISS-ICP, like the development kit's first version, takes pi for 3.14 and returns single precision.
+KISS_ICP_PI = 3.14
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_kitti_drift_equals_that_of_kiss_icp(seed, random_drive, noisy):
+    reference = random_drive(seed, scans=1000)
+    estimate = noisy(reference, seed + 50).transformed(exp([0.1, 0.2, 2.0, 5.0, 6.0, 7.0]))
+    translation, rotation = sequence_error(reference.T_world_lidar, estimate.T_world_lidar)
+    drift = kitti_drift(associate(estimate, reference))
+    assert drift.overall.translation_percent == pytest.approx(translation, rel=1e-6)
+    assert drift.overall.rotation_deg_per_m * math.pi / KISS_ICP_PI == pytest.approx(rotation, rel=1e-6)
+    assert drift.by_length[800] is not None
+
+
+def test_means_by_length_are_parts_of_the_whole(random_drive, noisy):
+    reference = random_drive(3, scans=700)
+    drift = kitti_drift(associate(noisy(reference, 1), reference))
+    reached = [part for part in drift.by_length.values() if part]
+    assert sum(part.segments for part in reached) == drift.overall.segments
+    total = sum(part.translation_percent * part.segments for part in reached)
+    assert total / drift.overall.segments == pytest.approx(drift.overall.translation_percent)
+    assert list(drift.by_length) == list(KITTI_LENGTHS_M)
+
+
+def test_segments_are_those_of_a_literal_loop(random_drive):
+    drive = random_drive(11, scans=300)
+    found = segment_errors(associate(drive, drive), [100.0, 200.0], step=10)
+    distances = drive.distances
+    expected = []
+    for length in (100.0, 200.0):
+        for first in range(0, 300, 10):
+            last = next((i for i in range(first, 300) if distances[i] > distances[first] + length), None)
+            if last is not None:
+                expected.append((length, (distances[last] - distances[first]) / (0.1 * (last - first))))
+    assert np.array_equal(found.lengths_m, [length for length, _ in expected])
+    np.testing.assert_allclose(found.speeds_mps, [speed for _, speed in expected])
+
+
+def test_a_segment_ends_beyond_its_length_and_not_at_it(straight_drive):
+    drive = straight_drive(30)  # poses at 0, 1, ... 29 m exactly
+    drift = segment_errors(associate(drive, drive), [5.0], step=1).mean()
+    assert drift.segments == 24
+
+
+@pytest.mark.parametrize("direction", [0.99, 1.01])
+def test_one_percent_of_scale_is_one_percent_of_drift(direction, straight_drive):
+    # 0.998 m a scan: segments overshoot by little, and no length is a multiple of the step.
+    reference = straight_drive(1000, (0.0, 0.0, 0.0, 0.998, 0.0, 0.0))
+    estimate = straight_drive(1000, (0.0, 0.0, 0.0, 0.998 * direction, 0.0, 0.0))
+    association = associate(estimate, reference)
+    drift = kitti_drift(association)
+    assert drift.overall.translation_percent == pytest.approx(1.0, rel=0.01)
+    assert drift.overall.rotation_deg_per_m == pytest.approx(0.0, abs=1e-9)
+    for part in short_drift(association).values():
+        assert part.translation_percent == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_constant_yaw_rate_is_found_per_metre(straight_drive):
+    step_m, yaw_per_step = 0.5, np.deg2rad(0.005)
+    reference = straight_drive(2000, (0.0, 0.0, 0.0, step_m, 0.0, 0.0))
+    estimate = straight_drive(2000, (0.0, 0.0, yaw_per_step, step_m, 0.0, 0.0))
+    association = associate(estimate, reference)
+    for length_m, part in short_drift(association).items():
+        assert part.rotation_deg_per_m == pytest.approx(0.01, rel=1e-6)
+        # The chord leaves the tangent by length^2 * curvature / 2.
+        deviation_percent = 100.0 * length_m * np.deg2rad(0.01) / 2.0
+        assert part.translation_percent == pytest.approx(deviation_percent, rel=0.11)
+    # The kit divides the angle over the overshooting segment by the nominal length.
+    for length_m, part in kitti_drift(association).by_length.items():
+        assert part.rotation_deg_per_m == pytest.approx(0.01 * (length_m + step_m) / length_m, rel=5e-3)
+
+
+def test_speed_is_taken_from_the_stamps(straight_drive):
+    reference = straight_drive(400, (0.0, 0.0, 0.0, 1.01, 0.0, 0.0))
+    drift = kitti_drift(associate(reference, reference))
+    assert {speed for speed, part in drift.by_speed.items() if part} == {10, 12}
+    slower = Trajectory(2.0 * reference.stamps, reference.T_world_lidar)
+    drift = kitti_drift(associate(slower, slower))
+    assert {speed for speed, part in drift.by_speed.items() if part} == {4, 6}
+
+
+def test_what_is_too_short_is_none(straight_drive):
+    association = associate(straight_drive(30), straight_drive(30))
+    assert kitti_drift(association) is None
+    short = short_drift(association)
+    assert list(short) == list(SHORT_LENGTHS_M)
+    assert [length for length, part in short.items() if part] == [5, 10, 25]
+    still = straight_drive(30, (0.0,) * 6)
+    assert set(short_drift(associate(still, still)).values()) == {None}
+
+
+def test_drift_does_not_depend_on_the_worlds(random_drive, noisy):
+    reference = random_drive(12)
+    estimate = noisy(reference, 13)
+    moved = estimate.transformed(exp([1.0, -0.5, 2.0, 100.0, -50.0, 3.0]))
+    first, second = (kitti_drift(associate(e, reference)).overall for e in (estimate, moved))
+    assert first.translation_percent == pytest.approx(second.translation_percent, rel=1e-9)
+    assert first.rotation_deg_per_m == pytest.approx(second.rotation_deg_per_m, rel=1e-6)

@@ -1,0 +1,320 @@
+"""Who may import whom, read from the syntax trees; every rule is also tried on a planted breach."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+PACKAGES = ("lidarslam", "odometry", "mapping", "evaluation")
+
+# The longest matching prefix holds: what the modules below it may import of our own.
+MAY_IMPORT = {
+    "lidarslam.core": ("lidarslam.core",),
+    "lidarslam.datasets": ("lidarslam.core", "lidarslam.datasets"),
+    "lidarslam.simulation": ("lidarslam.core", "lidarslam.datasets", "lidarslam.simulation"),
+    "odometry": ("lidarslam.core", "odometry"),
+    "mapping": ("lidarslam.core", "mapping"),
+    "evaluation": ("lidarslam.core", "evaluation"),
+    "lidarslam": PACKAGES,
+}
+# The way down is cli -> run -> pipeline -> libraries: nobody looks up it.
+MAY_NOT_IMPORT = {
+    "lidarslam": ("lidarslam.cli",),
+    "lidarslam.pipeline": ("lidarslam.run",),
+    "lidarslam.viewer": ("lidarslam.run",),
+    "lidarslam.config": ("lidarslam.run",),
+}
+ENTRY_POINTS = ("lidarslam.cli", "lidarslam.__main__")
+CORE_MAY_IMPORT = {"numpy", "scipy", "typing_extensions", *sys.stdlib_module_names}
+# A foreign library -> the modules that may know it; a trailing * stands for any ending.
+CONFINED = {
+    "kiss_icp": "odometry.kiss*",
+    "gtsam": "mapping.pose_graph",
+    "rerun": "lidarslam.rerun_viewer",
+    "click": "lidarslam.cli",
+    "rosbags": "lidarslam.datasets.*",
+}
+HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib"}
+NAMES_THAT_SAY_NOTHING = {"utils", "util", "common", "base", "helpers", "helper", "misc", "tools"}
+
+
+class Import(NamedTuple):
+    """One import: the module it names, and whether it is carried out when the importing module is loaded."""
+
+    target: str
+    on_load: bool
+
+
+@dataclass(frozen=True)
+class Module:
+    """One source file."""
+
+    name: str
+    tree: ast.Module
+    is_package: bool = False
+
+
+Modules = Mapping[str, Module]
+
+
+def parse_sources(root: Path) -> dict[str, Module]:
+    """Every module of the packages, by its dotted name."""
+    modules = {}
+    for path in sorted(path for package in PACKAGES for path in (root / package).rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        is_package = parts[-1] == "__init__"
+        name = ".".join(parts[:-1] if is_package else parts)
+        modules[name] = Module(name, ast.parse(path.read_text(encoding="utf-8"), str(path)), is_package)
+    return modules
+
+
+def parse_planted(**sources: str) -> dict[str, Module]:
+    """Modules from texts, for planted breaches; a double underscore in a keyword stands for the dot."""
+    names = {keyword.replace("__", "."): text for keyword, text in sources.items()}
+    packages = {name for name in names if any(other.startswith(f"{name}.") for other in names)}
+    return {name: Module(name, ast.parse(text), name in packages) for name, text in names.items()}
+
+
+def below(name: str, prefix: str) -> bool:
+    """Whether the dotted name is the prefix or lies below it."""
+    return name == prefix or name.startswith(f"{prefix}.")
+
+
+def imports_of(module: Module, modules: Modules) -> Iterator[Import]:
+    """All imports of a module, those inside functions and `import_module("literal")` too."""
+    yield from _imports_in(module.tree, module, modules, on_load=True)
+
+
+def _imports_in(node: ast.AST, module: Module, modules: Modules, on_load: bool) -> Iterator[Import]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import):
+            yield from (Import(alias.name, on_load) for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            source = _absolute(child, module)
+            for alias in child.names:
+                submodule = f"{source}.{alias.name}"
+                yield Import(submodule if submodule in modules else source, on_load)
+        elif isinstance(child, ast.Call) and _is_import_call(child):
+            yield Import(child.args[0].value, on_load)
+        else:
+            is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            yield from _imports_in(child, module, modules, on_load and not is_function)
+
+
+def _absolute(statement: ast.ImportFrom, module: Module) -> str:
+    if not statement.level:
+        return statement.module or ""
+    up = statement.level - module.is_package
+    parts = module.name.split(".")
+    return ".".join([*parts[: len(parts) - up], *([statement.module] if statement.module else [])])
+
+
+def _is_import_call(call: ast.Call) -> bool:
+    function = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    if function not in ("import_module", "__import__") or not call.args:
+        return False
+    return isinstance(call.args[0], ast.Constant) and isinstance(call.args[0].value, str)
+
+
+def is_ours(target: str) -> bool:
+    return target.partition(".")[0] in PACKAGES
+
+
+def layer_breaches(modules: Modules) -> list[str]:
+    """Imports of our own modules that go up or sideways."""
+    breaches = []
+    for module in modules.values():
+        allowed = MAY_IMPORT[max((p for p in MAY_IMPORT if below(module.name, p)), key=len)]
+        above = {t for p, targets in MAY_NOT_IMPORT.items() if below(module.name, p) for t in targets}
+        for target, _ in imports_of(module, modules):
+            upward = module.name not in ENTRY_POINTS and any(below(target, t) for t in above)
+            if is_ours(target) and (upward or not any(below(target, prefix) for prefix in allowed)):
+                breaches.append(f"{module.name} imports {target}")
+    return breaches
+
+
+def foreign_breaches(modules: Modules) -> list[str]:
+    """Foreign libraries outside their file, and in the core any that it must do without."""
+    breaches = []
+    for module in modules.values():
+        for target, _ in imports_of(module, modules):
+            library = target.partition(".")[0]
+            home = CONFINED.get(library, "*")
+            at_home = module.name.startswith(home[:-1]) if home.endswith("*") else module.name == home
+            fit_for_core = is_ours(target) or library in CORE_MAY_IMPORT
+            if not at_home or (below(module.name, "lidarslam.core") and not fit_for_core):
+                breaches.append(f"{module.name} imports {library}")
+    return breaches
+
+
+def cycle_breaches(modules: Modules) -> list[str]:
+    """Circles of imports, from their alphabetically first module; one at least of every tangle."""
+    graph = {
+        name: sorted({t for t, _ in imports_of(module, modules) if t in modules and not modules[t].is_package})
+        for name, module in modules.items()
+    }
+    found = {cycle for name in graph if (cycle := _shortest_way_back(name, graph)) and min(cycle) == cycle[0]}
+    return sorted(" -> ".join([*cycle, cycle[0]]) for cycle in found)
+
+
+def _shortest_way_back(start: str, graph: Mapping[str, list[str]]) -> tuple[str, ...] | None:
+    ways, seen = [(start,)], set()
+    for way in ways:  # grows while it is walked: breadth first
+        for target in graph[way[-1]]:
+            if target == start:
+                return way
+            if target not in seen:
+                seen.add(target)
+                ways.append((*way, target))
+    return None
+
+
+def weight_breaches(modules: Modules) -> list[str]:
+    """Heavy libraries that are loaded with a light module, be it through others of ours."""
+    breaches = []
+    for light in light_modules(modules):
+        reached = [light]
+        for name in reached:
+            targets = [t for t, on_load in imports_of(modules[name], modules) if on_load]
+            breaches += [f"{light} loads {t} through {name}" for t in targets if t.partition(".")[0] in HEAVY]
+            reached += sorted({t for t in targets if t in modules and t not in reached})
+    return breaches
+
+
+def light_modules(modules: Modules) -> list[str]:
+    """The modules `--help` and loading a configuration need."""
+    return [name for name in modules if name.endswith(".config") or name == "lidarslam.cli"]
+
+
+def root_breaches(modules: Modules) -> list[str]:
+    """Package roots that hold anything but a docstring."""
+    packages = (module for module in modules.values() if module.is_package)
+    return [m.name for m in packages if len(m.tree.body) != 1 or ast.get_docstring(m.tree) is None]
+
+
+def name_breaches(modules: Modules) -> list[str]:
+    """Modules whose name says nothing about what they hold."""
+    return [name for name in modules if name.rpartition(".")[2] in NAMES_THAT_SAY_NOTHING]
+
+
+RULES = [layer_breaches, foreign_breaches, cycle_breaches, weight_breaches, root_breaches, name_breaches]
+
+
+@pytest.fixture(scope="module")
+def sources() -> dict[str, Module]:
+    return parse_sources(REPOSITORY)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_sources_keep_the_rule(rule, sources):
+    assert rule(sources) == []
+
+
+def test_all_sources_are_looked_at(sources):
+    assert set(PACKAGES) | {"lidarslam.core", "lidarslam.datasets"} <= set(sources)
+    assert sources["lidarslam.core"].is_package
+    found = set(imports_of(sources["lidarslam.core.trajectory"], sources))
+    assert Import("lidarslam.core.geometry", True) in found
+    assert len(sources) > 20
+
+
+def test_light_modules_load_nothing_heavy(sources):
+    """The syntax trees see our own imports only; the interpreter sees those of foreign libraries too."""
+    names = light_modules(sources)
+    assert names
+    code = f"import sys, {', '.join(names)}; print(sorted({HEAVY!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("rule", "planted", "told"),
+    [
+        (layer_breaches, {"odometry__learned": "import mapping.mapper"}, "odometry.learned imports mapping.mapper"),
+        (layer_breaches, {"mapping__mapper": "from lidarslam import run"}, "mapping.mapper imports lidarslam"),
+        (
+            layer_breaches,
+            {"lidarslam__core__scan": "import evaluation.drift"},
+            "lidarslam.core.scan imports evaluation.drift",
+        ),
+        (
+            layer_breaches,
+            {"lidarslam__pipeline": "def f():\n  import lidarslam.run"},
+            "lidarslam.pipeline imports lidarslam.run",
+        ),
+        (layer_breaches, {"lidarslam__info": "import lidarslam.cli"}, "lidarslam.info imports lidarslam.cli"),
+        (
+            layer_breaches,
+            {"evaluation__report": "def f():\n  from lidarslam.datasets.registry import open_recording"},
+            "evaluation.report imports lidarslam.datasets.registry",
+        ),
+        (
+            layer_breaches,
+            {"lidarslam__core__scan": "", "lidarslam__core": "", "lidarslam__core__x": "from ..datasets import ply"},
+            "lidarslam.core.x imports lidarslam.datasets",
+        ),
+        (
+            foreign_breaches,
+            {"lidarslam__core__scan": "def f():\n  import torch.nn"},
+            "lidarslam.core.scan imports torch",
+        ),
+        (foreign_breaches, {"mapping__mapper": "from gtsam import Pose3"}, "mapping.mapper imports gtsam"),
+        (foreign_breaches, {"odometry__learned": "import kiss_icp.metrics"}, "odometry.learned imports kiss_icp"),
+        (foreign_breaches, {"lidarslam__run": "class A:\n  import click"}, "lidarslam.run imports click"),
+        (
+            foreign_breaches,
+            {"lidarslam__viewer": "import importlib\nlazy = importlib.import_module('rerun.blueprint')"},
+            "lidarslam.viewer imports rerun",
+        ),
+        (
+            cycle_breaches,
+            {
+                "mapping__a": "import mapping.b",
+                "mapping__b": "from mapping import c",
+                "mapping__c": "def f():\n  import mapping.a",
+            },
+            "mapping.a -> mapping.b -> mapping.c -> mapping.a",
+        ),
+        (
+            weight_breaches,
+            {"mapping__config": "import open3d as o3d"},
+            "mapping.config loads open3d through mapping.config",
+        ),
+        (
+            weight_breaches,
+            {
+                "odometry__config": "from odometry import network",
+                "odometry__network": "try:\n  import torch\nfinally: ...",
+            },
+            "odometry.config loads torch through odometry.network",
+        ),
+        (root_breaches, {"mapping": '"""Maps."""\nfrom mapping import a', "mapping__a": ""}, "mapping"),
+        (root_breaches, {"mapping": "", "mapping__a": ""}, "mapping"),
+        (name_breaches, {"odometry__utils": ""}, "odometry.utils"),
+    ],
+)
+def test_a_planted_breach_is_told(rule, planted, told):
+    assert rule(parse_planted(**planted)) == [told]
+
+
+def test_what_is_allowed_is_not_told():
+    allowed = parse_planted(
+        lidarslam__core='"""Docstring."""',
+        lidarslam__core__geometry="import numpy, scipy.linalg, typing_extensions, math",
+        lidarslam__core__scan="from . import geometry",
+        lidarslam__cli="import click\ndef f():\n  import lidarslam.run",
+        lidarslam__run="from mapping import pose_graph\nimport lidarslam.rerun_viewer",
+        lidarslam__rerun_viewer="import rerun.blueprint",
+        mapping='"""Docstring."""',
+        mapping__pose_graph="import gtsam\nfrom lidarslam.core.geometry import exp",
+        mapping__config="import pydantic\ndef f():\n  import open3d",
+        odometry__kiss_worker="import kiss_icp.kiss_icp",
+        lidarslam__datasets__bag_file="import rosbags.rosbag1",
+    )
+    assert {rule.__name__: rule(allowed) for rule in RULES} == {rule.__name__: [] for rule in RULES}
