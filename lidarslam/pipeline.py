@@ -5,9 +5,10 @@ from a motion (checking it, compensating the sweep, adding it to the map) happen
 """
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from mapping.deskew import deskew
 from mapping.global_map import GlobalMap, voxel_size_for
 from odometry.consistency import Consistency, ConsistencyCheck
 from odometry.interface import Motion, Odometry
+
+STAGES = ("read", "odometry", "deskew", "check", "map")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,7 @@ class ScanResult:
         points_read, points_dropped: valid points of the raw scan, and how many were left out as invalid.
         points_used: how many the motion rests on.
         residual_m, inlier_ratio: how the scan lies on the previous one; None when that cannot be told.
-        stage_ms: wall time of each stage.
+        stage_ms: wall time of each of the `STAGES`; read is the time spent waiting for the scan.
     """
 
     stamp: float
@@ -67,25 +70,27 @@ class Pipeline:
         """Process the scans in order; each result comes while the next scan's odometry is at work."""
         job: Future[ScanResult] | None = None
         with ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
-            scans = iter(scans)
-            while True:
-                started = time.perf_counter()
-                scan = next(scans, None)
-                if scan is None:
-                    break
-                read = time.perf_counter()
-                motion = self._odometry.estimate(scan)
-                stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
-                interval_s = 0.0 if self._previous_stamp is None else scan.stamp - self._previous_stamp
-                self._previous_stamp = scan.stamp
-                self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
+            for follow in self._lead(scans):
                 if job is not None:
                     yield job.result()
-                job = pool.submit(self._follow, scan, motion, self._T_odom_lidar, interval_s, stage_ms)
+                job = pool.submit(follow)
             if job is not None:
                 yield job.result()
         if self._waiting is not None:  # there never was a second scan
             self._add(self._crop(self._waiting).points, np.eye(4))
+
+    def _lead(self, scans: Iterable[Scan]) -> Iterator[Callable[[], ScanResult]]:
+        """Read and estimate scan after scan; what is left to do for each is handed out as a function."""
+        started = time.perf_counter()
+        for scan in scans:
+            read = time.perf_counter()
+            motion = self._odometry.estimate(scan)
+            stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
+            interval_s = 0.0 if self._previous_stamp is None else scan.stamp - self._previous_stamp
+            self._previous_stamp = scan.stamp
+            self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
+            yield partial(self._follow, scan, motion, self._T_odom_lidar, interval_s, stage_ms)
+            started = time.perf_counter()
 
     def _follow(
         self, scan: Scan, motion: Motion, T_odom_lidar: FloatArray, interval_s: float, stage_ms: dict[str, float]

@@ -11,7 +11,7 @@ from lidarslam.config import ViewerConfig
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline import ScanResult
+from lidarslam.pipeline import STAGES, ScanResult
 
 _SCAN_TIMELINE = "scan"
 _TIME_TIMELINE = "time"
@@ -20,7 +20,12 @@ _TIME_TIMELINE = "time"
 _STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
 _REFERENCE_COLOUR = (0, 158, 115)
 _SCAN_COLOUR = (240, 228, 66)
-_PLOTS = (("ms", "ms per scan"), ("residual", "residual [m]"), ("inliers", "inlier ratio"))
+# Entity, title, and the names of its series.
+_PLOTS = (
+    ("ms", "ms per scan", STAGES),
+    ("residual", "Residual [m]", ("median point to plane",)),
+    ("inliers", "Inlier ratio", ("worst direction",)),
+)
 
 
 class RerunViewer:
@@ -66,12 +71,8 @@ class RerunViewer:
             "world/lidar/scan", rr.Points3D(points, colors=[_SCAN_COLOUR], radii=[rr.Radius.ui_points(1.5)])
         )
         self._log_path(T[:3, 3], result.status)
-        values = {
-            "ms": sum(result.stage_ms.values()),
-            "residual": result.residual_m,
-            "inliers": result.inlier_ratio,
-        }
-        for plot, value in values.items():
+        self._recording.log("plots/ms", rr.Scalars([result.stage_ms[stage] for stage in STAGES]))
+        for plot, value in (("residual", result.residual_m), ("inliers", result.inlier_ratio)):
             if value is not None:
                 self._recording.log(f"plots/{plot}", rr.Scalars(value))
         if result.message:
@@ -94,8 +95,8 @@ class RerunViewer:
 
     def _log_static(self) -> None:
         self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for plot, title in _PLOTS:
-            self._recording.log(f"plots/{plot}", rr.SeriesLines(names=[title]), static=True)
+        for plot, _, names in _PLOTS:
+            self._recording.log(f"plots/{plot}", rr.SeriesLines(names=names), static=True)
 
     def _log_path(self, position: FloatArray, status: Status) -> None:
         """Only the newest piece: the view shows all pieces up to the present, so the recording grows linearly."""
@@ -118,12 +119,12 @@ def _blueprint() -> rrb.Blueprint:
         name="Trajectory and map",
         overrides={"world/trajectory": [rrb.VisibleTimeRanges(whole_past)]},
     )
-    plots = [rrb.TimeSeriesView(origin=f"/plots/{plot}", name=title) for plot, title in _PLOTS]
+    plots = [rrb.TimeSeriesView(origin=f"/plots/{plot}", name=title) for plot, title, _ in _PLOTS]
     return rrb.Blueprint(
         rrb.Horizontal(
             space, rrb.Vertical(*plots, rrb.TextLogView(origin="/log", name="Messages")), column_shares=[3, 1]
         ),
-        rrb.TimePanel(timeline=_SCAN_TIMELINE),
+        rrb.TimePanel(timeline=_SCAN_TIMELINE, state="collapsed"),
         collapse_panels=True,
     )
 

@@ -11,10 +11,8 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline import ScanResult
+from lidarslam.pipeline import STAGES, ScanResult
 from lidarslam.run_directory import SCANS_CSV, RunDirectory
-
-STAGES = ("read", "odometry", "deskew", "check", "map")
 
 COLUMNS = (
     "index",

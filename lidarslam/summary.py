@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.tracking import Status
-from lidarslam.scan_log import STAGES, ScanLog
+from lidarslam.pipeline import STAGES
+from lidarslam.scan_log import ScanLog
 
 
 @dataclass(frozen=True)

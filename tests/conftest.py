@@ -1,10 +1,16 @@
-"""Shared fixtures."""
+"""Shared fixtures: random numbers, real recordings, and a room whose scans are known exactly."""
 
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
 
 
 @pytest.fixture
@@ -20,3 +26,88 @@ def real_data() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("set LIDARSLAM_TEST_DATA to the folder with kitti_odometry_04 and kitti_raw_0005")
     return Path(folder)
+
+
+@dataclass(frozen=True)
+class Room:
+    """A box of 14 x 10 x 4 m with four pillars, scanned without noise at 10 Hz.
+
+    The scanner turns once a sweep and looks up and down at random: rings would repeat with every sweep, and methods
+    that match points to points stick to them.
+    """
+
+    half_size: tuple[float, float, float] = (7.0, 5.0, 2.0)
+    pillars: tuple[tuple[float, float, float], ...] = ((3, 2, 0.4), (-4, -3, 0.6), (-2, 3.5, 0.3), (5, -2, 0.5))
+    points: int = 9_000
+    period_s: float = 0.1
+
+    def directions(self, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Unit directions (N, 3) of one sweep and the fraction (N,) of the sweep each is measured at."""
+        rng = np.random.default_rng(seed)
+        fraction = np.sort(rng.uniform(0.0, 1.0, self.points))
+        elevation, azimuth = np.deg2rad(rng.uniform(-30.0, 30.0, self.points)), np.pi - 2.0 * np.pi * fraction
+        rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        return np.stack(rays, axis=-1), fraction
+
+    def cast(self, origins: FloatArray, directions: FloatArray) -> FloatArray:
+        """Distance (N,) along each ray (N, 3) to the first wall or pillar."""
+        with np.errstate(divide="ignore"):
+            inverse = 1.0 / np.where(directions == 0.0, 1e-12, directions)
+        walls = np.array(self.half_size)
+        distance = ((np.sign(directions) * walls - origins) * inverse).min(axis=1)
+        for x, y, half in self.pillars:
+            near = (np.array([x - half, y - half, -walls[2]]) - origins) * inverse
+            far = (np.array([x + half, y + half, walls[2]]) - origins) * inverse
+            enter, leave = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
+            distance = np.where((enter < leave) & (enter > 0.0), np.minimum(distance, enter), distance)
+        return distance
+
+    def distance_to_surface(self, points: FloatArray) -> FloatArray:
+        """Distance (N,) of points (N, 3) to the nearest wall or pillar."""
+        distance = np.abs(np.abs(points) - self.half_size).min(axis=1)
+        for x, y, half in self.pillars:
+            outside = np.abs(points[:, :2] - [x, y]) - half
+            beside = np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0)
+            distance = np.minimum(distance, np.abs(beside))
+        return distance
+
+    def sweep(self, T_room_lidar_at: Callable[[FloatArray], FloatArray], stamp: float, stamp_at: float = 0.5) -> Scan:
+        """A rolling sweep: every ray is cast from the pose (N, 4, 4) at its own time (N,).
+
+        `stamp_at` says where in the sweep the stamp lies: 0 at its start, 1 at its end.
+        """
+        directions, fraction = self.directions(seed=round(1e3 * stamp))
+        offsets = (fraction - stamp_at) * self.period_s
+        T = T_room_lidar_at(stamp + offsets)
+        ranges = self.cast(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], directions))
+        return Scan.from_raw(directions * ranges[:, None], stamp, offsets)
+
+
+@pytest.fixture(scope="session")
+def room() -> Room:
+    """The room."""
+    return Room()
+
+
+@pytest.fixture(scope="session")
+def drive() -> Callable[[FloatArray], FloatArray]:
+    """A smooth path through the room: poses (N, 4, 4) at times (N,); about 0.8 m/s, turning 17 degrees a second."""
+
+    def T_room_lidar_at(time: FloatArray) -> FloatArray:
+        start = exp([0.0, 0.0, 0.3, -4.0, 0.0, -0.4])
+        return start @ exp(np.multiply.outer(np.asarray(time), [0.0, 0.01, 0.3, 0.8, 0.05, 0.0]))
+
+    return T_room_lidar_at
+
+
+@pytest.fixture(scope="session")
+def room_truth(drive: Callable[[FloatArray], FloatArray]) -> Trajectory:
+    """The true poses at the stamps of `room_scans`."""
+    stamps = 0.1 * np.arange(1, 21)
+    return Trajectory(stamps, drive(stamps))
+
+
+@pytest.fixture(scope="session")
+def room_scans(room: Room, drive: Callable[[FloatArray], FloatArray], room_truth: Trajectory) -> list[Scan]:
+    """Twenty rolling sweeps along the drive, stamped in their middle."""
+    return [room.sweep(drive, float(stamp)) for stamp in room_truth.stamps]

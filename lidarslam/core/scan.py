@@ -59,9 +59,12 @@ class Scan:
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
         the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite.
         """
-        xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        raw = np.asarray(points, dtype=np.float64)
+        if raw.size and raw.shape[-1] != 3:
+            raise ValueError(f"points must be (..., 3), got {raw.shape}")
+        xyz = raw.reshape(-1, 3)
         offsets = None if time_offsets is None else np.asarray(time_offsets, dtype=np.float64).reshape(-1)
-        lasers = None if rings is None else np.asarray(rings).astype(np.int32).reshape(-1)
+        lasers = None if rings is None else np.asarray(rings).reshape(-1)
         for name, values in (("time_offsets", offsets), ("rings", lasers)):
             if values is not None and len(values) != len(xyz):
                 raise ValueError(f"{name} has {len(values)} entries for {len(xyz)} points")
@@ -75,7 +78,8 @@ class Scan:
             xyz = xyz[valid]
             offsets = None if offsets is None else offsets[valid]
             lasers = None if lasers is None else lasers[valid]
-        return cls(xyz, float(stamp), offsets, lasers, dropped)
+        # Invalid points may carry NaN for a ring, which no integer can hold: cast what is left.
+        return cls(xyz, float(stamp), offsets, None if lasers is None else lasers.astype(np.int32), dropped)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":
         """The scan with only the chosen points (a mask or indices), times and rings in step."""

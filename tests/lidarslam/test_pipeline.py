@@ -1,0 +1,127 @@
+"""Scans of known truth through the pipeline: poses, map, and what happens when tracking is lost."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline import Pipeline, ScanResult
+from mapping.config import GlobalMapConfig
+from odometry.config import ConsistencyConfig
+from odometry.consistency import ConsistencyCheck
+from odometry.external import ExternalOdometry
+from odometry.interface import Motion
+
+
+def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:
+    return Pipeline(odometry, ConsistencyCheck(ConsistencyConfig()), GlobalMapConfig(voxel_size_m=voxel_size_m))
+
+
+@pytest.fixture
+def true_odometry(room_truth: Trajectory) -> ExternalOdometry:
+    return ExternalOdometry(room_truth)
+
+
+def test_true_motions_give_true_poses_and_a_true_map(
+    true_odometry: ExternalOdometry, room: Any, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    pipeline = make_pipeline(true_odometry)
+    results = list(pipeline.run(room_scans))
+    truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
+    np.testing.assert_allclose([result.T_world_lidar for result in results], truth, atol=1e-9)
+    assert all(result.status is Status.OK for result in results)
+    assert pipeline.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    # A voxel's mean may lie off a corner by a part of the voxel; nothing else may lie off a surface.
+    distance = room.distance_to_surface(in_room)
+    assert np.median(distance) < 1e-6
+    assert distance.max() < 0.06
+
+
+def test_results_carry_the_compensated_points(
+    true_odometry: ExternalOdometry, room: Any, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    results = list(make_pipeline(true_odometry).run(room_scans[:6]))
+    in_room = transform_points(room_truth.T_world_lidar[5], results[5].points)
+    assert room.distance_to_surface(in_room).max() < 1e-6
+    assert results[5].points_read == len(room_scans[5])
+    assert set(results[5].stage_ms) == {"read", "odometry", "deskew", "check", "map"}
+
+
+def test_a_single_scan_becomes_the_map(true_odometry: ExternalOdometry, room_scans: list[Scan]) -> None:
+    pipeline = make_pipeline(true_odometry)
+    (result,) = pipeline.run(room_scans[:1])
+    np.testing.assert_array_equal(result.T_world_lidar, np.eye(4))
+    assert pipeline.global_map is not None
+    assert len(pipeline.global_map.points()) > 1_000
+
+
+def test_no_scans_give_no_results(true_odometry: ExternalOdometry) -> None:
+    assert list(make_pipeline(true_odometry).run([])) == []
+
+
+class _Astray:
+    """True motions, but for one scan whose motion is wrong or not measured."""
+
+    def __init__(self, truth: Trajectory, index: int, error: list[float], failure: str | None = None) -> None:
+        self._motions = [np.eye(4), *truth.relative_motions()]
+        self._motions[index] = self._motions[index] @ exp(error)
+        self._failures = {index: failure}
+        self._next = 0
+
+    def estimate(self, scan: Scan) -> Motion:
+        index, self._next = self._next, self._next + 1
+        return Motion(self._motions[index], len(scan), self._failures.get(index))
+
+    def correct(self, T_prev_curr: FloatArray) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def statuses(results: list[ScanResult]) -> list[Status]:
+    return [result.status for result in results]
+
+
+@pytest.mark.parametrize("failure", [None, "the sensor was covered"])
+def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(
+    room: Any, room_scans: list[Scan], room_truth: Trajectory, failure: str | None
+) -> None:
+    error = [0.0] * 6 if failure else [0.0, 0.0, 0.4, 0.0, 0.0, 0.0]
+    pipeline = make_pipeline(_Astray(room_truth, 19, error, failure))
+    results = list(pipeline.run(room_scans))
+    assert statuses(results) == [Status.OK] * 19 + [Status.LOST]
+    assert failure is None or results[19].message == failure
+    assert pipeline.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert room.distance_to_surface(in_room).max() < 0.06, "no wall is drawn twice"
+
+
+def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(
+    true_odometry: ExternalOdometry, room_scans: list[Scan]
+) -> None:
+    def scans() -> Any:
+        yield from room_scans[:3]
+        raise OSError("disk")
+
+    results = []
+    with pytest.raises(OSError, match="disk"):
+        for result in make_pipeline(true_odometry).run(scans()):
+            results.append(result)
+    assert len(results) == 2, "the third was still at work"
+
+
+def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive: Callable[..., FloatArray]) -> None:
+    scans = [room.sweep(drive, float(stamp)) for stamp in (0.1, 0.2)]
+    config = GlobalMapConfig(voxel_size_m=0.1, min_range_m=2.0, max_range_m=4.0)
+    pipeline = Pipeline(true_odometry, ConsistencyCheck(ConsistencyConfig()), config)
+    for result in pipeline.run(scans):
+        ranges = np.linalg.norm(result.points, axis=1)
+        assert ranges.min() > 1.9  # compensation moves points by centimetres after the crop
+        assert ranges.max() < 4.1

@@ -1,0 +1,71 @@
+"""Whether two scans fit each other: true motions do, wrong ones do not."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import exp, inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from mapping.deskew import deskew
+from odometry.config import ConsistencyConfig
+from odometry.consistency import Consistency, ConsistencyCheck, plane_distances
+
+
+@pytest.fixture
+def check() -> ConsistencyCheck:
+    return ConsistencyCheck(ConsistencyConfig())
+
+
+def fit(check: ConsistencyCheck, scans: list[Scan], truth: Trajectory, error: list[float]) -> Consistency:
+    """The fit of two true sweeps under the true motion followed by an error."""
+    T_prev_curr = inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[1]
+    points = [deskew(s.points, s.time_offsets, T_prev_curr, 0.1) for s in scans[:2] if s.time_offsets is not None]
+    assert check.check(points[0], np.eye(4)).status is Status.OK
+    return check.check(points[1], T_prev_curr @ exp(error))
+
+
+def test_the_true_motion_fits(check: ConsistencyCheck, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    result = fit(check, room_scans, room_truth, [0.0] * 6)
+    assert result.status is Status.OK
+    assert result.inlier_ratio is not None
+    assert result.residual_m is not None
+    assert result.inlier_ratio > 0.9
+    assert result.residual_m < 0.01
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        [0.0, 0.0, np.deg2rad(15.0), 0.0, 0.0, 0.0],
+        [0.0, np.deg2rad(15.0), 0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.6, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.6, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.6],
+    ],
+    ids=["yaw", "pitch", "forwards", "sideways", "up"],
+)
+def test_a_wrong_motion_is_found_in_every_direction(
+    check: ConsistencyCheck, room_scans: list[Scan], room_truth: Trajectory, error: list[float]
+) -> None:
+    assert fit(check, room_scans, room_truth, error).status is Status.LOST
+
+
+def test_without_points_a_scan_is_lost(check: ConsistencyCheck, room_scans: list[Scan]) -> None:
+    check.check(room_scans[0].points, np.eye(4))
+    result = check.check(np.empty((0, 3)), np.eye(4))
+    assert result == Consistency(None, None, Status.LOST)
+
+
+def test_distances_to_planes_are_exact() -> None:
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 21), np.linspace(-1.0, 1.0, 21))
+    plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    queries = np.array([[0.13, 0.21, 0.3], [0.5, -0.4, -0.05]])
+    distances, facing = plane_distances(queries, plane)
+    np.testing.assert_allclose(distances, [0.3, 0.05], atol=1e-12)
+    np.testing.assert_array_equal(facing, [2, 2])
+
+
+def test_a_cloud_without_planes_gives_no_distance(rng: np.random.Generator) -> None:
+    distances, _ = plane_distances(rng.uniform(-1.0, 1.0, (50, 3)), rng.uniform(-1.0, 1.0, (500, 3)))
+    assert np.isnan(distances).mean() > 0.5

@@ -1,0 +1,72 @@
+"""The configuration: closed, typed, and clear about what is wrong."""
+
+from pathlib import Path
+
+import pytest
+
+from lidarslam.config import Config, dump_yaml, load_config
+from lidarslam.core.errors import ConfigError
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+
+
+def test_defaults_come_from_the_code() -> None:
+    assert load_config() == Config()
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("**/*.yaml")), ids=lambda path: path.name)
+def test_every_shipped_file_loads_and_differs_from_the_defaults(path: Path) -> None:
+    assert load_config(path) != Config()
+
+
+def test_settings_win_over_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("odometry: {kiss_icp: {voxel_size_m: 0.5, max_range_m: 40}}\n")
+    config = load_config(file, ["odometry.kiss_icp.voxel_size_m=0.25"])
+    assert config.odometry.kiss_icp.voxel_size_m == 0.25
+    assert config.odometry.kiss_icp.max_range_m == 40.0
+
+
+def test_what_is_dumped_loads_again_with_the_section_on_the_run(tmp_path: Path) -> None:
+    config = load_config(None, ["reader.sequence='04'", "global_map.voxel_size_m=0.3"])
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_yaml(config, {"version": "0.1.0", "source": "somewhere"}))
+    assert load_config(file) == config
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["odometry.kiss_icp.voxelsize=1"], r"no odometry\.kiss_icp\.voxelsize; did you mean voxel_size_m\?"),
+        (["odometry.colour=1"], r"no odometry\.colour; there are: method"),
+        (["global_map.voxel_size_m=-1"], r"global_map\.voxel_size_m=-1: input should be greater than 0"),
+        (["odometry.method=loam"], r"odometry\.method='loam': input should be 'kiss-icp'"),
+        (["global_map"], r"expected key\.path=value"),
+        (["global_map.voxel_size_m=2", "global_map.voxel_size_m.x=1"], "voxel_size_m is a value, not a section"),
+    ],
+)
+def test_mistakes_are_named(settings: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, settings)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [1, 2", "not YAML"),
+        ("- 1\n- 2\n", "expected keys and values, got a list"),
+        (b"\xff\xfe\x00", "cannot be read"),
+    ],
+)
+def test_broken_files_are_named(tmp_path: Path, text: str | bytes, message: str) -> None:
+    file = tmp_path / "broken.yaml"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigError, match=message) as error:
+        load_config(file)
+    assert "broken.yaml" in str(error.value)
+
+
+def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "empty.yaml"
+    file.write_text("# nothing\n")
+    assert load_config(file) == Config()
