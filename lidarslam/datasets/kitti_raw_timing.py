@@ -1,0 +1,100 @@
+"""When the sweeps of a KITTI raw drive took place, and when within its sweep a point was measured."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.stamps import mend_stamps, read_stamps
+
+# Sweeps of one drive last the same to 0.2 %; what differs by more than this part is a wrong stamp.
+_SWEEP_TOLERANCE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTiming:
+    """The times of N sweeps.
+
+    Attributes:
+        stamps: (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras.
+        before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end.
+        from_clock: whether the stamps are clock readings; else they are made from the rate.
+        notes: what the user should know.
+    """
+
+    stamps: FloatArray
+    before_s: FloatArray
+    after_s: FloatArray
+    from_clock: bool
+    notes: tuple[str, ...]
+
+
+def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], rate_hz: float) -> SweepTiming:
+    """Read timestamps.txt, timestamps_start.txt and timestamps_end.txt of a `velodyne_points` folder.
+
+    Args:
+        folder: where the three files are, if they are.
+        numbers: (N,) the scans' numbers, which are the rows of the files; a missing scan has a blank row.
+        rate_hz: makes the stamps when timestamps.txt is missing or useless.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    stamps, notes = _read_forward_stamps(folder / "timestamps.txt", numbers)
+    if stamps is None:
+        half = np.full(len(numbers), 0.5 / rate_hz)
+        notes = (*notes, f"The stamps assume {rate_hz:g} scans a second.")
+        return SweepTiming(numbers / rate_hz, half, half, False, notes)
+    start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
+    period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / rate_hz
+    if start is None or end is None:
+        notes = (*notes, "There are no timestamps_start.txt and timestamps_end.txt; sweeps are taken to be seamless.")
+        half = np.full(len(numbers), 0.5 * period)
+        return SweepTiming(stamps, half, half, True, notes)
+    before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
+    after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
+    if wrong_starts or wrong_ends:
+        notes = (*notes, f"{wrong_starts} starts and {wrong_ends} ends of sweeps are implausible and were replaced.")
+    return SweepTiming(stamps, before_s, after_s, True, notes)
+
+
+def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray | None:
+    """The stamps of the rows with these numbers, NaN where the file ends before; None without a file."""
+    if not path.is_file():
+        return None
+    stamps = read_stamps(path)
+    padded = np.full(max(len(stamps), int(numbers[-1]) + 1), np.nan)
+    padded[: len(stamps)] = stamps
+    return padded[numbers]
+
+
+def _read_forward_stamps(path: Path, numbers: NDArray[np.intp]) -> tuple[FloatArray | None, tuple[str, ...]]:
+    stamps = _rows(path, numbers)
+    if stamps is None:
+        return None, (f"There is no {path.name}.",)
+    try:
+        mended, count = mend_stamps(stamps, numbers.astype(np.float64))
+    except ValueError:
+        return None, (f"{path.name} has no two stamps that increase.",)
+    if not count:
+        return mended, ()
+    return mended, (f"{count} stamps of {path.name} are missing, repeat or run backwards and were interpolated.",)
+
+
+def _plausible(durations: FloatArray, expected: float) -> tuple[FloatArray, int]:
+    wrong = ~(np.abs(durations - expected) < _SWEEP_TOLERANCE * expected)  # NaN is wrong too
+    return np.where(wrong, expected, durations), int(np.count_nonzero(wrong))
+
+
+def offsets_from_azimuth(points: NDArray[np.floating], before_s: float, after_s: float) -> FloatArray:
+    """Seconds (N,) from the stamp at which points (N, 3) of one sweep were measured.
+
+    Seen from above the laser turns clockwise: it starts at the rear (azimuth pi), sweeps the left side, faces
+    forward (azimuth 0) at the stamp, sweeps the right side and ends at the rear (azimuth -pi). Measured on the
+    drives 0005 and 0009: deskewed in this direction, scans half a second apart lie closer to each other's planes
+    than without deskewing, deskewed in the opposite direction less close.
+    """
+    half_turns: FloatArray = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / -np.pi
+    return np.where(half_turns < 0.0, before_s * half_turns, after_s * half_turns)

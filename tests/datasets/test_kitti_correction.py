@@ -1,0 +1,55 @@
+"""The elevation correction against KISS-ICP's own, and against what it means."""
+
+import numpy as np
+import pytest
+
+from lidarslam.datasets.kitti_correction import correct_elevation
+
+
+def _cloud(rng: np.random.Generator, count: int = 20_000) -> np.ndarray:
+    return rng.uniform([-80.0, -80.0, -5.0], [80.0, 80.0, 10.0], size=(count, 3))
+
+
+def test_equals_kiss_icp(rng):
+    pybind = pytest.importorskip("kiss_icp.pybind.kiss_icp_pybind")
+    points = _cloud(rng)
+    expected = np.asarray(pybind._correct_kitti_scan(pybind._Vector3dVector(points)))
+    assert np.abs(expected - points).max() > 0.3  # the oracle does something
+    np.testing.assert_allclose(correct_elevation(points, 0.205), expected, rtol=0.0, atol=1e-9)
+
+
+def test_raises_elevation_and_keeps_range_and_azimuth(rng):
+    points = _cloud(rng)
+    raised = correct_elevation(points, 1.5)
+    elevation = [np.rad2deg(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))) for p in (points, raised)]
+    np.testing.assert_allclose(elevation[1] - elevation[0], 1.5, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(raised, axis=1), np.linalg.norm(points, axis=1), rtol=1e-12)
+    azimuth = [np.arctan2(p[:, 1], p[:, 0]) for p in (points, raised)]
+    np.testing.assert_allclose(azimuth[1], azimuth[0], atol=1e-12)
+
+
+def test_is_undone_by_the_opposite_angle(rng):
+    points = _cloud(rng)
+    np.testing.assert_allclose(correct_elevation(correct_elevation(points, 0.7), -0.7), points, atol=1e-11)
+
+
+def test_leaves_its_input_alone_and_computes_in_double_precision(rng):
+    points = _cloud(rng).astype(np.float32)
+    before = points.copy()
+    raised = correct_elevation(points, 0.205)
+    assert raised.dtype == np.float64
+    np.testing.assert_array_equal(points, before)
+    np.testing.assert_allclose(raised, correct_elevation(points.astype(np.float64), 0.205), atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 1, 8191, 8192, 8193])
+def test_handles_every_number_of_points(rng, count):
+    points = _cloud(rng, count)
+    one_by_one = [correct_elevation(point[None], 0.205)[0] for point in points]
+    np.testing.assert_allclose(correct_elevation(points, 0.205), np.reshape(one_by_one, (-1, 3)), atol=1e-12)
+
+
+def test_invalid_points_stay_recognisable():
+    raised = correct_elevation(np.array([[0.0, 0.0, 0.0], [np.nan, 1.0, 2.0], [np.inf, 1.0, np.inf]]), 0.205)
+    np.testing.assert_array_equal(raised[0], 0.0)
+    assert not np.isfinite(raised[1:]).all(axis=1).any()

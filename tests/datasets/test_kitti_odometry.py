@@ -1,0 +1,237 @@
+"""The KITTI odometry reader on little recordings in the published layout, and on a real one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp, inverse, is_rigid
+from lidarslam.core.trajectory_io import format_kitti
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.registry import choose_reader, open_recording
+
+UNCORRECTED = ReaderConfig(kitti_elevation_correction_deg=0.0)
+# The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.
+AXES = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+T_CAM_LIDAR = AXES @ exp([0.01, -0.02, 0.015, 0.1, -0.05, -0.3])
+
+
+def _truth(count: int) -> np.ndarray:
+    return np.stack([exp([0.01 * i, -0.004 * i, 0.03 * i, 1.1 * i, 0.1 * i, 0.02 * i]) for i in range(count)])
+
+
+def _write_sequence(
+    root: Path, rng: np.random.Generator, name: str = "04", numbers=range(6), rows: int = 6, poses: int | None = 6
+) -> list[np.ndarray]:
+    folder = root / "sequences" / name
+    (folder / "velodyne").mkdir(parents=True)
+    clouds = []
+    for number in numbers:
+        cloud = rng.uniform(1.0, 30.0, size=(50 + number, 4)).astype(np.float32)
+        cloud.tofile(folder / "velodyne" / f"{number:06d}.bin")
+        clouds.append(cloud)
+    (folder / "times.txt").write_text("".join(f"{0.1037 * row:.6e}\n" for row in range(rows)))
+    line = " ".join(f"{value:.12e}" for value in T_CAM_LIDAR[:3].reshape(-1))
+    (folder / "calib.txt").write_text(f"P0: {'0.0 ' * 12}\nTr: {line}\n")
+    if poses is not None:
+        T_cam0_cam = T_CAM_LIDAR @ _truth(poses) @ inverse(T_CAM_LIDAR)
+        (root / "poses").mkdir(exist_ok=True)
+        (root / "poses" / f"{name}.txt").write_text(format_kitti(T_cam0_cam))
+    return clouds
+
+
+def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng):
+    clouds = _write_sequence(tmp_path, rng)
+    assert choose_reader(tmp_path) == "kitti-odometry"
+    recording = open_recording(tmp_path, UNCORRECTED)
+    scans = list(recording.scans())
+    assert recording.name == "kitti_04"
+    assert len(recording) == len(scans) == 6
+    for row, (scan, cloud) in enumerate(zip(scans, clouds, strict=True)):
+        np.testing.assert_array_equal(scan.points, cloud[:, :3])
+        assert scan.stamp == pytest.approx(0.1037 * row, abs=1e-6)
+        assert scan.time_offsets is None
+    np.testing.assert_allclose(recording.T_cam_lidar, T_CAM_LIDAR, atol=1e-11)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
+    np.testing.assert_allclose(recording.ground_truth.stamps, [scan.stamp for scan in scans], atol=0.0)
+    assert recording.ground_truth is recording.ground_truth
+
+
+def test_a_single_sequence_folder_reads_the_same(tmp_path, rng, monkeypatch):
+    clouds = _write_sequence(tmp_path, rng)
+    monkeypatch.chdir(tmp_path / "sequences" / "04")
+    for source in (tmp_path / "sequences" / "04", Path()):
+        recording = open_recording(source, UNCORRECTED)
+        np.testing.assert_array_equal(next(recording.scans(2)).points, clouds[2][:, :3])
+        np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
+        assert recording.name == "kitti_04"
+
+
+def test_poses_beside_the_scans_are_found(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    folder = tmp_path / "sequences" / "04"
+    (tmp_path / "poses" / "04.txt").rename(folder / "poses.txt")
+    recording = open_recording(folder, UNCORRECTED)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
+    assert recording.describe().ground_truth.name == "poses.txt"
+
+
+def test_gaps_in_the_numbers_keep_stamps_and_truth_in_step(tmp_path, rng):
+    clouds = _write_sequence(tmp_path, rng, numbers=(1, 2, 4), rows=9, poses=7)
+    recording = open_recording(tmp_path, UNCORRECTED)
+    scans = list(recording.scans())
+    np.testing.assert_allclose([scan.stamp for scan in scans], [0.1037, 0.2074, 0.4148], atol=1e-6)
+    np.testing.assert_array_equal(scans[2].points, clouds[2][:, :3])
+    assert len(recording.ground_truth) == 7
+    np.testing.assert_allclose(recording.ground_truth.at(np.array([scans[2].stamp]))[0], _truth(7)[4], atol=1e-8)
+    assert any("only 3" in note for note in recording.describe().notes)
+
+
+def test_more_poses_than_stamps_are_cut_off(tmp_path, rng):
+    _write_sequence(tmp_path, rng, poses=11)
+    assert len(open_recording(tmp_path).ground_truth) == 6
+
+
+def test_the_correction_is_applied_unless_switched_off(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    raised, plain = (next(open_recording(tmp_path, c).scans()).points for c in (ReaderConfig(), UNCORRECTED))
+    elevation = [np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) for p in (plain, raised)]
+    np.testing.assert_allclose(np.rad2deg(elevation[1] - elevation[0]), 0.205, atol=1e-9)
+    assert any("0.205" in note for note in open_recording(tmp_path).describe().notes)
+    assert not any("elevation" in note for note in open_recording(tmp_path, UNCORRECTED).describe().notes)
+
+
+def test_scans_follow_range(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    recording = open_recording(tmp_path)
+
+    def rows(*args):
+        return [round(scan.stamp / 0.1037) for scan in recording.scans(*args)]
+
+    assert rows(1, 100, 2) == [1, 3, 5]
+    assert rows(2, 4) == [2, 3]
+    assert rows(9) == []
+    for wrong in ((0, None, 0), (-1,), (0, -2), (5, 0, -1)):
+        with pytest.raises(InputError, match="step >= 1"):
+            recording.scans(*wrong)
+
+
+def test_the_sequence_must_be_chosen_among_several(tmp_path, rng):
+    for name in ("03", "07"):
+        _write_sequence(tmp_path, rng, name)
+    (tmp_path / "sequences" / "11").mkdir()  # no scans: not available
+    with pytest.raises(InputError, match=r"--sequence: 03, 07$"):
+        open_recording(tmp_path)
+    with pytest.raises(InputError, match=r"there are: 03, 07$"):
+        open_recording(tmp_path, ReaderConfig(sequence="11"))
+    for wanted in ("07", "7"):
+        assert open_recording(tmp_path, ReaderConfig(sequence=wanted)).name == "kitti_07"
+    with pytest.raises(InputError, match="is the sequence 03, not 07"):
+        open_recording(tmp_path / "sequences" / "03", ReaderConfig(sequence="07"))
+
+
+def test_without_times_the_rate_gives_the_stamps_of_scans_and_truth(tmp_path, rng):
+    _write_sequence(tmp_path, rng, numbers=(0, 1, 3))
+    (tmp_path / "sequences" / "04" / "times.txt").unlink()
+    recording = open_recording(tmp_path, ReaderConfig(rate_hz=20.0))
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [0.0, 0.05, 0.15])
+    np.testing.assert_allclose(recording.ground_truth.stamps, np.arange(6) / 20.0)
+    assert any("20 scans a second" in note for note in recording.describe().notes)
+
+
+def test_without_calibration_or_poses_there_is_no_truth(tmp_path, rng):
+    _write_sequence(tmp_path / "a", rng, poses=None)
+    recording = open_recording(tmp_path / "a")
+    assert recording.ground_truth is None
+    assert recording.describe().ground_truth is None
+    _write_sequence(tmp_path / "b", rng)
+    (tmp_path / "b" / "sequences" / "04" / "calib.txt").unlink()
+    recording = open_recording(tmp_path / "b")
+    assert recording.T_cam_lidar is None
+    assert recording.ground_truth is None
+    assert recording.describe().ground_truth is None
+    assert any("calib.txt" in note for note in recording.describe().notes)
+
+
+def test_describe(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    scan = tmp_path / "sequences" / "04" / "velodyne" / "000000.bin"
+    cloud = np.fromfile(scan, dtype=np.float32).reshape(-1, 4)
+    cloud[3, :3] = 0.0
+    cloud[5, 1] = np.nan
+    cloud.tofile(scan)
+    info = open_recording(tmp_path).describe()
+    assert (info.reader, info.scans, info.points_per_scan, info.dropped_points) == ("kitti-odometry", 6, 48, 2)
+    assert info.duration_s == pytest.approx(5 * 0.1037, abs=1e-6)
+    assert info.rate_hz == pytest.approx(1 / 0.1037, rel=1e-4)
+    assert info.ground_truth == tmp_path / "poses" / "04.txt"
+    assert info.point_time is None
+    assert [field.name for field in info.fields] == ["x", "y", "z", "intensity"]
+
+
+def test_damaged_files_are_named(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    folder = tmp_path / "sequences" / "04"
+    scan = folder / "velodyne" / "000002.bin"
+    scan.write_bytes(scan.read_bytes()[:-5])
+    recording = open_recording(tmp_path)
+    with pytest.raises(InputError, match=r"000002\.bin: expected points of 4 float32 numbers.*copy it again"):
+        list(recording.scans())
+    scan.write_bytes(b"")
+    assert len(next(recording.scans(2))) == 0
+    (folder / "velodyne" / "last.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"last\.bin: expected a name that is the scan's number"):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("0.0\n0.1\n0.2\n", "up to 000005.bin, 6 lines, got 3"),
+        ("0.0\n0.1\nlater\n0.3\n0.4\n0.5\n", "'later' at line 3"),
+        ("0.0\n0.1\n0.2\n0.2\n0.4\n0.5\n", "expected stamps that increase"),
+    ],
+)
+def test_a_damaged_times_file_is_an_error(tmp_path, rng, content, message):
+    _write_sequence(tmp_path, rng)
+    (tmp_path / "sequences" / "04" / "times.txt").write_text(content)
+    with pytest.raises(InputError, match=message):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize("line", ["Tr: 1 2 3", "P0: 1", "Tr: 1 0 0 0 0 2 0 0 0 0 1 0", "Tr: 1 0 0 0 0 1 0 0 0 0 -1 0"])
+def test_a_damaged_calibration_is_an_error(tmp_path, rng, line):
+    _write_sequence(tmp_path, rng)
+    path = tmp_path / "sequences" / "04" / "calib.txt"
+    path.write_text(line)
+    with pytest.raises(InputError, match=r"calib\.txt"):
+        _ = open_recording(tmp_path).ground_truth
+
+
+@pytest.mark.real_data
+def test_sequence_04(real_data):
+    recording = open_recording(real_data / "kitti_odometry_04")
+    info = recording.describe()
+    assert info.reader == "kitti-odometry"
+    assert info.scans == 51
+    assert 110_000 < info.points_per_scan < 130_000
+    truth = recording.ground_truth
+    assert len(truth) == 271
+    assert is_rigid(truth.T_world_lidar, tolerance=1e-9)
+    # Known as 394 m long; the car drives straight ahead, along x in the LiDAR's frame, z in the camera's.
+    assert truth.length_m == pytest.approx(394.0, abs=0.5)
+    forward = truth.relative_motions()[:, :3, 3]
+    assert (forward[:, 0] > 1.0).all()
+    assert np.abs(forward[:, 1:]).max() < 0.1
+
+
+@pytest.mark.real_data
+def test_sequence_04_scans_are_those_of_kiss_icp(real_data):
+    kitti = pytest.importorskip("kiss_icp.datasets.kitti")
+    root = real_data / "kitti_odometry_04"
+    oracle = kitti.KITTIOdometryDataset(root, "04")
+    recording = open_recording(root)
+    points, _ = oracle[7]
+    np.testing.assert_allclose(next(recording.scans(7)).points, points, atol=1e-9)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, oracle.gt_poses, atol=1e-4)

@@ -1,0 +1,485 @@
+"""The reader of scan folders: every format with every type of field, stamps, truth, and damaged files."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.lzf import decompress_lzf
+from lidarslam.datasets.pcd import read_pcd
+from lidarslam.datasets.ply import read_ply
+from lidarslam.datasets.registry import choose_reader, open_recording
+from lidarslam.datasets.stamps import read_stamps, stamps_from_names
+
+EPOCH = 1583836591.25
+RICH = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<f4"),
+        ("t", "<u4"),
+        ("ring", "<u2"),
+        ("label", "i1"),
+        ("clock", "<f8"),
+    ]
+)
+PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "u4": "uint", "i4": "int"}
+
+
+def _rich(rng: np.random.Generator, count: int = 200) -> np.ndarray:
+    table = np.zeros(count, RICH)
+    for name in "xyz":
+        table[name] = rng.uniform(1.0, 30.0, count)
+    table["intensity"] = rng.uniform(0.0, 255.0, count)
+    table["t"] = np.linspace(0, 99_000_000, count)  # nanoseconds of a sweep of 0.1 s
+    table["ring"] = np.arange(count) % 16 + 300
+    table["label"] = -(np.arange(count) % 100)
+    table["clock"] = EPOCH + 1e-6 * np.arange(count)
+    return table
+
+
+def _pcd_bytes(table: np.ndarray, data: str, points: int | None = None) -> bytes:
+    kinds = {"f": "F", "u": "U", "i": "I"}
+    types = [table.dtype[name] for name in table.dtype.names]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(table.dtype.names),
+        "SIZE " + " ".join(str(t.base.itemsize) for t in types),
+        "TYPE " + " ".join(kinds[t.base.kind] for t in types),
+        "COUNT " + " ".join(str(int(np.prod(t.shape)) if t.shape else 1) for t in types),
+        f"WIDTH {len(table)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(table) if points is None else points}",
+        f"DATA {data}",
+    ]
+    header = ("\n".join(lines) + "\n").encode()
+    if data == "ascii":
+        return header + _ascii(table)
+    if data == "binary":
+        return header + table.tobytes()
+    columns = b"".join(np.ascontiguousarray(table[name]).tobytes() for name in table.dtype.names)
+    packed = _lzf_literals(columns)
+    return header + struct.pack("<II", len(packed), len(columns)) + packed
+
+
+def _ascii(table: np.ndarray) -> bytes:
+    return "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in table).encode()
+
+
+def _lzf_literals(data: bytes) -> bytes:
+    """An LZF stream without copies, as a compressor writes what does not repeat."""
+    return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
+
+
+def _ply_bytes(table: np.ndarray, encoding: str, before: str = "", prefix: bytes = b"") -> bytes:
+    properties = "".join(f"property {PLY_NAMES[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names)
+    header = f"ply\nformat {encoding} 1.0\ncomment made by a test\n{before}element vertex {len(table)}\n{properties}"
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    tail = b"\x03" + bytes(12)
+    if encoding == "ascii":
+        return header.encode() + prefix + _ascii(table) + b"3 0 1 2\n"
+    order = "<" if "little" in encoding else ">"
+    return header.encode() + prefix + table.astype(table.dtype.newbyteorder(order)).tobytes() + tail
+
+
+def _write(folder: Path, name: str, table: np.ndarray) -> None:
+    suffix = name.rpartition(".")[2]
+    folder.mkdir(parents=True, exist_ok=True)
+    if suffix == "npy":
+        np.save(folder / name, table)
+    elif suffix == "pcd":
+        (folder / name).write_bytes(_pcd_bytes(table, "binary"))
+    elif suffix == "ply":
+        (folder / name).write_bytes(_ply_bytes(table, "binary_little_endian"))
+    else:
+        np.column_stack([table[n] for n in ("x", "y", "z", "intensity")]).astype("<f4").tofile(folder / name)
+
+
+def _points(table: np.ndarray) -> np.ndarray:
+    return np.column_stack([table[name] for name in "xyz"]).astype(np.float64)
+
+
+@pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
+def test_pcd_keeps_every_field_and_type(tmp_path, rng, data):
+    table = _rich(rng)
+    (tmp_path / "a.pcd").write_bytes(_pcd_bytes(table, data))
+    read = read_pcd(tmp_path / "a.pcd")
+    assert read.dtype == RICH
+    np.testing.assert_array_equal(read, table)
+
+
+def test_pcd_with_padding_and_vector_fields(tmp_path, rng):
+    dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("_", "u1", (4,)), ("normal", "<f4", (3,))])
+    table = np.zeros(5, dtype)
+    table["x"], table["normal"] = np.arange(5) + 1.0, rng.uniform(size=(5, 3))
+    for data in ("binary", "binary_compressed"):
+        (tmp_path / "a.pcd").write_bytes(_pcd_bytes(table, data))
+        np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["normal"], table["normal"])
+    twice = _pcd_bytes(table, "binary").replace(b"FIELDS x y z _ normal", b"FIELDS x y z _ _")
+    (tmp_path / "a.pcd").write_bytes(twice)
+    np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["x"], table["x"])
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply_keeps_every_property_and_type(tmp_path, rng, encoding):
+    table = _rich(rng)
+    before, prefix = "element sensor 2\nproperty double height\n", b"1.5\n2.5\n"
+    if encoding != "ascii":
+        prefix = np.array([1.5, 2.5], "<f8" if "little" in encoding else ">f8").tobytes()
+    (tmp_path / "a.ply").write_bytes(_ply_bytes(table, encoding, before, prefix))
+    read = read_ply(tmp_path / "a.ply")
+    assert read.dtype.names == RICH.names
+    for name in RICH.names:
+        np.testing.assert_array_equal(read[name], table[name])
+        assert read.dtype[name].newbyteorder("<") == RICH[name].newbyteorder("<")
+
+
+def test_open3d_agrees_on_pcd(tmp_path, rng):
+    o3d = pytest.importorskip("open3d", exc_type=ImportError)
+    table = _rich(rng, 3000)  # repeats, so that Open3D's compressor writes short, long and overlapping copies
+    table["intensity"] = 7.0
+    (tmp_path / "a.pcd").write_bytes(_pcd_bytes(table, "binary"))
+    cloud = o3d.t.io.read_point_cloud(str(tmp_path / "a.pcd"))
+    for compressed in (True, False):
+        o3d.t.io.write_point_cloud(str(tmp_path / "b.pcd"), cloud, write_ascii=False, compressed=compressed)
+        read = read_pcd(tmp_path / "b.pcd")
+        for name in ("x", "y", "z", "intensity", "t", "ring", "clock"):
+            np.testing.assert_array_equal(read[name], table[name])
+
+
+def test_lzf_copies():
+    assert decompress_lzf(bytes([2]) + b"abc" + bytes([0b001_00000, 2]), 6) == b"abcabc"
+    # Seven in the upper bits: a further byte adds to the length; the copy overlaps what it writes.
+    assert decompress_lzf(bytes([1]) + b"xy" + bytes([0b111_00000, 4, 1]), 15) == b"xyxyxyxyxyxyxyx"
+    far = bytes(range(32)) * 10
+    stream = _lzf_literals(far) + bytes([0b001_00001, 319 - 256])
+    assert decompress_lzf(stream, 323) == far + far[:3]
+    for stream in (bytes([0b001_00000, 0]), bytes([1]) + b"xy" + bytes([0b111_00000]), bytes([5]) + b"ab"):
+        with pytest.raises(ValueError):
+            decompress_lzf(stream, 6)
+
+
+@pytest.mark.parametrize("suffix", ["bin", "pcd", "ply", "npy"])
+def test_reads_every_format_with_times_and_rings(tmp_path, rng, suffix):
+    folder = tmp_path / "scans"
+    tables = [_rich(rng, 150 + i) for i in range(3)]
+    for index, table in enumerate(tables):
+        _write(folder, f"scan_{index}.{suffix}", table)
+    assert choose_reader(folder) == "scan-folder"
+    recording = open_recording(folder)
+    assert len(recording) == 3
+    assert recording.name == "scans"
+    assert recording.T_cam_lidar is None
+    for scan, table in zip(recording.scans(), tables, strict=True):
+        np.testing.assert_array_equal(scan.points, _points(table))
+        if suffix == "bin":
+            assert scan.time_offsets is None
+            assert scan.rings is None
+        else:
+            np.testing.assert_allclose(scan.time_offsets, table["t"] * 1e-9, atol=1e-12)
+            np.testing.assert_array_equal(scan.rings, table["ring"])
+    info = recording.describe()
+    assert (info.reader, info.scans, info.points_per_scan) == ("scan-folder", 3, 150)
+    assert info.rate_hz == pytest.approx(10.0)
+    if suffix != "bin":
+        assert (info.point_time.source, info.point_time.unit, info.point_time.reference) == ("t", "ns", "relative")
+        assert info.point_time.last_s == pytest.approx(0.099)
+        assert [(f.name, f.type_name) for f in info.fields][4:6] == [("t", "uint32"), ("ring", "uint16")]
+        assert info.has_rings
+
+
+def test_invalid_points_go_with_their_times_and_rings(tmp_path, rng):
+    table = _rich(rng)
+    table["x"][10] = np.nan
+    for name in "xyz":
+        table[name][20] = 0.0
+    table["t"][20] = 4_000_000_000  # drivers leave anything in points without a return
+    _write(tmp_path, "scan_0.ply", table)
+    scan = next(open_recording(tmp_path).scans())
+    assert scan.dropped == 2
+    kept = np.delete(np.arange(200), [10, 20])
+    np.testing.assert_array_equal(scan.rings, table["ring"][kept])
+    np.testing.assert_allclose(scan.time_offsets, table["t"][kept] * 1e-9, atol=1e-12)
+
+
+def test_time_options(tmp_path, rng):
+    table = _rich(rng)
+    _write(tmp_path, "scan_0.npy", table)
+    assert next(open_recording(tmp_path, ReaderConfig(time_reference="none")).scans()).time_offsets is None
+    table["t"] //= 1000  # microseconds, as their span says; a given unit is not questioned
+    _write(tmp_path, "scan_0.npy", table)
+    for config, factor in ((ReaderConfig(), 1e-6), (ReaderConfig(time_unit="ns", time_reference="relative"), 1e-9)):
+        scan = next(open_recording(tmp_path, config).scans())
+        np.testing.assert_allclose(scan.time_offsets, table["t"] * factor, atol=1e-15)
+    with pytest.raises(InputError, match="no time field 'when'"):
+        next(open_recording(tmp_path, ReaderConfig(time_field="when")).scans())
+
+
+def _absolute(rng, start: float, count: int = 100) -> np.ndarray:
+    dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
+    table = np.zeros(count, dtype)
+    for name in "xyz":
+        table[name] = rng.uniform(1.0, 30.0, count)
+    table["timestamp"] = start + np.linspace(0.0, 0.0625, count)
+    return table
+
+
+def test_absolute_times_count_from_the_stamp(tmp_path, rng):
+    for index in range(3):
+        _write(tmp_path, f"{EPOCH + 0.1 * index:.6f}.ply", _absolute(rng, EPOCH + 0.1 * index - 0.03125))
+    for index, scan in enumerate(open_recording(tmp_path).scans()):
+        assert scan.stamp == pytest.approx(EPOCH + 0.1 * index, abs=1e-6)
+        np.testing.assert_allclose([scan.time_offsets.min(), scan.time_offsets.max()], [-0.03125, 0.03125], atol=1e-6)
+
+
+def test_absolute_times_give_the_stamps_where_there_are_none(tmp_path, rng):
+    for index in range(3):
+        table = _absolute(rng, EPOCH + 0.05 * index)
+        table["timestamp"][7] = 0.0  # a missing return
+        _write(tmp_path, f"scan_{index}.ply", table)
+    recording = open_recording(tmp_path)
+    scans = list(recording.scans())
+    np.testing.assert_allclose([s.stamp for s in scans], EPOCH + 0.05 * np.arange(3), rtol=0.0, atol=1e-6)
+    assert [len(scan) for scan in scans] == [99, 99, 99]
+    assert scans[2].time_offsets.min() == pytest.approx(0.0, abs=1e-6)
+    assert scans[2].time_offsets.max() == pytest.approx(0.0625, abs=1e-6)
+    info = recording.describe()
+    assert info.rate_hz == pytest.approx(20.0, rel=1e-3)
+    assert info.first_stamp == pytest.approx(EPOCH, abs=1e-6)
+
+
+def test_absolute_times_on_a_clock_that_begins_at_zero(tmp_path, rng):
+    for index in range(40):
+        _write(tmp_path, f"scan_{index}.npy", _absolute(rng, 0.1 * index, 20))
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * index:.3f}\n" for index in range(40)))
+    for scan in open_recording(tmp_path).scans(0, None, 13):
+        np.testing.assert_allclose([scan.time_offsets.min(), scan.time_offsets.max()], [0.0, 0.0625], atol=1e-9)
+
+
+def _write_numbered(folder: Path, rng, names: list[str]) -> None:
+    """Scans whose number of points is 10, 11, ... in the order given."""
+    for place, name in enumerate(names):
+        _write(folder, name, _rich(rng, 10 + place))
+
+
+def _sizes(recording) -> list[int]:
+    return [len(scan) for scan in recording.scans()]
+
+
+def test_names_are_sorted_as_people_count(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["scan_0.bin", "scan_2.bin", "scan_10.bin", "scan_11.bin", "scan_100.bin"])
+    assert _sizes(open_recording(tmp_path)) == [10, 11, 12, 13, 14]
+
+
+@pytest.mark.parametrize(
+    ("names", "stamps"),
+    [
+        (["1311868164.36.ply", "1311868164.4.ply", "1311868165.0.ply"], [1311868164.36, 1311868164.4, 1311868165.0]),
+        (["9.9.ply", "10.05.ply"], [9.9, 10.05]),
+        (["1311868164360000000.bin", "1311868164460000000.bin"], [1311868164.36, 1311868164.46]),
+        (["1311868164360000.npy", "1311868164460000.npy"], [1311868164.36, 1311868164.46]),
+        (
+            ["cloud_1583836591_82590976.pcd", "cloud_1583836591_182590976.pcd"],
+            [1583836591.082590976, 1583836591.182591],
+        ),
+    ],
+)
+def test_stamps_from_names(tmp_path, rng, names, stamps):
+    _write_numbered(tmp_path, rng, names)
+    recording = open_recording(tmp_path)
+    assert _sizes(recording) == [10 + i for i in range(len(names))]
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], stamps, rtol=0.0, atol=3e-7)
+    assert "The stamps are the file names." in recording.describe().notes
+
+
+@pytest.mark.parametrize("stems", [["000000", "000001"], ["20240131120000", "20240131120001"], ["a1.5", "a2.5"]])
+def test_names_that_are_no_stamps(stems):
+    assert stamps_from_names(stems) is None
+
+
+def test_without_stamps_the_rate_gives_them(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["000000.bin", "000001.bin", "000002.bin"])
+    recording = open_recording(tmp_path, ReaderConfig(rate_hz=20.0))
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [0.0, 0.05, 0.1])
+    assert any("20 scans a second" in note for note in recording.describe().notes)
+
+
+@pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])
+@pytest.mark.parametrize("above", [False, True])
+def test_a_stamp_file_comes_first(tmp_path, rng, name, above):
+    folder = tmp_path / "scans"
+    _write_numbered(folder, rng, ["5.5.bin", "6.5.bin", "7.5.bin"])
+    (tmp_path / name if above else folder / name).write_text("0.5\n0.75\n1.5\n")
+    recording = open_recording(folder)
+    assert [scan.stamp for scan in recording.scans()] == [0.5, 0.75, 1.5]
+    (tmp_path / name if above else folder / name).write_text("0.5\n0.75\n")
+    with pytest.raises(InputError, match=r"each of the 3 \.bin scans.*got 2"):
+        open_recording(folder)
+
+
+def test_stamp_file_formats(tmp_path):
+    lines = [
+        "# stamps",
+        "1311868164.36",
+        "1311868164460000000",
+        "1311868164560000",
+        "",
+        "2011-07-28 15:49:24.660000000",
+    ]
+    (tmp_path / "times.txt").write_text("\n".join(lines))
+    expected = [1311868164.36, 1311868164.46, 1311868164.56, np.nan, 1311868164.66]
+    np.testing.assert_allclose(read_stamps(tmp_path / "times.txt"), expected, rtol=0.0, atol=3e-7)
+    for wrong in ("0.1 0.2", "nan", "inf", "soon", "2011-99-28 15:49:24.66"):
+        (tmp_path / "times.txt").write_text(f"0.0\n{wrong}\n")
+        with pytest.raises(InputError, match="at line 2"):
+            read_stamps(tmp_path / "times.txt")
+
+
+def test_stamps_that_do_not_increase_are_interpolated(tmp_path, rng):
+    _write_numbered(tmp_path, rng, [f"{i}.bin" for i in range(4)])
+    (tmp_path / "times.txt").write_text("1.0\n1.5\n1.5\n2.5\n")
+    recording = open_recording(tmp_path)
+    np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [1.0, 1.5, 2.0, 2.5])
+    assert any("1 stamps of times.txt" in note for note in recording.describe().notes)
+
+
+@pytest.mark.parametrize("name", ["ground_truth.tum", "groundtruth.tum", "groundtruth.txt", "ground_truth.txt"])
+@pytest.mark.parametrize("above", [False, True])
+def test_truth_beside_the_scans_or_above(tmp_path, rng, name, above):
+    folder = tmp_path / "scans"
+    _write_numbered(folder, rng, ["0.bin", "1.bin"])
+    assert open_recording(folder).ground_truth is None
+    truth = Trajectory(np.array([0.0, 0.1]), np.stack([np.eye(4), exp([0.0, 0.1, 0.2, 1.0, 2.0, 3.0])]))
+    path = tmp_path / name if above else folder / name
+    write_tum(path, truth)
+    recording = open_recording(folder)
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar, truth.T_world_lidar, atol=1e-8)
+    assert recording.describe().ground_truth.samefile(path)
+
+
+def test_a_map_beside_the_scans_is_no_scan(tmp_path, rng):
+    _write_numbered(tmp_path / "a", rng, ["0.bin", "1.bin"])
+    _write(tmp_path / "a", "map.ply", _rich(rng))
+    _write(tmp_path / "a", ".0.bin", _rich(rng))
+    _write_numbered(tmp_path / "b", rng, ["scan_1.ply", "scan_2.ply"])
+    _write(tmp_path / "b", "map.ply", _rich(rng))
+    for name in "ab":
+        recording = open_recording(tmp_path / name)
+        assert _sizes(recording) == [10, 11]
+        assert any("map.ply" in note for note in recording.describe().notes)
+
+
+def test_bin_with_other_numbers_of_columns(tmp_path, rng):
+    five = rng.uniform(1.0, 20.0, size=(32, 5)).astype(np.float32)
+    five[:, 4] = np.arange(32)
+    three = rng.uniform(1.0, 20.0, size=(7, 3)).astype(np.float32)
+    for name, cloud in (("five", five), ("three", three)):
+        (tmp_path / name).mkdir()
+        cloud.tofile(tmp_path / name / "0.bin")
+        np.testing.assert_array_equal(next(open_recording(tmp_path / name).scans()).points, cloud[:, :3])
+    # 32 points of five are 40 of four by size; only the ring numbers tell them apart.
+    np.testing.assert_array_equal(next(open_recording(tmp_path / "five").scans()).rings, np.arange(32))
+    (tmp_path / "four").mkdir()
+    four = rng.uniform(1.0, 20.0, size=(40, 4)).astype(np.float32)
+    four.tofile(tmp_path / "four" / "0.bin")
+    np.testing.assert_array_equal(next(open_recording(tmp_path / "four").scans()).points, four[:, :3])
+    (tmp_path / "six").mkdir()
+    (tmp_path / "six" / "0.bin").write_bytes(bytes(4 * 7 + 1))
+    with pytest.raises(InputError, match="16 bytes each"):
+        open_recording(tmp_path / "six")
+    five[0, 4] = 0.5
+    five[:31].tofile(tmp_path / "five" / "0.bin")
+    with pytest.raises(InputError, match="is no ring"):
+        open_recording(tmp_path / "five")
+
+
+def test_organised_and_plain_npy(tmp_path, rng):
+    cloud = rng.uniform(1.0, 9.0, size=(4, 16, 4))
+    cloud[1, 3, :3] = 0.0
+    np.save(tmp_path / "0.npy", cloud)
+    scan = next(open_recording(tmp_path).scans())
+    np.testing.assert_array_equal(scan.points, np.delete(cloud.reshape(-1, 4), 19, axis=0)[:, :3])
+    for wrong in (np.zeros(9), np.zeros((3, 500)), np.zeros((5, 2)), np.array([["a", "b", "c"]])):
+        np.save(tmp_path / "0.npy", wrong)
+        with pytest.raises(InputError, match=r"0\.npy: expected an array \(N, 3\)"):
+            next(open_recording(tmp_path).scans())
+    np.save(tmp_path / "0.npy", np.array([{"x": 1}]), allow_pickle=True)
+    with pytest.raises(InputError, match=r"0\.npy: cannot be read"):
+        next(open_recording(tmp_path).scans())
+
+
+def _damage(data: bytes, how: str) -> bytes:
+    header_end = max(data.find(b"end_header\n"), data.find(b"DATA"))
+    return {
+        "empty": b"",
+        "header": data[: header_end // 2],
+        "half": data[: (header_end + len(data)) // 2],
+        "noise": bytes(range(256)) * 8,
+        "no_z": data.replace(b" z ", b" w ").replace(b"float z", b"float w"),
+        "count": data.replace(b"POINTS 200", b"POINTS abc").replace(b"vertex 200", b"vertex abc"),
+    }[how]
+
+
+@pytest.mark.parametrize("how", ["empty", "header", "half", "noise", "no_z", "count"])
+@pytest.mark.parametrize("name", ["ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "binary.ply"])
+def test_damaged_files_are_named(tmp_path, rng, name, how):
+    table = _rich(rng)
+    kind, _, suffix = name.partition(".")
+    if suffix == "pcd":
+        data = _pcd_bytes(table, "binary_compressed" if kind == "compressed" else kind)
+    else:
+        data = _ply_bytes(table, "ascii" if kind == "ascii" else "binary_little_endian")
+    (tmp_path / name).write_bytes(data)
+    assert len(next(open_recording(tmp_path).scans())) == 200
+    (tmp_path / name).write_bytes(_damage(data, how))
+    with pytest.raises(InputError, match=rf"{kind}\.{suffix}: .*expected|{kind}\.{suffix}: .*invalid"):
+        next(open_recording(tmp_path).scans())
+
+
+def test_damaged_npy_and_bin_are_named(tmp_path, rng):
+    for suffix in ("npy", "bin"):
+        folder = tmp_path / suffix
+        _write_numbered(folder, rng, [f"{i}.{suffix}" for i in range(3)])
+        path = folder / f"1.{suffix}"
+        path.write_bytes(path.read_bytes()[:-3])
+        recording = open_recording(folder)
+        next(recording.scans())
+        with pytest.raises(InputError, match=rf"1\.{suffix}: "):
+            next(recording.scans(1))
+
+
+def test_ply_with_lists_before_the_vertices_is_refused(tmp_path, rng):
+    before = "element face 1\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "0.ply").write_bytes(_ply_bytes(_rich(rng), "ascii", before, b"3 0 1 2\n"))
+    with pytest.raises(InputError, match="plain type"):
+        next(open_recording(tmp_path).scans())
+
+
+def test_scans_follow_range_and_a_file_is_no_folder(tmp_path, rng):
+    _write_numbered(tmp_path, rng, [f"{i}.bin" for i in range(5)])
+    recording = open_recording(tmp_path)
+    assert [len(scan) for scan in recording.scans(1, 9, 3)] == [11, 14]
+    with pytest.raises(InputError, match="step >= 1"):
+        recording.scans(0, None, 0)
+    with pytest.raises(InputError, match="give the folder"):
+        open_recording(tmp_path / "0.bin", ReaderConfig(name="scan-folder"))
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="found none"):
+        open_recording(tmp_path / "none", ReaderConfig(name="scan-folder"))
+
+
+@pytest.mark.real_data
+def test_a_real_folder_of_bin(real_data):
+    recording = open_recording(real_data / "kitti_raw_stop/2011_09_26/2011_09_26_drive_stop_sync/velodyne_points/data")
+    info = recording.describe()
+    assert (info.scans, info.has_rings, [field.name for field in info.fields][-1]) == (78, False, "intensity")
+    assert 100_000 < info.points_per_scan < 130_000
