@@ -1,0 +1,1 @@
+"""Worlds, sensors and motions: recordings whose truth is known exactly."""

@@ -1,0 +1,208 @@
+"""What a world is made of: boxes, cylinders and height fields, things that move, and a route through it.
+
+Few primitives serve two casters: Open3D casts rays against their triangles, the batched one against their formulas.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Solid boxes.
+
+    Attributes:
+        centres: (N, 3) in the world.
+        half_sizes: (N, 3) along the box's own axes, positive.
+        R_world_box: (N, 3, 3).
+    """
+
+    centres: FloatArray
+    half_sizes: FloatArray
+    R_world_box: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.centres)
+        _check("Boxes.centres", self.centres, (n, 3))
+        _check("Boxes.half_sizes", self.half_sizes, (n, 3))
+        _check("Boxes.R_world_box", self.R_world_box, (n, 3, 3))
+        if (self.half_sizes <= 0.0).any():
+            raise ValueError("Boxes.half_sizes must be positive")
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @classmethod
+    def empty(cls) -> "Boxes":
+        """No box."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinders:
+    """Solid cylinders with flat ends, in any direction: poles, trunks, pipes.
+
+    Attributes:
+        starts, ends: (N, 3) centres of the two ends, in the world.
+        radii: (N,) positive.
+    """
+
+    starts: FloatArray
+    ends: FloatArray
+    radii: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.starts)
+        _check("Cylinders.starts", self.starts, (n, 3))
+        _check("Cylinders.ends", self.ends, (n, 3))
+        _check("Cylinders.radii", self.radii, (n,))
+        if (self.radii <= 0.0).any() or (np.linalg.norm(self.ends - self.starts, axis=1) <= 0.0).any():
+            raise ValueError("Cylinders must have positive radii and lengths")
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    @classmethod
+    def empty(cls) -> "Cylinders":
+        """No cylinder."""
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+
+@dataclass(frozen=True, eq=False)
+class HeightField:
+    """A surface z(x, y) over a regular grid: ground, or with another one above it the rock around a tunnel.
+
+    Attributes:
+        origin_xy: (2,) world position of `heights[0, 0]`.
+        cell_m: distance between neighbouring grid points.
+        heights: (X, Y) z at `origin + cell * (i, j)`; each cell is two triangles, split along the diagonal from
+            (i, j) to (i + 1, j + 1).
+    """
+
+    origin_xy: FloatArray
+    cell_m: float
+    heights: FloatArray
+
+    def __post_init__(self) -> None:
+        _check("HeightField.origin_xy", self.origin_xy, (2,))
+        if self.heights.ndim != 2 or min(self.heights.shape) < 2 or not np.isfinite(self.heights).all():
+            raise ValueError(f"HeightField.heights must be a finite grid of at least (2, 2), got {self.heights.shape}")
+        if not self.cell_m > 0.0:
+            raise ValueError(f"HeightField.cell_m must be positive, got {self.cell_m}")
+
+    def height_at(self, xy: FloatArray) -> FloatArray:
+        """z (N,) of the surface's triangles at (N, 2) world positions; outside the grid, that of its border."""
+        limit = np.array(self.heights.shape, dtype=np.float64) - 1.0
+        grid = np.clip((xy - self.origin_xy) / self.cell_m, 0.0, limit)
+        low = np.minimum(grid.astype(np.int64), (limit - 1.0).astype(np.int64))
+        u, v = (grid - low).T
+        i, j = low.T
+        h = self.heights
+        z00, z11 = h[i, j], h[i + 1, j + 1]
+        corner = np.where(u >= v, h[i + 1, j], h[i, j + 1])
+        larger, smaller = np.maximum(u, v), np.minimum(u, v)
+        return np.asarray(z00 + larger * (corner - z00) + smaller * (z11 - corner))
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """Something that drives around: boxes that follow a polyline at constant speed, again and again.
+
+    Attributes:
+        boxes: in the mover's own frame, x forwards, the origin on the ground.
+        waypoints: (M, 3) closed polyline in the world, or one point for something that stands.
+        speed_mps: along the polyline.
+        start_m: where on the polyline it is at time 0.
+    """
+
+    boxes: Boxes
+    waypoints: FloatArray
+    speed_mps: float
+    start_m: float
+
+    def __post_init__(self) -> None:
+        _check("Mover.waypoints", self.waypoints, (len(self.waypoints), 3))
+        if not len(self.waypoints):
+            raise ValueError("Mover.waypoints must hold a point")
+
+    def pose_at(self, times: FloatArray) -> FloatArray:
+        """T_world_mover (N, 4, 4) at times (N,) in seconds, x along the polyline."""
+        from lidarslam.core.geometry import make_transform
+
+        corners = np.concatenate([self.waypoints, self.waypoints[:1]])
+        steps = np.diff(corners, axis=0)
+        lengths = np.linalg.norm(steps, axis=1)
+        if lengths.sum() <= 0.0:
+            return make_transform(np.broadcast_to(np.eye(3), (len(times), 3, 3)), self.waypoints[:1])
+        ends = np.cumsum(lengths)
+        along = np.mod(self.start_m + self.speed_mps * times, ends[-1])
+        leg = np.minimum(np.searchsorted(ends, along, side="right"), len(lengths) - 1)
+        fraction = (along - (ends[leg] - lengths[leg])) / lengths[leg]
+        position = corners[leg] + fraction[:, None] * steps[leg]
+        yaw = np.arctan2(steps[leg, 1], steps[leg, 0])
+        R = np.zeros((len(times), 3, 3))
+        R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = (
+            np.cos(yaw),
+            -np.sin(yaw),
+            np.sin(yaw),
+            np.cos(yaw),
+            1,
+        )
+        return make_transform(R, position)
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """Where a carrier can go.
+
+    Attributes:
+        waypoints: (M, 3) corners of a polyline on the ground; the last is joined to the first, so that going on long
+            enough revisits every place.
+        corner_radius_m: how far a corner may be cut, what a car needs and a walker does not.
+        free_side_m: free space to either side of the polyline.
+        free_height_m: free space above the ground.
+        speed_limit_mps: how fast anybody would go here.
+    """
+
+    waypoints: FloatArray
+    corner_radius_m: float
+    free_side_m: float
+    free_height_m: float
+    speed_limit_mps: float
+
+    def __post_init__(self) -> None:
+        _check("Route.waypoints", self.waypoints, (len(self.waypoints), 3))
+        if len(self.waypoints) < 3:
+            raise ValueError(f"Route.waypoints must hold three corners or more, got {len(self.waypoints)}")
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A place to record in.
+
+    Attributes:
+        name, seed: which world this is; the same two make the same world.
+        boxes, cylinders, height_fields: what stands still.
+        movers: what does not.
+        route: the way through it.
+    """
+
+    name: str
+    seed: int
+    route: Route
+    boxes: Boxes = field(default_factory=Boxes.empty)
+    cylinders: Cylinders = field(default_factory=Cylinders.empty)
+    height_fields: tuple[HeightField, ...] = ()
+    movers: tuple[Mover, ...] = ()
+
+    def ground_at(self, xy: FloatArray) -> FloatArray:
+        """z (N,) of the first height field, which is the ground; 0 where there is none."""
+        return self.height_fields[0].height_at(xy) if self.height_fields else np.zeros(len(xy))
+
+
+def _check(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name} must be {shape}, got {array.shape}")
