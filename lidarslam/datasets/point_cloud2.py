@@ -1,0 +1,136 @@
+"""sensor_msgs/PointCloud2: bytes laid out as the message itself says -> NumPy arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.point_time import find_ring_field, find_time_field
+from lidarslam.datasets.recording import PointField
+
+# sensor_msgs/PointField, constants INT8 to FLOAT64.
+_TYPES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32", 7: "float32", 8: "float64"}
+
+
+class PointFieldMessage(Protocol):
+    """sensor_msgs/PointField."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
+class PointCloud2Message(Protocol):
+    """sensor_msgs/PointCloud2, of ROS 1 or ROS 2; `data` is one-dimensional and of bytes."""
+
+    height: int
+    width: int
+    fields: Sequence[PointFieldMessage]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedCloud:
+    """The points of one message, invalid ones included, in the order of the message.
+
+    Attributes:
+        points: (N, 3) float64, metres, in the LiDAR frame.
+        time_field: name of the field the times come from; None without per-point time.
+        times: (N,) as stored, None without per-point time.
+        rings: (N,) integers, None when the points do not carry the number of their laser.
+        fields: all fields of the message.
+    """
+
+    points: FloatArray
+    time_field: str | None
+    times: NDArray[np.generic] | None
+    rings: NDArray[np.generic] | None
+    fields: tuple[PointField, ...]
+
+
+def decode_point_cloud2(message: PointCloud2Message, time_field: str | None = None) -> DecodedCloud:
+    """Copy coordinates, times and rings out of a message; other fields are not touched.
+
+    Args:
+        message: organised or not, of either byte order, with any padding of points and rows.
+        time_field: field with the per-point time; None: found by its name.
+
+    Raises:
+        InputError: the message has no x, y and z, not the given time field, or fewer bytes than it declares.
+    """
+    fields = {field.name: field for field in message.fields}
+    names = list(fields)
+    if missing := [axis for axis in "xyz" if axis not in fields]:
+        raise InputError(f"points need the fields x, y and z, {missing[0]} is missing; they have: {', '.join(names)}")
+    time_field, ring_field = find_time_field(names, time_field), find_ring_field(names)
+    wanted = [fields[name] for name in names if name in ("x", "y", "z", time_field, ring_field)]
+    cloud = _view(message, wanted)
+    return DecodedCloud(
+        coordinates(cloud),
+        time_field,
+        None if time_field is None else _column(cloud[time_field]),
+        None if ring_field is None else _whole_numbers(_column(cloud[ring_field])),
+        tuple(PointField(field.name, _type_name(field)) for field in message.fields),
+    )
+
+
+def coordinates(cloud: NDArray[np.void]) -> FloatArray:
+    """The fields x, y and z of records as (N, 3) float64."""
+    points = np.empty((*cloud.shape, 3))
+    with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaN
+        for column, axis in enumerate("xyz"):
+            points[..., column] = cloud[axis]
+    return points.reshape(-1, 3)
+
+
+def _view(message: PointCloud2Message, wanted: Sequence[PointFieldMessage]) -> NDArray[np.void]:
+    """The message's bytes as an array (height, width) of records with the wanted fields."""
+    height, width, point_step = message.height, message.width, message.point_step
+    row_step = max(message.row_step, width * point_step)  # some drivers leave it zero
+    needed = (height - 1) * row_step + width * point_step if height and width else 0
+    if len(message.data) < needed:
+        raise InputError(
+            f"a point cloud of {height} x {width} points of {point_step} bytes needs {needed} bytes,"
+            f" the message holds {len(message.data)}"
+        )
+    order: Literal["<", ">"] = ">" if message.is_bigendian else "<"
+    formats = []
+    for field in wanted:
+        if field.datatype not in _TYPES:
+            raise InputError(f"point field {field.name!r} has the unknown datatype {field.datatype}; known are 1 to 8")
+        scalar = np.dtype(_TYPES[field.datatype]).newbyteorder(order)
+        if field.offset + scalar.itemsize > point_step:
+            raise InputError(f"point field {field.name!r} reaches beyond the {point_step} bytes of a point")
+        formats.append(scalar)  # of a field with several values the first is read
+    record = np.dtype(
+        {
+            "names": [field.name for field in wanted],
+            "formats": formats,
+            "offsets": [field.offset for field in wanted],
+            "itemsize": point_step,
+        }
+    )
+    return np.ndarray((height, width), record, np.ascontiguousarray(message.data), strides=(row_step, point_step))
+
+
+def _column(values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """A flat copy in the machine's own byte order."""
+    return values.astype(values.dtype.newbyteorder("=")).reshape(-1)
+
+
+def _whole_numbers(rings: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Some converters store rings as floats, with NaN for missing returns."""
+    return np.nan_to_num(rings, posinf=0.0, neginf=0.0).astype(np.int32) if rings.dtype.kind == "f" else rings
+
+
+def _type_name(field: PointFieldMessage) -> str:
+    name = _TYPES.get(field.datatype, f"datatype {field.datatype}")
+    return name if field.count <= 1 else f"{name}[{field.count}]"

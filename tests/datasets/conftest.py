@@ -1,0 +1,276 @@
+"""Point clouds as the drivers lay them out, and bags that hold them."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+_DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def _layout(point_step, **fields):
+    """A record type from `name=(type, offset)`."""
+    return np.dtype(
+        {
+            "names": list(fields),
+            "formats": [kind for kind, _ in fields.values()],
+            "offsets": [offset for _, offset in fields.values()],
+            "itemsize": point_step,
+        }
+    )
+
+
+_XYZ = {"x": ("f4", 0), "y": ("f4", 4), "z": ("f4", 8)}
+_OUSTER = {
+    **_XYZ,
+    "intensity": ("f4", 16),
+    "t": ("u4", 20),
+    "reflectivity": ("u2", 24),
+    "ring": ("u2", 26),
+    "ambient": ("u2", 28),
+    "range": ("u4", 32),
+}
+
+
+def _relative(dtype, factor, first_s=0.0):
+    def times(seconds, stamp_ns):
+        return np.round((seconds + first_s) * factor, 0 if factor > 1 else 9).astype(dtype)
+
+    return times
+
+
+def _epoch_seconds(seconds, stamp_ns):
+    return stamp_ns / 10**9 + seconds
+
+
+def _epoch_nanoseconds(seconds, stamp_ns):
+    return (stamp_ns + np.round(seconds * 1e9).astype(np.int64)).astype(np.float64)
+
+
+# Driver -> record type, time field, its unit, its reference, and how it fills it.
+_DRIVERS = {
+    "velodyne": (
+        _layout(22, **_XYZ, intensity=("f4", 12), ring=("u2", 16), time=("f4", 18)),
+        ("time", "s", "relative", _relative("f4", 1)),
+    ),
+    "velodyne-stamped-at-the-end": (
+        _layout(32, **_XYZ, intensity=("f4", 16), ring=("u2", 20), time=("f4", 24)),
+        ("time", "s", "relative", _relative("f4", 1, first_s=-0.1)),
+    ),
+    "ouster": (_layout(48, **_OUSTER), ("t", "ns", "relative", _relative("u4", 1e9))),
+    "ouster-early": (
+        _layout(48, **{**_OUSTER, "ring": ("u1", 26)}),
+        ("t", "ns", "relative", _relative("u4", 1e9)),
+    ),
+    "hesai": (
+        _layout(48, **_XYZ, intensity=("f4", 16), timestamp=("f8", 24), ring=("u2", 32)),
+        ("timestamp", "s", "absolute", _epoch_seconds),
+    ),
+    "robosense": (
+        _layout(26, **_XYZ, intensity=("f4", 12), ring=("u2", 16), timestamp=("f8", 18)),
+        ("timestamp", "s", "absolute", _epoch_seconds),
+    ),
+    "robosense-early": (
+        _layout(32, **_XYZ, intensity=("u1", 16), ring=("u2", 18), timestamp=("f8", 24)),
+        ("timestamp", "s", "absolute", _epoch_seconds),
+    ),
+    "livox": (
+        _layout(26, **_XYZ, intensity=("f4", 12), tag=("u1", 16), line=("u1", 17), timestamp=("f8", 18)),
+        ("timestamp", "ns", "absolute", _epoch_nanoseconds),
+    ),
+}
+
+_LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+_LIVOX_MESSAGE = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+)
+
+
+@pytest.fixture(params=list(_DRIVERS))
+def driver(request: pytest.FixtureRequest) -> str:
+    """The name of a driver, every one in turn."""
+    return request.param
+
+
+@pytest.fixture
+def make_sweep(rng: np.random.Generator) -> Callable[..., SimpleNamespace]:
+    """Make the records of a driver's cloud together with what a reader should find in them.
+
+    The result has records (height, width), points (N, 3), raw times, their exact offsets from the stamp, rings, and
+    the time field's name, unit and reference. With `holes`, every fifth point is NaN and every seventh at the origin.
+    """
+
+    def make(name: str, stamp_ns: int, height: int = 4, width: int = 50, holes: bool = False) -> SimpleNamespace:
+        dtype, (time_field, unit, reference, fill) = _DRIVERS[name]
+        count = height * width
+        records = np.zeros((height, width), dtype)
+        records.view("u1")[:] = rng.integers(0, 255, records.view("u1").shape)  # padding is never clean
+        points = rng.uniform(-50.0, 50.0, (count, 3)).astype("f4")
+        if holes:
+            points[::5] = np.nan
+            points[::7] = 0.0
+        for column, axis in enumerate("xyz"):
+            records[axis] = points[:, column].reshape(height, width)
+        times = fill(np.tile(np.linspace(0.0, 0.1, width), height), stamp_ns)
+        records[time_field] = times.reshape(height, width)
+        ring_field = "ring" if "ring" in dtype.names else "line"
+        rings = np.repeat(np.arange(height), width)
+        records[ring_field] = rings.reshape(height, width)
+        per_second = {"s": 1, "ns": 10**9}[unit]
+        # Offsets count from the stamp as float64 holds it, which is what Scan.stamp is.
+        zero = Fraction(stamp_ns / 10**9) if reference == "absolute" else 0
+        offsets = np.array([float(Fraction(time.item()) / per_second - zero) for time in times])
+        return SimpleNamespace(
+            records=records,
+            points=points.astype(np.float64),
+            times=times,
+            offsets=offsets,
+            rings=rings,
+            time_field=time_field,
+            unit=unit,
+            reference=reference,
+            returns=np.isfinite(points).all(axis=1) & points.any(axis=1),
+        )
+
+    return make
+
+
+class BagKit:
+    """Messages and bags of ROS 1 ("bag") or ROS 2 ("db3", "mcap")."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.kind = kind
+        self.ros2 = kind != "bag"
+        self.folder = folder
+        self.store = get_typestore(Stores.ROS2_HUMBLE if self.ros2 else Stores.ROS1_NOETIC)
+        for package in ("livox_ros_driver", "livox_ros_driver2"):
+            self.store.register(get_types_from_msg(_LIVOX_POINT, f"{package}/msg/CustomPoint"))
+            self.store.register(get_types_from_msg(_LIVOX_MESSAGE, f"{package}/msg/CustomMsg"))
+
+    def new(self, type_name: str, /, **values: Any) -> Any:
+        """A message of a type given as package/Name."""
+        return self.store.types[type_name.replace("/", "/msg/")](**values)
+
+    def header(self, stamp_ns: int) -> Any:
+        """A std_msgs/Header."""
+        stamp = self.new("builtin_interfaces/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return self.new("std_msgs/Header", stamp=stamp, frame_id="lidar", **({} if self.ros2 else {"seq": 7}))
+
+    def cloud(self, records: np.ndarray, stamp_ns: int, row_padding: int = 0, **changes: Any) -> Any:
+        """A sensor_msgs/PointCloud2 of records (height, width)."""
+        height, width = records.shape
+        point_step = records.dtype.itemsize
+        rows = np.zeros((height, width * point_step + row_padding), np.uint8)
+        if records.size:
+            rows[:, : width * point_step] = np.ascontiguousarray(records).view(np.uint8).reshape(height, -1)
+        fields = [
+            self.new("sensor_msgs/PointField", name=name, offset=offset, datatype=_DATATYPES[kind.str[1:]], count=1)
+            for name, (kind, offset) in records.dtype.fields.items()
+        ]
+        values = {
+            "header": self.header(stamp_ns),
+            "height": height,
+            "width": width,
+            "fields": fields,
+            "is_bigendian": False,
+            "point_step": point_step,
+            "row_step": rows.shape[1],
+            "data": rows.reshape(-1),
+            "is_dense": False,
+        }
+        return self.new("sensor_msgs/PointCloud2", **{**values, **changes})
+
+    def livox(
+        self, points: np.ndarray, offset_ns: np.ndarray, lines: np.ndarray, stamp_ns: int, timebase: int, package: str
+    ) -> Any:
+        """A Livox CustomMsg."""
+        return self.new(
+            f"{package}/CustomMsg",
+            header=self.header(stamp_ns),
+            timebase=timebase,
+            point_num=len(points),
+            lidar_id=1,
+            rsvd=np.zeros(3, np.uint8),
+            points=[
+                self.new(
+                    f"{package}/CustomPoint",
+                    offset_time=int(time),
+                    x=float(x),
+                    y=float(y),
+                    z=float(z),
+                    reflectivity=9,
+                    tag=16,
+                    line=int(line),
+                )
+                for (x, y, z), time, line in zip(points, offset_ns, lines, strict=True)
+            ],
+        )
+
+    def serialize(self, message: Any) -> bytes:
+        """The bytes of a message."""
+        serialize = self.store.serialize_cdr if self.ros2 else self.store.serialize_ros1
+        return bytes(serialize(message, message.__msgtype__))
+
+    def write(
+        self,
+        topics: dict[str, list[tuple[int, Any]]],
+        name: str = "drive",
+        definitions: bool = True,
+        extra: Callable[[Any], None] | None = None,
+        **options: Any,
+    ) -> Path:
+        """Write a bag of `topic: [(record stamp in ns, message), ...]`; a topic of no messages takes a type's name."""
+        if self.ros2:
+            path = self.folder / name
+            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            writer = Rosbag2Writer(path, version=9, storage_plugin=plugin)
+        else:
+            path = self.folder / f"{name}.bag"
+            writer = Rosbag1Writer(path)
+        if options.get("compression"):
+            writer.set_compression(*options["compression"])
+        with writer:
+            pending = []
+            for topic, messages in topics.items():
+                message_type = messages if isinstance(messages, str) else messages[0][1].__msgtype__
+                missing = {"msgdef": "", "rihs01" if self.ros2 else "md5sum": "*"}
+                connection = writer.add_connection(
+                    topic, message_type, **({"typestore": self.store} if definitions else missing)
+                )
+                if not isinstance(messages, str):
+                    pending += [(record_ns, connection, message) for record_ns, message in messages]
+            if extra is not None:
+                extra(writer)
+            for record_ns, connection, message in sorted(pending, key=lambda row: row[0]):
+                writer.write(connection, record_ns, self.serialize(message))
+        return path
+
+    def storage_file(self, path: Path) -> Path:
+        """The file with the messages."""
+        return path / f"{path.name}.{self.kind}" if path.is_dir() else path
+
+
+@pytest.fixture(params=["bag", "db3", "mcap"])
+def bag_kit(request: pytest.FixtureRequest, tmp_path: Path) -> BagKit:
+    """Every kind of bag in turn."""
+    return BagKit(request.param, tmp_path)
+
+
+@pytest.fixture
+def ros2_kit(tmp_path: Path) -> BagKit:
+    """A ROS 2 bag in MCAP, where the kind does not matter."""
+    return BagKit("mcap", tmp_path)
+
+
+@pytest.fixture
+def make_bag_kit(tmp_path: Path) -> Callable[[str], BagKit]:
+    """A bag of a given kind."""
+    return lambda kind: BagKit(kind, tmp_path)

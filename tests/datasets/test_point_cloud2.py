@@ -1,0 +1,173 @@
+"""Every driver's cloud comes out of its bytes as it went in."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.livox import decode_custom_message
+from lidarslam.datasets.point_cloud2 import decode_point_cloud2
+from lidarslam.datasets.point_time import PointTimeModel, infer_point_time
+from lidarslam.datasets.recording import PointField
+
+STAMP_NS = 1_700_000_000_250_000_000
+STAMP = STAMP_NS / 10**9
+
+
+def test_layout_of_every_driver(driver, make_sweep, ros2_kit):
+    sweep = make_sweep(driver, STAMP_NS)
+    cloud = decode_point_cloud2(ros2_kit.cloud(sweep.records, STAMP_NS))
+    np.testing.assert_array_equal(cloud.points, sweep.points)
+    np.testing.assert_array_equal(cloud.rings, sweep.rings)
+    np.testing.assert_array_equal(cloud.times, sweep.times)
+    assert cloud.points.dtype == np.float64
+    assert cloud.times.dtype == sweep.times.dtype
+    assert [field.name for field in cloud.fields] == list(sweep.records.dtype.names)
+    model = infer_point_time(cloud.time_field, cloud.times, STAMP)
+    assert model == PointTimeModel(sweep.time_field, sweep.unit, sweep.reference)
+    np.testing.assert_allclose(model.offsets(cloud.times, STAMP), sweep.offsets, rtol=0.0, atol=1e-9)
+
+
+def test_padded_rows_and_big_endian(driver, make_sweep, ros2_kit):
+    sweep = make_sweep(driver, STAMP_NS)
+    swapped = sweep.records.astype(sweep.records.dtype.newbyteorder(">"))
+    message = ros2_kit.cloud(swapped, STAMP_NS, row_padding=13, is_bigendian=True)
+    cloud = decode_point_cloud2(message)
+    np.testing.assert_array_equal(cloud.points, sweep.points)
+    np.testing.assert_array_equal(cloud.rings, sweep.rings)
+    np.testing.assert_array_equal(cloud.times, sweep.times)
+    assert cloud.times.dtype.isnative
+    assert cloud.rings.dtype.isnative
+
+
+def test_missing_returns_of_an_organised_cloud_go_with_their_times_and_rings(driver, make_sweep, ros2_kit):
+    sweep = make_sweep(driver, STAMP_NS, holes=True)
+    assert 0 < sweep.returns.sum() < len(sweep.points)
+    cloud = decode_point_cloud2(ros2_kit.cloud(sweep.records, STAMP_NS))
+    model = PointTimeModel(sweep.time_field, sweep.unit, sweep.reference)
+    scan = Scan.from_raw(cloud.points, STAMP, model.offsets(cloud.times, STAMP), cloud.rings)
+    assert scan.dropped == np.count_nonzero(~sweep.returns)
+    np.testing.assert_array_equal(scan.points, sweep.points[sweep.returns])
+    np.testing.assert_array_equal(scan.rings, sweep.rings[sweep.returns])
+    np.testing.assert_allclose(scan.time_offsets, sweep.offsets[sweep.returns], rtol=0.0, atol=1e-9)
+
+
+def test_the_result_does_not_hold_on_to_the_message(make_sweep, ros2_kit):
+    sweep = make_sweep("ouster", STAMP_NS)
+    message = ros2_kit.cloud(sweep.records, STAMP_NS)
+    cloud = decode_point_cloud2(message)
+    message.data[:] = 0
+    np.testing.assert_array_equal(cloud.points, sweep.points)
+    np.testing.assert_array_equal(cloud.times, sweep.times)
+    np.testing.assert_array_equal(cloud.rings, sweep.rings)
+
+
+def test_coordinates_alone_are_enough(ros2_kit, rng):
+    records = np.zeros((1, 9), [("z", "f8"), ("x", "f8"), ("y", "f8")])
+    for axis in "xyz":
+        records[axis] = rng.normal(size=(1, 9))
+    cloud = decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS))
+    np.testing.assert_array_equal(cloud.points, np.stack([records[axis][0] for axis in "xyz"], axis=1))
+    assert cloud.time_field is cloud.times is cloud.rings is None
+
+
+def test_fields_with_a_count(ros2_kit, make_sweep):
+    sweep = make_sweep("velodyne", STAMP_NS)
+    message = ros2_kit.cloud(sweep.records, STAMP_NS)
+    message.fields[0].count = 0  # as some simulators write it
+    message.fields[3].count = 3
+    cloud = decode_point_cloud2(message)
+    np.testing.assert_array_equal(cloud.points, sweep.points)
+    assert cloud.fields[0] == PointField("x", "float32")
+    assert cloud.fields[3] == PointField("intensity", "float32[3]")
+
+
+def test_an_unknown_datatype_matters_only_where_it_is_read(ros2_kit, make_sweep):
+    sweep = make_sweep("velodyne", STAMP_NS)
+    message = ros2_kit.cloud(sweep.records, STAMP_NS)
+    message.fields[3].datatype = 11
+    np.testing.assert_array_equal(decode_point_cloud2(message).points, sweep.points)
+    message.fields[0].datatype = 11
+    with pytest.raises(InputError, match="'x' has the unknown datatype 11"):
+        decode_point_cloud2(message)
+
+
+def test_rings_stored_as_floats(ros2_kit):
+    records = np.zeros((1, 3), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "f4")])
+    records["ring"] = [5.0, np.nan, 31.0]
+    np.testing.assert_array_equal(decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS)).rings, [5, 0, 31])
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (1, 0), (0, 5)])
+def test_empty_cloud(ros2_kit, make_sweep, shape):
+    records = np.zeros(shape, make_sweep("ouster", STAMP_NS).records.dtype)
+    cloud = decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS))
+    assert cloud.points.shape == (0, 3)
+    assert len(cloud.times) == len(cloud.rings) == 0
+
+
+def test_row_step_of_zero(ros2_kit, make_sweep):
+    sweep = make_sweep("ouster", STAMP_NS)
+    message = ros2_kit.cloud(sweep.records, STAMP_NS, row_step=0)
+    np.testing.assert_array_equal(decode_point_cloud2(message).points, sweep.points)
+
+
+def test_message_shorter_than_it_says(ros2_kit, make_sweep):
+    message = ros2_kit.cloud(make_sweep("velodyne", STAMP_NS).records, STAMP_NS)
+    message.data = message.data[:-1]
+    with pytest.raises(InputError, match="needs 4400 bytes, the message holds 4399"):
+        decode_point_cloud2(message)
+
+
+def test_field_beyond_the_point(ros2_kit, make_sweep):
+    message = ros2_kit.cloud(make_sweep("velodyne", STAMP_NS).records, STAMP_NS)
+    message.fields[5].offset = 19
+    with pytest.raises(InputError, match="'time' reaches beyond the 22 bytes"):
+        decode_point_cloud2(message)
+
+
+def test_missing_coordinate(ros2_kit):
+    records = np.zeros((1, 3), [("x", "f4"), ("y", "f4"), ("intensity", "f4")])
+    with pytest.raises(InputError, match="z is missing; they have: x, y, intensity"):
+        decode_point_cloud2(ros2_kit.cloud(records, STAMP_NS))
+
+
+def test_wanted_time_field(ros2_kit, make_sweep):
+    sweep = make_sweep("ouster", STAMP_NS)
+    message = ros2_kit.cloud(sweep.records, STAMP_NS)
+    cloud = decode_point_cloud2(message, "range")
+    assert cloud.time_field == "range"
+    np.testing.assert_array_equal(cloud.times, sweep.records["range"].reshape(-1))
+    with pytest.raises(InputError, match="'stamp'"):
+        decode_point_cloud2(message, "stamp")
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 97])
+@pytest.mark.parametrize("frame_id", ["", "l", "livox", "livox_frame_7"])  # moves what follows the header
+def test_livox_custom_message(bag_kit, rng, count, frame_id):
+    points = rng.normal(size=(count, 3)).astype("f4")
+    offsets = np.sort(rng.integers(0, 10**8, count))
+    lines = rng.integers(0, 6, count)
+    message = bag_kit.livox(points, offsets, lines, STAMP_NS, timebase=STAMP_NS + 3, package="livox_ros_driver2")
+    message.header.frame_id = frame_id
+    raw = bag_kit.serialize(message)
+    decoded = [decode_custom_message(raw, bag_kit.ros2)]
+    if bag_kit.ros2:
+        message_type = "livox_ros_driver2/msg/CustomMsg"
+        big_endian = bytes(bag_kit.store.serialize_cdr(message, message_type, little_endian=False))
+        decoded += [decode_custom_message(raw + b"\0", True), decode_custom_message(big_endian, True)]
+    for cloud in decoded:
+        np.testing.assert_array_equal(cloud.points, points.astype("f8"))
+        np.testing.assert_array_equal(cloud.times, (STAMP_NS + 3 + offsets).astype("u8"))
+        np.testing.assert_array_equal(cloud.rings, lines)
+        assert cloud.time_field == "offset_time"
+
+
+def test_livox_custom_message_cut_anywhere(bag_kit, rng):
+    message = bag_kit.livox(
+        rng.normal(size=(5, 3)), np.arange(5), np.zeros(5), STAMP_NS, STAMP_NS, package="livox_ros_driver"
+    )
+    raw = bag_kit.serialize(message)
+    for length in range(4, len(raw) - 1):
+        with pytest.raises(InputError, match="Livox CustomMsg"):
+            decode_custom_message(raw[:length], bag_kit.ros2)

@@ -1,0 +1,218 @@
+"""Unit and reference of per-point time are recovered from the values, for every habit of the drivers."""
+
+import logging
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.point_time import (
+    TIME_FIELD_NAMES,
+    UNITS_PER_SECOND,
+    PointTimeModel,
+    find_ring_field,
+    find_time_field,
+    infer_point_time,
+)
+
+STAMP = 1_700_000_000.25  # representable exactly
+STAMP_NS = 1_700_000_000_250_000_000
+SWEEP = np.linspace(0.0, 0.1, 1001)
+SWEEP_NS = np.round(SWEEP * 1e9).astype(np.int64)
+
+
+def exact_offsets(values, unit, stamp):
+    """The offsets of clock readings in exact arithmetic."""
+    return np.array([float(Fraction(v.item()) / UNITS_PER_SECOND[unit] - Fraction(stamp)) for v in values])
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "reference", "offsets", "tolerance"),
+    [
+        pytest.param(SWEEP.astype("f4"), "s", "relative", SWEEP, 1e-7, id="velodyne"),
+        pytest.param((SWEEP - 0.1).astype("f4"), "s", "relative", SWEEP - 0.1, 1e-7, id="velodyne-stamped-at-the-end"),
+        pytest.param(SWEEP_NS.astype("u4"), "ns", "relative", SWEEP, 1e-9, id="ouster"),
+        pytest.param((SWEEP_NS / 1e3).astype("f4"), "us", "relative", SWEEP, 1e-7, id="microseconds"),
+        pytest.param((SWEEP_NS / 1e6).astype("f4"), "ms", "relative", SWEEP, 1e-7, id="milliseconds"),
+        pytest.param(STAMP + SWEEP, "s", "absolute", SWEEP, 2e-7, id="hesai"),
+        pytest.param((STAMP_NS + SWEEP_NS).astype("f8"), "ns", "absolute", SWEEP, 2e-7, id="livox-float64"),
+        pytest.param((STAMP_NS + SWEEP_NS).astype("u8"), "ns", "absolute", SWEEP, 1e-9, id="nanoseconds-uint64"),
+        pytest.param((STAMP_NS - SWEEP_NS).astype("i8"), "ns", "absolute", -SWEEP, 1e-9, id="nanoseconds-backwards"),
+        pytest.param((STAMP_NS + SWEEP_NS) // 1000, "us", "absolute", SWEEP, 2e-6, id="epoch-microseconds"),
+        pytest.param((STAMP_NS + SWEEP_NS) / 1e6, "ms", "absolute", SWEEP, 3e-7, id="epoch-milliseconds"),
+        pytest.param(5_000_000_000_000 + SWEEP_NS, "ns", "absolute", SWEEP, 1e-9, id="clock-since-power-on"),
+        pytest.param(STAMP - 3600.0 + SWEEP, "s", "absolute", SWEEP, 3e-7, id="clock-an-hour-late"),
+    ],
+)
+def test_habits_of_drivers(values, unit, reference, offsets, tolerance):
+    model = infer_point_time("t", values, STAMP)
+    assert model == PointTimeModel("t", unit, reference)
+    np.testing.assert_allclose(model.offsets(values, STAMP), offsets, rtol=0.0, atol=tolerance)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    unit=st.sampled_from(sorted(UNITS_PER_SECOND)),
+    reference=st.sampled_from(["relative", "absolute"]),
+    sweep_s=st.floats(0.02, 0.3),
+    where=st.floats(-1.0, 0.0),
+    stamp_ns=st.integers(10 * 10**9, 2 * 10**18),
+    know_period=st.booleans(),
+)
+def test_any_sweep_in_any_unit_is_recovered(unit, reference, sweep_s, where, stamp_ns, know_period):
+    stamp = stamp_ns / 10**9
+    offsets = (np.linspace(0.0, 1.0, 500) + where) * sweep_s
+    readings = offsets + (stamp if reference == "absolute" else 0.0)
+    values = readings * UNITS_PER_SECOND[unit]
+    model = infer_point_time("t", values, stamp, period_s=sweep_s if know_period else None)
+    assert model == PointTimeModel("t", unit, reference)
+    np.testing.assert_allclose(model.offsets(values, stamp), offsets, rtol=0.0, atol=1e-6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(stamp_ns=st.integers(10**9, 4 * 10**18), dtype=st.sampled_from(["uint64", "float64"]))
+def test_offsets_lose_nothing_of_a_clock_reading(stamp_ns, dtype):
+    stamp = stamp_ns / 10**9  # rounded to float64, as Scan.stamp is
+    values = (stamp_ns + SWEEP_NS[::100]).astype(dtype)
+    offsets = PointTimeModel("t", "ns", "absolute").offsets(values, stamp)
+    np.testing.assert_allclose(offsets, exact_offsets(values, "ns", stamp), rtol=0.0, atol=1e-15)
+
+
+def test_offsets_of_epoch_seconds_are_exact():
+    values = STAMP + SWEEP
+    offsets = PointTimeModel("t", "s", "absolute").offsets(values, STAMP)
+    np.testing.assert_array_equal(offsets, exact_offsets(values, "s", STAMP))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pytest.param(np.zeros(100), id="all-zero"),
+        pytest.param(np.full(100, STAMP), id="all-equal"),
+        pytest.param(np.full(100, STAMP_NS, dtype="u8"), id="all-equal-integers"),
+        pytest.param(np.full(100, np.nan), id="all-nan"),
+        pytest.param(np.array([0.05]), id="one-point"),
+        pytest.param(np.empty(0, dtype="f4"), id="no-points"),
+        pytest.param((STAMP + SWEEP * 2000).astype("f4"), id="epoch-in-float32"),
+        pytest.param(np.r_[np.zeros(999), 0.1], id="all-equal-but-one"),
+        pytest.param(SWEEP * 1e-7, id="span-of-no-sweep"),
+    ],
+)
+def test_no_per_point_time(values):
+    assert infer_point_time("t", values, STAMP) is None
+
+
+def test_reference_none_ignores_the_field():
+    assert infer_point_time("t", SWEEP, STAMP, reference="none") is None
+
+
+def test_nan_values_do_not_disturb():
+    values = np.r_[np.nan, SWEEP, np.nan]
+    model = infer_point_time("time", values, STAMP)
+    assert model == PointTimeModel("time", "s", "relative")
+    offsets = model.offsets(values, STAMP)
+    assert np.isnan(offsets[[0, -1]]).all()
+    np.testing.assert_array_equal(offsets[1:-1], SWEEP)
+
+
+def test_missing_returns_of_a_clock_read_zero():
+    values = np.r_[np.zeros(1500, dtype="i8"), STAMP_NS + SWEEP_NS]
+    model = infer_point_time("timestamp", values, STAMP)
+    assert model == PointTimeModel("timestamp", "ns", "absolute")
+    offsets = model.offsets(values, STAMP)
+    assert np.isnan(offsets[:1500]).all()
+    np.testing.assert_allclose(offsets[1500:], SWEEP, rtol=0.0, atol=1e-9)
+
+
+def test_stray_times_do_not_disturb():
+    # As on destaggered clouds, where some columns hold leftovers.
+    values = SWEEP_NS.astype("u4")
+    values[[3, 700]] = 4_000_000_000
+    model = infer_point_time("t", values, STAMP)
+    assert model == PointTimeModel("t", "ns", "relative")
+    scan = Scan.from_raw(np.ones((len(values), 3)), STAMP, model.offsets(values, STAMP))
+    assert scan.dropped == 2
+    assert scan.time_offsets.max() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nonsense_never_crashes(seed):
+    rng = np.random.default_rng(seed)
+    for values in (
+        rng.integers(0, 2**32, 1000, dtype="u4"),
+        rng.integers(0, 2**64 - 1, 1000, dtype="u8"),
+        rng.normal(size=1000) * 1e300,
+        np.where(rng.random(1000) < 0.5, np.inf, rng.random(1000)),
+        rng.integers(0, 256, 1000, dtype="u1"),
+    ):
+        model = infer_point_time("t", values, STAMP) or PointTimeModel("t", "ns", "absolute")
+        assert model.offsets(values, STAMP).shape == (1000,)
+
+
+def test_unit_follows_the_period_where_the_sweep_is_unusual():
+    packet = np.linspace(0.0, 1.3, 200)  # a cloud a packet: 1.3 ms, written in ms
+    assert infer_point_time("t", packet, STAMP) is None
+    assert infer_point_time("t", packet, STAMP, period_s=0.00133).unit == "ms"
+
+
+def test_an_incredible_period_is_no_evidence():
+    assert infer_point_time("t", SWEEP, STAMP, period_s=100.0).unit == "s"
+    assert infer_point_time("t", SWEEP, STAMP, period_s=0.0).unit == "s"
+
+
+def test_given_unit_and_reference_are_obeyed():
+    assert infer_point_time("t", SWEEP, STAMP, unit="ms") == PointTimeModel("t", "ms", "relative")
+    assert infer_point_time("t", SWEEP_NS, STAMP, unit="us") == PointTimeModel("t", "us", "absolute")
+    assert infer_point_time("t", SWEEP + 0.5, 0.6, reference="absolute") == PointTimeModel("t", "s", "absolute")
+    assert infer_point_time("t", STAMP + SWEEP, STAMP, reference="relative") == PointTimeModel("t", "s", "relative")
+
+
+def test_without_a_stamp_the_span_decides():
+    assert infer_point_time("t", STAMP_NS + SWEEP_NS, None) == PointTimeModel("t", "ns", "absolute")
+    assert infer_point_time("t", SWEEP_NS, None) == PointTimeModel("t", "ns", "relative")
+
+
+def test_another_clock_is_reported(caplog):
+    with caplog.at_level(logging.WARNING):
+        model = infer_point_time("timestamp", STAMP + 37.0 + SWEEP, STAMP)  # TAI against UTC
+    assert "another clock" in caplog.text
+    assert not model.shares_clock(STAMP + 37.0 + SWEEP, STAMP)
+    assert model.shares_clock(STAMP + SWEEP, STAMP)
+
+
+def test_another_clock_starts_at_the_earliest_point():
+    values = STAMP + 37.0 + SWEEP[::-1]
+    offsets = PointTimeModel("t", "s", "absolute").offsets(values, STAMP)
+    assert offsets.min() == offsets[-1] == 0.0
+    assert offsets[0] == pytest.approx(0.1, abs=3e-7)
+
+
+def test_offsets_of_no_points():
+    assert PointTimeModel("t", "ns", "absolute").offsets(np.empty(0, dtype="u8"), STAMP).shape == (0,)
+
+
+@pytest.mark.parametrize("name", TIME_FIELD_NAMES)
+def test_time_fields_are_found(name):
+    assert find_time_field(["x", "y", "z", "intensity", name]) == name
+    assert find_time_field(["x", "y", "z", name.upper()]) == name.upper()
+
+
+def test_time_field_of_several_and_of_none():
+    assert find_time_field(["x", "timestamp", "t"]) == "t"
+    assert find_time_field(["x", "y", "z", "range"]) is None
+    assert find_time_field(["x", "t", "laser_time"], wanted="laser_time") == "laser_time"
+
+
+def test_wanted_time_field_that_is_missing_lists_the_fields():
+    with pytest.raises(InputError, match=r"'stamp'.*x, y, z, t$"):
+        find_time_field(["x", "y", "z", "t"], wanted="stamp")
+
+
+@pytest.mark.parametrize("name", ["ring", "channel", "line", "laser_id"])
+def test_ring_fields_are_found(name):
+    assert find_ring_field(["x", "y", "z", name]) == name
+    assert find_ring_field(["x", "y", "z"]) is None

@@ -1,0 +1,468 @@
+"""Real bags of every kind, written by a driver's layout and read back."""
+
+import contextlib
+import logging
+import sqlite3
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.datasets.bag_file import BagFile
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.recording import PointField, PointTime, Topic
+from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.truth_files import find_truth_file
+
+STAMP_NS = 1_700_000_000_250_000_000
+PERIOD_NS = 100_000_000
+LATENCY_NS = 37_000_123  # from the stamp of the header to the recording
+
+
+def stamps_ns(count):
+    return [STAMP_NS + i * PERIOD_NS for i in range(count)]
+
+
+@pytest.fixture
+def drive(bag_kit, make_sweep):
+    """A bag of six velodyne scans beside an IMU's empty topic, and what is in it."""
+    sweeps = [make_sweep("velodyne", stamp_ns, holes=True) for stamp_ns in stamps_ns(6)]
+    return bag_kit.write({"/points": recorded(bag_kit, sweeps), "/imu": "sensor_msgs/msg/Imu"}), sweeps
+
+
+def recorded(kit, sweeps, first_ns=STAMP_NS):
+    clouds = [kit.cloud(sweep.records, first_ns + i * PERIOD_NS) for i, sweep in enumerate(sweeps)]
+    return [(first_ns + i * PERIOD_NS + LATENCY_NS, cloud) for i, cloud in enumerate(clouds)]
+
+
+def assert_scan(scan, sweep, stamp_ns):
+    assert scan.stamp == stamp_ns / 10**9
+    assert scan.dropped == np.count_nonzero(~sweep.returns)
+    np.testing.assert_array_equal(scan.points, sweep.points[sweep.returns])
+    np.testing.assert_array_equal(scan.rings, sweep.rings[sweep.returns])
+    np.testing.assert_allclose(scan.time_offsets, sweep.offsets[sweep.returns], rtol=0.0, atol=1e-9)
+
+
+def test_every_driver_in_every_kind_of_bag(bag_kit, driver, make_sweep):
+    first_ns = STAMP_NS + 123_456_789  # a stamp that float64 has to round
+    sweeps = [make_sweep(driver, first_ns + i * PERIOD_NS, holes=True) for i in range(3)]
+    path = bag_kit.write({"/points": recorded(bag_kit, sweeps, first_ns)})
+    recording = open_recording(path)
+    assert len(recording) == 3
+    assert recording.name == "drive"
+    assert recording.T_cam_lidar is None
+    for i, (scan, sweep) in enumerate(zip(recording.scans(), sweeps, strict=True)):
+        assert_scan(scan, sweep, first_ns + i * PERIOD_NS)
+
+
+def test_stamp_and_offset_add_up_to_the_clock(ros2_kit, make_sweep):
+    first_ns = STAMP_NS + 987_654_321
+    sweep = make_sweep("hesai", first_ns)
+    scan = next(open_recording(ros2_kit.write({"/points": recorded(ros2_kit, [sweep], first_ns)})).scans())
+    for offset, reading in zip(scan.time_offsets[::37], sweep.times[::37], strict=True):
+        assert abs(Fraction(scan.stamp) + Fraction(offset) - Fraction(reading)) < Fraction(1, 10**12)
+
+
+@pytest.mark.parametrize("package", ["livox_ros_driver", "livox_ros_driver2"])
+@pytest.mark.parametrize("clock_ns", [0, 2_000_000, -STAMP_NS, 55_000_000_000 - STAMP_NS])
+def test_livox_custom_message(bag_kit, rng, package, clock_ns):
+    points, lines = rng.uniform(1, 9, (200, 3)).astype("f4"), rng.integers(0, 6, 200)
+    offset_ns = np.r_[0, np.sort(rng.integers(0, 10**8, 199))]
+    messages = [
+        (stamp_ns + LATENCY_NS, bag_kit.livox(points, offset_ns, lines, stamp_ns, stamp_ns + clock_ns, package))
+        for stamp_ns in stamps_ns(3)
+    ]
+    recording = open_recording(bag_kit.write({"/livox/lidar": messages}))
+    for scan, stamp_ns in zip(recording.scans(), stamps_ns(3), strict=True):
+        assert scan.stamp == stamp_ns / 10**9
+        np.testing.assert_array_equal(scan.points, points)
+        np.testing.assert_array_equal(scan.rings, lines)
+        # A time base that is not the stamp's clock, or never set, leaves the first point at the stamp.
+        base_s = float(Fraction(stamp_ns + clock_ns, 10**9) - Fraction(scan.stamp)) if abs(clock_ns) < 10**9 else 0.0
+        np.testing.assert_allclose(scan.time_offsets, base_s + offset_ns / 1e9, rtol=0.0, atol=1e-9)
+    info = recording.describe()
+    assert info.point_time.source == "offset_time"
+    assert info.point_time.unit == "ns"
+    assert any("another clock" in note for note in info.notes) == (abs(clock_ns) > 10**9)
+
+
+def test_single_files_of_a_rosbag2_folder(make_bag_kit, make_sweep):
+    for kind in ("db3", "mcap"):
+        kit = make_bag_kit(kind)
+        sweep = make_sweep("ouster", STAMP_NS)
+        path = kit.write({"/points": recorded(kit, [sweep])}, name=f"drive_{kind}")
+        recording = open_recording(kit.storage_file(path))
+        assert recording.name == f"drive_{kind}"
+        assert_scan(next(recording.scans()), sweep, STAMP_NS)
+
+
+def test_without_type_definitions(bag_kit, make_sweep):
+    sweep = make_sweep("velodyne", STAMP_NS)
+    path = bag_kit.write({"/points": recorded(bag_kit, [sweep])}, definitions=False)
+    if bag_kit.kind == "db3":  # as rosbag2 wrote it up to ROS 2 Humble
+        with contextlib.closing(sqlite3.connect(bag_kit.storage_file(path))) as database, database:
+            database.executescript("DROP TABLE schema; DROP TABLE message_definitions;")
+    assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
+
+
+def test_a_definition_that_cannot_be_parsed_does_not_matter(bag_kit, make_sweep):
+    def add_nonsense(writer):
+        digest = {"rihs01" if bag_kit.ros2 else "md5sum": "0"}
+        writer.add_connection("/odd", "odd_msgs/msg/Odd", msgdef="((( no definition", **digest)
+
+    sweep = make_sweep("velodyne", STAMP_NS)
+    path = bag_kit.write({"/points": recorded(bag_kit, [sweep])}, extra=add_nonsense)
+    assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "compression"),
+    [
+        ("bag", (Rosbag1Writer.CompressionFormat.BZ2,)),
+        ("bag", (Rosbag1Writer.CompressionFormat.LZ4,)),
+        ("db3", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
+        ("db3", (CompressionMode.FILE, CompressionFormat.ZSTD)),
+        ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
+    ],
+)
+def test_compressed_bags(make_bag_kit, make_sweep, kind, compression):
+    kit = make_bag_kit(kind)
+    sweep = make_sweep("velodyne", STAMP_NS)
+    path = kit.write({"/points": recorded(kit, [sweep])}, compression=compression)
+    assert_scan(next(open_recording(path).scans()), sweep, STAMP_NS)
+
+
+def test_file_of_compressed_messages_asks_for_the_folder(make_bag_kit, make_sweep):
+    kit = make_bag_kit("db3")
+    path = kit.write(
+        {"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])},
+        compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD),
+    )
+    with pytest.raises(InputError, match=r"compressed, give the rosbag2 folder"):
+        next(open_recording(kit.storage_file(path)).scans())
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "step"),
+    [(0, None, 1), (2, None, 1), (0, 4, 1), (1, 6, 2), (0, 99, 3), (5, None, 1), (6, None, 1), (3, 3, 1), (4, 2, 1)],
+)
+def test_ranges_are_slices(drive, start, stop, step):
+    recording = open_recording(drive[0])
+    expected = list(recording.scans())[start:stop:step]
+    scans = list(recording.scans(start, stop, step))
+    assert [scan.stamp for scan in scans] == [scan.stamp for scan in expected]
+    for scan, other in zip(scans, expected, strict=True):
+        np.testing.assert_array_equal(scan.points, other.points)
+        np.testing.assert_array_equal(scan.time_offsets, other.time_offsets)
+
+
+@pytest.mark.parametrize(("start", "stop", "step"), [(-1, None, 1), (0, None, 0), (0, -2, 1)])
+def test_ranges_that_make_no_sense(drive, start, stop, step):
+    with pytest.raises(InputError, match="expected start"):
+        open_recording(drive[0]).scans(start, stop, step)
+
+
+def test_skipped_messages_are_not_decoded(drive, monkeypatch):
+    decoded = []
+    decode = BagFile.decode
+
+    def spy(self, message, time_field=None):
+        decoded.append(message.header_ns)
+        return decode(self, message, time_field)
+
+    recording = open_recording(drive[0])
+    next(recording.scans())  # the time field has been looked at
+    monkeypatch.setattr(BagFile, "decode", spy)
+    assert len(list(recording.scans(1, None, 2))) == 3
+    assert decoded == stamps_ns(6)[1::2]
+    decoded.clear()
+    assert len(recording) == 6
+    next(recording.scans(0))
+    assert decoded == stamps_ns(1)
+
+
+def test_scans_can_be_read_twice_and_side_by_side(drive):
+    recording = open_recording(drive[0])
+    pairs = list(zip(recording.scans(), recording.scans(), strict=True))
+    assert len(pairs) == 6
+    assert all(one.stamp == other.stamp for one, other in pairs)
+
+
+def test_description(drive):
+    path, sweeps = drive
+    info = open_recording(path).describe()
+    assert info.reader == "rosbag"
+    assert info.scans == 6
+    assert info.first_stamp == STAMP_NS / 10**9
+    assert info.duration_s == pytest.approx(0.5, abs=1e-6)
+    assert info.rate_hz == pytest.approx(10.0, abs=1e-4)
+    assert info.points_per_scan == np.count_nonzero(sweeps[0].returns)
+    assert info.dropped_points == np.count_nonzero(~sweeps[0].returns)
+    assert info.has_rings
+    assert info.ground_truth is None
+    returned = sweeps[0].offsets[sweeps[0].returns]
+    assert info.point_time == PointTime("time", "s", "relative", returned.min(), returned.max())
+    assert info.topic == "/points"
+    assert info.topics == (
+        Topic("/imu", "sensor_msgs/msg/Imu", 0),
+        Topic("/points", "sensor_msgs/msg/PointCloud2", 6),
+    )
+    assert info.fields[4:] == (PointField("ring", "uint16"), PointField("time", "float32"))
+    assert info.notes == ()
+
+
+def test_description_of_a_single_scan(ros2_kit, make_sweep):
+    info = open_recording(ros2_kit.write({"/points": recorded(ros2_kit, [make_sweep("ouster", STAMP_NS)])})).describe()
+    assert info.duration_s == 0.0
+    assert info.rate_hz is None
+
+
+def test_a_cloud_topic_that_ends_early_has_its_own_duration(bag_kit, make_sweep):
+    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(4)])
+    late = (STAMP_NS + 500 * 10**9, bag_kit.header(STAMP_NS))
+    info = open_recording(bag_kit.write({"/points": clouds, "/late": [late]})).describe()
+    assert info.duration_s == pytest.approx(0.3, abs=1e-6)
+
+
+def test_several_cloud_topics_are_listed(bag_kit, make_sweep):
+    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(2)])
+    path = bag_kit.write({"/front": clouds, "/rear": clouds[:1], "/empty": "sensor_msgs/msg/PointCloud2"})
+    with pytest.raises(InputError) as caught:
+        open_recording(path)
+    assert "--topic" in str(caught.value)
+    assert "/front (sensor_msgs/msg/PointCloud2, 2 messages)" in str(caught.value)
+    assert "/rear (sensor_msgs/msg/PointCloud2, 1 messages)" in str(caught.value)
+    assert "/empty" not in str(caught.value)
+
+
+@pytest.mark.parametrize("topic", ["/rear", "rear"])
+def test_topic_that_is_asked_for(bag_kit, make_sweep, topic):
+    front, rear = make_sweep("velodyne", STAMP_NS), make_sweep("ouster", STAMP_NS)
+    path = bag_kit.write({"/front": recorded(bag_kit, [front] * 2), "/rear": recorded(bag_kit, [rear])})
+    recording = open_recording(path, ReaderConfig(topic=topic))
+    assert len(recording) == 1
+    assert_scan(next(recording.scans()), rear, STAMP_NS)
+    assert recording.describe().topic == "/rear"
+
+
+@pytest.mark.parametrize(
+    ("topic", "message"),
+    [
+        ("/nowhere", "no topic '/nowhere'"),
+        ("/imu", r"/imu \(sensor_msgs/msg/Imu, 0 messages\), which is no point cloud"),
+    ],
+)
+def test_topic_that_is_not_there(drive, topic, message):
+    with pytest.raises(InputError, match=message) as caught:
+        open_recording(drive[0], ReaderConfig(topic=topic))
+    assert "/points (sensor_msgs/msg/PointCloud2, 6 messages)" in str(caught.value)
+
+
+def test_bag_without_clouds(bag_kit):
+    path = bag_kit.write({"/header": [(STAMP_NS, bag_kit.header(STAMP_NS))]})
+    with pytest.raises(InputError, match=r"no point cloud topic.*/header \(std_msgs/msg/Header, 1 messages\)"):
+        open_recording(path)
+
+
+def test_bag_of_raw_packets(bag_kit):
+    def add_packets(writer):
+        digest = {"rihs01" if bag_kit.ros2 else "md5sum": "0"}
+        connection = writer.add_connection("/packets", "velodyne_msgs/msg/VelodyneScan", msgdef="uint8 a", **digest)
+        writer.write(connection, STAMP_NS, b"\0\1\0\0\0")
+
+    with pytest.raises(InputError, match="/packets holds raw packets"):
+        open_recording(bag_kit.write({"/imu": "sensor_msgs/msg/Imu"}, extra=add_packets))
+
+
+def test_empty_bag(bag_kit):
+    with pytest.raises(InputError, match="the bag is empty"):
+        open_recording(bag_kit.write({}))
+
+
+def test_headers_without_stamps(bag_kit, make_sweep):
+    sweeps = [make_sweep("velodyne", ns) for ns in stamps_ns(3)]
+    clouds = [(ns + LATENCY_NS, bag_kit.cloud(s.records, 0)) for ns, s in zip(stamps_ns(3), sweeps, strict=True)]
+    recording = open_recording(bag_kit.write({"/points": clouds}))
+    assert [scan.stamp for scan in recording.scans()] == [(ns + LATENCY_NS) / 10**9 for ns in stamps_ns(3)]
+    assert any("times of recording" in note for note in recording.describe().notes)
+
+
+def test_stamps_that_do_not_increase_are_skipped_and_counted(bag_kit, make_sweep, caplog):
+    sweep = make_sweep("velodyne", STAMP_NS)
+    steps = [0, 1, 1, 3, 2, 4]
+    clouds = [
+        (STAMP_NS + i * PERIOD_NS, bag_kit.cloud(sweep.records, STAMP_NS + step * PERIOD_NS))
+        for i, step in enumerate(steps)
+    ]
+    recording = open_recording(bag_kit.write({"/points": clouds}))
+    assert len(recording) == 6
+    with caplog.at_level(logging.WARNING):
+        stamps = [scan.stamp for scan in recording.scans()]
+    assert stamps == [(STAMP_NS + step * PERIOD_NS) / 10**9 for step in (0, 1, 3, 4)]
+    assert "2 scans skipped" in caplog.text
+    # Indices are those of the messages, so a range selects the same scans wherever it begins.
+    assert [scan.stamp for scan in recording.scans(2, 5)] == [(STAMP_NS + 3 * PERIOD_NS) / 10**9]
+
+
+def test_a_stamp_that_was_never_set_is_skipped(bag_kit, make_sweep):
+    sweep = make_sweep("velodyne", STAMP_NS)
+    clouds = [(STAMP_NS + i, bag_kit.cloud(sweep.records, ns)) for i, ns in enumerate([0, STAMP_NS])]
+    recording = open_recording(bag_kit.write({"/points": clouds}))
+    assert [scan.stamp for scan in recording.scans()] == [STAMP_NS / 10**9]
+
+
+@pytest.mark.parametrize("reference", ["relative", "absolute"])
+@pytest.mark.parametrize("count", [25, 40])
+def test_simulated_time_from_zero(ros2_kit, reference, count):
+    # In the first scan times from 0 to 0.1 s mean the same either way; a later one tells.
+    seconds = np.linspace(0.0, 0.1, 64)
+    clouds = []
+    for i in range(count):
+        records = np.ones((1, 64), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("timestamp", "f8")])
+        records["timestamp"] = seconds + (i / 10 if reference == "absolute" else 0.0)
+        clouds.append((i * PERIOD_NS + 10, ros2_kit.cloud(records, i * PERIOD_NS)))
+    recording = open_recording(ros2_kit.write({"/points": clouds}))
+    scans = list(recording.scans())
+    assert [scan.stamp for scan in scans] == [i / 10 for i in range(count)]
+    for scan in scans:
+        np.testing.assert_allclose(scan.time_offsets, seconds, rtol=0.0, atol=1e-9)
+    assert recording.describe().point_time.reference == reference
+
+
+def test_time_is_learned_from_the_first_scan_that_has_it(ros2_kit, make_sweep):
+    sweeps = [make_sweep("ouster", ns) for ns in stamps_ns(3)]
+    sweeps[0].records["t"] = 0
+    scans = list(open_recording(ros2_kit.write({"/points": recorded(ros2_kit, sweeps)})).scans())
+    assert (scans[0].time_offsets == 0.0).all()
+    assert_scan(scans[2], sweeps[2], stamps_ns(3)[2])
+
+
+def test_time_options(ros2_kit, make_sweep):
+    path = ros2_kit.write({"/points": recorded(ros2_kit, [make_sweep("ouster", STAMP_NS)])})
+
+    def offsets(**options):
+        return next(open_recording(path, ReaderConfig(**options)).scans()).time_offsets
+
+    assert offsets(time_reference="none") is None
+    assert offsets().max() == pytest.approx(0.1)
+    assert offsets(time_unit="ns", time_reference="relative").max() == pytest.approx(0.1)
+    with pytest.raises(InputError, match=r"drive: the points have no time field 'stamp'; their fields are: x, y, z"):
+        offsets(time_field="stamp")
+
+
+def test_a_field_without_time_is_noted(ros2_kit, make_sweep):
+    sweep = make_sweep("ouster", STAMP_NS)
+    sweep.records["t"] = 0
+    recording = open_recording(ros2_kit.write({"/points": recorded(ros2_kit, [sweep])}))
+    assert next(recording.scans()).time_offsets is None
+    info = recording.describe()
+    assert info.point_time is None
+    assert info.notes == ("The point field t holds no usable time.",)
+
+
+def test_empty_clouds_are_scans_without_points(ros2_kit, make_sweep):
+    sweep = make_sweep("ouster", STAMP_NS)
+    clouds = recorded(ros2_kit, [sweep, sweep])
+    clouds[0] = (clouds[0][0], ros2_kit.cloud(sweep.records[:0], STAMP_NS))
+    scans = list(open_recording(ros2_kit.write({"/points": clouds})).scans())
+    assert [len(scan) for scan in scans] == [0, 200]
+
+
+def test_ground_truth_beside_the_bag(drive):
+    path, _ = drive
+    assert open_recording(path).ground_truth is None
+    truth = Trajectory(np.array([1.0, 2.0]), np.stack([np.eye(4), np.eye(4)]))
+    write_tum(path.parent / "drive.tum", truth)
+    recording = open_recording(path)
+    np.testing.assert_array_equal(recording.ground_truth.stamps, truth.stamps)
+    assert recording.describe().ground_truth.name == "drive.tum"
+
+
+def test_truth_files_by_name(tmp_path):
+    inner = tmp_path / "drive"
+    inner.mkdir()
+    assert find_truth_file([inner, tmp_path], "drive") is None
+    for path in (tmp_path / "groundtruth.txt", tmp_path / "ground_truth.tum", inner / "groundtruth.tum"):
+        path.touch()
+        assert find_truth_file([inner, tmp_path], "drive") == path
+    (tmp_path / "drive.tum").touch()
+    assert find_truth_file([inner, tmp_path], "drive") == tmp_path / "drive.tum"
+    assert find_truth_file([inner, tmp_path]) == inner / "groundtruth.tum"
+
+
+def read_all(path):
+    recording = open_recording(path)
+    recording.describe()
+    return list(recording.scans())
+
+
+@pytest.mark.parametrize("part", [0.0, 0.002, 0.05, 0.3, 0.6, 0.9, 0.99])
+def test_truncated_bags(drive, bag_kit, part):
+    path = bag_kit.storage_file(drive[0])
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(InputError) as caught:
+        read_all(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_damaged_bags_raise_nothing_but_input_errors(drive, bag_kit, seed):
+    path = bag_kit.storage_file(drive[0])
+    rng = np.random.default_rng(seed)
+    damaged = np.frombuffer(path.read_bytes(), np.uint8).copy()
+    places = rng.integers(0, len(damaged), 400)
+    damaged[places] = rng.integers(0, 256, len(places))
+    path.write_bytes(damaged.tobytes())
+    with contextlib.suppress(InputError):  # what the damage spared may well be read
+        assert len(read_all(path)) <= 6
+
+
+def test_bag_without_index_asks_for_reindexing(make_bag_kit, make_sweep):
+    kit = make_bag_kit("bag")
+    path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])})
+    data = bytearray(path.read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    data[place : place + 8] = bytes(8)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"not indexed.*rosbag reindex"):
+        open_recording(path)
+
+
+def test_folder_whose_files_are_gone(make_bag_kit, make_sweep):
+    kit = make_bag_kit("mcap")
+    path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])})
+    kit.storage_file(path).unlink()
+    with pytest.raises(InputError, match=r"missing.*ros2 bag reindex"):
+        open_recording(path)
+
+
+def test_folder_without_metadata(make_bag_kit, make_sweep):
+    kit = make_bag_kit("mcap")
+    path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])})
+    (path / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match=r"metadata.*ros2 bag reindex"):
+        open_recording(path, ReaderConfig(name="rosbag"))
+
+
+def test_index_that_promises_more_messages(make_bag_kit, make_sweep, caplog):
+    kit = make_bag_kit("db3")
+    path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", ns) for ns in stamps_ns(3)])})
+    recording = open_recording(path)
+    with contextlib.closing(sqlite3.connect(kit.storage_file(path))) as database, database:
+        database.execute("DELETE FROM messages WHERE id = 3")
+    with caplog.at_level(logging.WARNING):
+        assert len(list(recording.scans(0, 2))) == 2
+        assert not caplog.records
+        assert len(list(recording.scans())) == 2
+    assert "lists 3 scans, it holds 2" in caplog.text
+    with contextlib.closing(sqlite3.connect(kit.storage_file(path))) as database, database:
+        database.execute("DELETE FROM messages")
+    with pytest.raises(InputError, match="lists 3 messages of /points, it holds none"):
+        list(recording.scans())
