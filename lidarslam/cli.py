@@ -2,11 +2,12 @@
 
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from lidarslam.core.errors import LidarSlamError
 
@@ -38,7 +39,7 @@ class _Group(click.Group):
             ctx.exit(EXIT_MENDABLE)
 
 
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group("lidarslam", cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="lidarslam", message="%(prog)s %(version)s")
 @click.option("-v", "--verbose", is_flag=True, help="Say more about what is going on.")
 def main(verbose: bool) -> None:
@@ -71,6 +72,24 @@ _reader_options = _options(
     click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag that holds several."),
     click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
 )
+
+
+class _Registered(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
+    """One of the names in a registry, which is imported when they are asked for."""
+
+    name = "name"
+
+    def __init__(self, names: Callable[[], Iterable[str]]) -> None:
+        self._names = names
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return click.Choice(list(self._names())).convert(value, param, ctx)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:  # noqa: ARG002
+        return f"[{'|'.join(self._names())}]"
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return click.Choice(list(self._names())).shell_complete(ctx, param, incomplete)
 
 
 def _resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
@@ -140,7 +159,7 @@ def info(
 @_reader_options
 @_config_options
 @click.pass_context
-def run(ctx: click.Context, source: Path, out: Path, **options: Any) -> None:
+def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.progress import show_progress
     from lidarslam.run import RunRequest, execute
@@ -172,6 +191,73 @@ def _refuse_missing_parts(mapping: bool, pose_graph: bool) -> None:
         raise ConfigError("scan-to-map refinement is not part of this version; run with --no-mapping")
     if pose_graph:
         raise ConfigError("the pose graph is not part of this version; run with --no-pose-graph")
+
+
+def _worlds() -> Iterable[str]:
+    from lidarslam.simulation.worlds.registry import WORLDS
+
+    return WORLDS
+
+
+def _sensors() -> Iterable[str]:
+    from lidarslam.simulation.sensor_table import SENSORS
+
+    return SENSORS
+
+
+def _motions() -> Iterable[str]:
+    from lidarslam.simulation.carriers import CARRIERS
+
+    return CARRIERS
+
+
+def _mounts() -> Iterable[str]:
+    from lidarslam.simulation.mounts import MOUNTS
+
+    return MOUNTS
+
+
+def _formats() -> Iterable[str]:
+    from lidarslam.simulation.writers.registry import FORMATS
+
+    return FORMATS
+
+
+@main.command(
+    epilog="""lidarslam simulate --out recordings/office
+    lidarslam simulate --out recordings/street --world street --sensor hdl-64e --motion car --format kitti
+    lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000"""
+)
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Folder that the recording is made in.")
+@click.option("--world", type=_Registered(_worlds), default="office", show_default=True, help="Where.")
+@click.option("--sensor", type=_Registered(_sensors), default="vlp-16", show_default=True, help="With what LiDAR.")
+@click.option(
+    "--motion",
+    type=_Registered(_motions),
+    help="How what carries the LiDAR moves.  [default: handheld, on a trajectory car]",
+)
+@click.option("--trajectory", type=_FILE, metavar="FILE", help="Move along a trajectory, TUM or KITTI.")
+@click.option(
+    "--mount", type=_Registered(_mounts), default="upright", show_default=True, help="How the LiDAR is mounted."
+)
+@click.option(
+    "--scans", type=click.IntRange(min=1), help="How many scans.  [default: 300, or as long as the trajectory lasts]"
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same recording.")
+@click.option("--format", type=_Registered(_formats), default="mcap", show_default=True, help="What files.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
+def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
+    """Make a recording in a simulated world, with the exact trajectory and the exact map."""
+    from lidarslam.progress import show_count
+    from lidarslam.simulation.record import record
+    from lidarslam.simulation.recording_request import RecordRequest
+    from lidarslam.simulation.recording_text import format_summary
+
+    motion = motion or ("handheld" if trajectory is None else "car")
+    request = RecordRequest(out, motion=motion, trajectory=trajectory, **options)
+    with show_count(out.name) as progress:
+        summary = record(request, progress)
+    click.echo(format_summary(request, summary))
 
 
 @main.command(epilog="lidarslam config --set odometry.kiss_icp.voxel_size_m=0.5")

@@ -14,6 +14,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from mapping.config import GlobalMapConfig
 from mapping.deskew import deskew
@@ -33,7 +34,7 @@ class ScanResult:
         T_world_lidar: (4, 4), the final pose at the stamp; the world is the first scan's LiDAR frame.
         T_odom_lidar: (4, 4), what the odometry alone says.
         status: whether to believe the pose, and `message` why not.
-        points: (N, 3) in the LiDAR frame at the stamp, motion compensated, cropped to the map's range.
+        points: (N, 3) in the LiDAR frame at the stamp, motion compensated, within the map's range, one a voxel.
         points_read, points_dropped: valid points of the raw scan, and how many were left out as invalid.
         points_used: how many the motion rests on.
         residual_m, inlier_ratio: how the scan lies on the previous one; None when that cannot be told.
@@ -63,6 +64,7 @@ class Pipeline:
         self._config = config
         self._T_odom_lidar = np.eye(4)
         self._previous_stamp: float | None = None
+        self._voxel_size_m = config.voxel_size_m
         self._waiting: Scan | None = None  # the first scan, until a motion says how to compensate it
         self.global_map: GlobalMap | None = None
 
@@ -77,7 +79,7 @@ class Pipeline:
             if job is not None:
                 yield job.result()
         if self._waiting is not None:  # there never was a second scan
-            self._add(self._crop(self._waiting).points, np.eye(4))
+            self._add(self._waiting.points, np.eye(4))
 
     def _lead(self, scans: Iterable[Scan]) -> Iterator[Callable[[], ScanResult]]:
         """Read and estimate scan after scan; what is left to do for each is handed out as a function."""
@@ -97,12 +99,18 @@ class Pipeline:
     ) -> ScanResult:
         """Everything that follows from a motion: compensate the sweep, check the motion, add to the map."""
         started = time.perf_counter()
-        points = self._compensate(self._crop(scan), motion.T_prev_curr, interval_s)
+        thinned = self._thin(scan)
+        points = _compensate(thinned, motion.T_prev_curr, interval_s)
         compensated = time.perf_counter()
         fit = self._check.check(points, motion.T_prev_curr)
         checked = time.perf_counter()
         status, message = _judge(motion, fit)
-        self._map(scan, points, motion.T_prev_curr, T_odom_lidar, interval_s, status)
+        if interval_s == 0.0:
+            self._waiting = thinned
+        else:
+            self._add_waiting(motion.T_prev_curr, interval_s)
+            if status is not Status.LOST:  # a pose that is not believed must not draw walls
+                self._add(points, T_odom_lidar)
         stage_ms["deskew"] = _ms(started, compensated)
         stage_ms["check"] = _ms(compensated, checked)
         stage_ms["map"] = _ms(checked, time.perf_counter())
@@ -121,42 +129,35 @@ class Pipeline:
             stage_ms=stage_ms,
         )
 
-    def _crop(self, scan: Scan) -> Scan:
-        """The points within the map's range."""
-        squared = np.einsum("ij,ij->i", scan.points, scan.points)
-        return scan.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
+    def _thin(self, scan: Scan) -> Scan:
+        """The points within the map's range, one a voxel of the map: more would not change it."""
+        if not len(scan):
+            return scan
+        if self._voxel_size_m is None:
+            self._voxel_size_m = voxel_size_for(scan.points)
+        thinned = scan.select(one_per_cell(scan.points, self._voxel_size_m))
+        squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
+        return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
 
-    def _compensate(self, scan: Scan, T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
-        if scan.time_offsets is None:
-            return scan.points
-        return deskew(scan.points, scan.time_offsets, T_prev_curr, interval_s)
-
-    def _map(
-        self,
-        scan: Scan,
-        points: FloatArray,
-        T_prev_curr: FloatArray,
-        T_world_lidar: FloatArray,
-        interval_s: float,
-        status: Status,
-    ) -> None:
-        """Add the scan to the map, unless it is lost: a pose that is not believed must not draw walls.
-
-        The first scan waits for the second, whose motion says how to compensate it.
-        """
-        if interval_s == 0.0:
-            self._waiting = scan
-            return
-        if self._waiting is not None:
-            first, self._waiting = self._waiting, None
-            self._add(self._compensate(self._crop(first), T_prev_curr, interval_s), np.eye(4))
-        if status is not Status.LOST:
-            self._add(points, T_world_lidar)
+    def _add_waiting(self, T_prev_curr: FloatArray, interval_s: float) -> None:
+        """Add the first scan, which waited for the second's motion to be compensated with."""
+        first, self._waiting = self._waiting, None
+        if first is not None:
+            self._add(_compensate(first, T_prev_curr, interval_s), np.eye(4))
 
     def _add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
+        if self._voxel_size_m is None:  # no scan had a point so far
+            return
         if self.global_map is None:
-            self.global_map = GlobalMap(self._config.voxel_size_m or voxel_size_for(points))
+            self.global_map = GlobalMap(self._voxel_size_m)
         self.global_map.add(points, T_world_lidar)
+
+
+def _compensate(scan: Scan, T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
+    """The scan's points as seen from the pose at its stamp."""
+    if scan.time_offsets is None:
+        return scan.points
+    return deskew(scan.points, scan.time_offsets, T_prev_curr, interval_s)
 
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:

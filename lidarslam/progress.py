@@ -1,8 +1,8 @@
-"""The progress bar of a run."""
+"""The progress bars."""
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -46,3 +46,18 @@ def show_progress(name: str) -> Iterator[ProgressCallback]:
             bar.update(task, completed=number, total=total, state=state)
 
         yield update
+
+
+@contextlib.contextmanager
+def show_count(name: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error that is told the number of the scan just finished, from 1, and how many there are."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _RateColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda number, total: bar.update(task, completed=number, total=total)

@@ -20,6 +20,8 @@ _TIME_TIMELINE = "time"
 _STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
 _REFERENCE_COLOUR = (0, 158, 115)
 _SCAN_COLOUR = (240, 228, 66)
+# Negative radii are in points on the screen, whatever the zoom.
+_PATH_RADIUS, _SCAN_RADIUS, _MAP_RADIUS = -3.0, -1.5, -1.0
 # Entity, title, and the names of its series.
 _PLOTS = (
     ("ms", "ms per scan", STAGES),
@@ -67,9 +69,7 @@ class RerunViewer:
         T = result.T_world_lidar
         self._recording.log("world/lidar", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
         points = _every_nth(result.points, self._config.scan_points)
-        self._recording.log(
-            "world/lidar/scan", rr.Points3D(points, colors=[_SCAN_COLOUR], radii=[rr.Radius.ui_points(1.5)])
-        )
+        self._recording.log("world/lidar/scan", rr.Points3D(points, colors=[_SCAN_COLOUR], radii=_SCAN_RADIUS))
         self._log_path(T[:3, 3], result.status)
         self._recording.log("plots/ms", rr.Scalars([result.stage_ms[stage] for stage in STAGES]))
         for plot, value in (("residual", result.residual_m), ("inliers", result.inlier_ratio)):
@@ -85,7 +85,7 @@ class RerunViewer:
             near = np.linalg.norm(points - self._last_position, axis=1) < self._config.map_radius_m
             points = points[near]
         points = _every_nth(points, self._config.map_points)
-        cloud = rr.Points3D(points, colors=height_colours(points), radii=[rr.Radius.ui_points(1.0)])
+        cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
         self._recording.log("world/map", cloud)
 
     def close(self) -> None:
@@ -101,7 +101,9 @@ class RerunViewer:
     def _log_path(self, position: FloatArray, status: Status) -> None:
         """Only the newest piece: the view shows all pieces up to the present, so the recording grows linearly."""
         if self._last_position is not None:
-            piece = rr.LineStrips3D([np.stack([self._last_position, position])], colors=[_STATUS_COLOURS[status]])
+            piece = rr.LineStrips3D(
+                [np.stack([self._last_position, position])], colors=[_STATUS_COLOURS[status]], radii=_PATH_RADIUS
+            )
             self._recording.log("world/trajectory", piece)
         self._last_position = position.copy()
 

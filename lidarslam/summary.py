@@ -43,6 +43,7 @@ class RunSummary:
     scans: int
     length_m: float
     duration_s: float
+    elapsed_s: float
     ms_per_scan: dict[str, Milliseconds]
     realtime_factor: float | None
     peak_rss_mb: float
@@ -63,6 +64,7 @@ class RunSummary:
             "scans": self.scans,
             "length_m": self.length_m,
             "duration_s": self.duration_s,
+            "elapsed_s": self.elapsed_s,
             "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
             "realtime_factor": self.realtime_factor,
             "peak_rss_mb": self.peak_rss_mb,
@@ -91,6 +93,7 @@ def summarise(log: ScanLog, total_ms: list[float], map_points: int, skipped: int
         scans=len(log),
         length_m=trajectory.length_m,
         duration_s=trajectory.duration_s,
+        elapsed_s=elapsed_s,
         ms_per_scan={
             stage: Milliseconds(float(np.median(values)), float(np.percentile(values, 95.0)))
             for stage, values in stages.items()

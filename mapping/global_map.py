@@ -15,7 +15,7 @@ _MASK = (1 << _BITS) - 1
 # Columns of the sums kept for every voxel.
 _POSITION, _VIEW, _COUNT = slice(0, 3), slice(3, 6), 6
 
-# Voxels waiting to be merged, at least; merging fewer at a time would cost more than it saves.
+# Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 1_000_000
 
 
@@ -37,7 +37,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """Sums over the points of each voxel: keys (M,) int64, sorted and unique; sums (M, 7) float32."""
+    """Sums over points of one voxel each: keys (M,) int64, sums (M, 7) float32; once reduced, sorted and unique."""
 
     keys: NDArray[np.int64]
     sums: NDArray[np.float32]
@@ -61,8 +61,8 @@ class _Voxels:
 class GlobalMap:
     """Accumulates scans into voxels.
 
-    New voxels wait in a list and are merged into the sorted main table when there are as many as half of it, so each
-    scan costs the sorting of its own points, and memory stays within a small factor of the number of voxels.
+    New points wait in a list and are merged into the sorted main table when there are as many as half of it, so that
+    sorting costs little a scan, and memory stays within a small factor of the number of voxels.
     """
 
     def __init__(self, voxel_size_m: float) -> None:
@@ -82,9 +82,8 @@ class GlobalMap:
         towards_sensor = T_world_lidar[:3, 3] - world
         sums[:, _VIEW] = towards_sensor / np.linalg.norm(towards_sensor, axis=1, keepdims=True)
         sums[:, _COUNT] = 1.0
-        new = _Voxels.reduce(_pack(cells), sums)
-        self._pending.append(new)
-        self._pending_size += len(new.keys)
+        self._pending.append(_Voxels(_pack(cells), sums))
+        self._pending_size += len(points)
         if self._pending_size > max(_MIN_PENDING, len(self._merged.keys) // 2):
             self._merge()
 
@@ -140,7 +139,7 @@ def estimate_normals(points: FloatArray, neighbours: int) -> FloatArray:
     import open3d as o3d
 
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
-    cloud.estimate_normals(max_nn=neighbours)
+    cloud.estimate_normals(max_nn=neighbours)  # type: ignore[call-arg] # the stub lacks the defaults
     return np.array(cloud.point.normals.numpy(), dtype=np.float64)
 
 

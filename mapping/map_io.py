@@ -19,6 +19,6 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
     out = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(cloud.points.astype(np.float32)))
     out.point.normals = o3d.core.Tensor.from_numpy(cloud.normals.astype(np.float32))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        written = o3d.t.io.write_point_cloud(str(path), out, write_ascii=False)
+        written = o3d.t.io.write_point_cloud(path, out, write_ascii=False)
     if not written:
         raise OutputError(f"{path}: the map could not be written; is the disk full or the folder read-only?")

@@ -30,7 +30,7 @@ class ConsistencyConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    queries: int = Field(1500, ge=100, description="points of the new scan that are looked up in the previous one")
+    queries: int = Field(1000, ge=100, description="points of the new scan that are looked up in the previous one")
     gate_ratio: float = Field(0.02, gt=0.0, description="largest residual of an inlier, as a fraction of its range")
     gate_min_m: float = Field(0.10, gt=0.0, description="smallest gate, for points close to the sensor")
     degraded_below: float = Field(0.70, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")

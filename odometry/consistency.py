@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from odometry.config import ConsistencyConfig
 
@@ -22,7 +23,7 @@ _MIN_PLANES = 20
 # Points are thinned to cells of this fraction of the median range, so that the dense ground does not outvote the rest.
 _CELL_PER_RANGE = 0.03
 # Points looked at before thinning; more do not change the answer.
-_MAX_POINTS = 30_000
+_MAX_POINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -45,22 +46,26 @@ class ConsistencyCheck:
 
     def __init__(self, config: ConsistencyConfig) -> None:
         self._config = config
-        self._previous: FloatArray | None = None
+        self._held: FloatArray | None = None
+        self._T_held_prev = np.eye(4)
 
     def check(self, points: FloatArray, T_prev_curr: FloatArray) -> Consistency:
         """Hold a scan's motion-compensated points (N, 3) against the previous call's.
 
-        The first scan has nothing to be held against and is ok.
+        The first scan has nothing to be held against and is ok. A scan that is all but empty is lost, and the next one
+        is held against the one before it.
         """
         even = _thin_evenly(points)
-        previous, self._previous = self._previous, even
-        if previous is None:
-            return Consistency(None, None, Status.OK)
-        if len(previous) < _MIN_PLANES or len(even) < _MIN_PLANES:
+        T_held_curr = self._T_held_prev @ T_prev_curr
+        if len(even) < _MIN_PLANES:  # go on holding the last scan that had something to see
+            self._T_held_prev = T_held_curr
             return Consistency(None, None, Status.LOST)
+        held, self._held, self._T_held_prev = self._held, even, np.eye(4)
+        if held is None:
+            return Consistency(None, None, Status.OK)
         queries = _every_nth(even, self._config.queries)
         ranges = np.linalg.norm(queries, axis=1)
-        distances, facing = plane_distances(transform_points(T_prev_curr, queries), previous)
+        distances, facing = plane_distances(transform_points(T_held_curr, queries), held)
         known = np.isfinite(distances)
         if np.count_nonzero(known) < _MIN_PLANES:
             return Consistency(None, None, Status.DEGRADED)
@@ -108,10 +113,7 @@ def _thin_evenly(points: FloatArray) -> FloatArray:
     if not len(points):
         return points
     cell = _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1)))
-    index = np.floor(points / cell).astype(np.int64)
-    keys = (index[:, 0] * 73_856_093) ^ (index[:, 1] * 19_349_669) ^ (index[:, 2] * 83_492_791)
-    _, first = np.unique(keys, return_index=True)
-    return points[np.sort(first)]
+    return np.asarray(points[one_per_cell(points, cell)], dtype=np.float64)
 
 
 def _every_nth(points: FloatArray, count: int) -> FloatArray:

@@ -3,21 +3,31 @@
 The library aborts the process on some inputs (an assertion in its C++ part, not an exception). Run as a module, this
 file is the child process: it reads requests from its standard input and writes replies to its standard output.
 
-Request: header `<qq` (points, time stamps), points (N, 3) float64, time stamps (N,) float64. Reply: pose (16,) float64,
-row by row, and the number of points registered, as a seventeenth float64.
+Once the library is loaded it says READY. Request: header `<qq` (points, time stamps), points (N, 3) float64, time
+stamps (N,) float64. Reply: pose (16,) float64, row by row, and the number of points registered, as a seventeenth.
 """
 
 import json
 import os
 import struct
 import sys
-from typing import Any, BinaryIO
+from io import BufferedReader
+from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+
+class Readable(Protocol):
+    """A binary stream that can fill a buffer."""
+
+    def readinto(self, buffer: memoryview, /) -> int | None:
+        """Read up to the buffer's length; how much was read."""
+
+
 REQUEST_HEADER = struct.Struct("<qq")
 REPLY_FLOATS = 17
+READY = b"R"
 
 
 def build(settings: dict[str, Any]) -> Any:
@@ -28,24 +38,24 @@ def build(settings: dict[str, Any]) -> Any:
     return KissICP(KISSConfig.model_validate(settings))
 
 
-def read_array(stream: BinaryIO, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def read_array(stream: Readable, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Read exactly one float64 array.
 
     Raises:
         EOFError: the stream ended before.
     """
-    array = np.empty(shape, dtype=np.float64)
-    view = memoryview(array).cast("B") if array.size else memoryview(b"")
+    buffer = bytearray(8 * int(np.prod(shape)))
+    view = memoryview(buffer)
     done = 0
     while done < len(view):
-        count = stream.readinto(view[done:])  # type: ignore[attr-defined]
+        count = stream.readinto(view[done:])
         if not count:
             raise EOFError
         done += count
-    return array
+    return np.frombuffer(buffer, dtype=np.float64).reshape(shape)
 
 
-def serve(odometry: Any, requests: BinaryIO, replies: BinaryIO) -> None:
+def serve(odometry: Any, requests: BufferedReader, replies: BinaryIO) -> None:
     """Register scan after scan until the requests end."""
     while len(header := requests.read(REQUEST_HEADER.size)) == REQUEST_HEADER.size:
         points, times = REQUEST_HEADER.unpack(header)
@@ -62,7 +72,9 @@ def main() -> None:
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     odometry = build(json.loads(sys.argv[1]))
-    serve(odometry, sys.stdin.buffer, replies)
+    replies.write(READY)
+    replies.flush()
+    serve(odometry, cast(BufferedReader, sys.stdin.buffer), replies)
 
 
 if __name__ == "__main__":

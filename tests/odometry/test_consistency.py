@@ -57,6 +57,16 @@ def test_without_points_a_scan_is_lost(check: ConsistencyCheck, room_scans: list
     assert result == Consistency(None, None, Status.LOST)
 
 
+def test_after_an_empty_scan_the_one_before_it_is_held_against(
+    check: ConsistencyCheck, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    motions = [np.eye(4), *room_truth.relative_motions()[:2]]
+    points = [room_scans[0].points, np.empty((0, 3)), room_scans[2].points]
+    results = [check.check(p, T).status for p, T in zip(points, motions, strict=True)]
+    assert results == [Status.OK, Status.LOST, Status.OK]
+    assert check.check(room_scans[3].points, exp([0.0, 0.0, 0.4, 0.0, 0.0, 0.0])).status is Status.LOST
+
+
 def test_distances_to_planes_are_exact() -> None:
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, 21), np.linspace(-1.0, 1.0, 21))
     plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)

@@ -1,0 +1,151 @@
+"""What `lidarslam run --odometry kiss-icp --no-mapping` adds to KISS-ICP: accuracy and time, both in one run.
+
+    python benchmarks/kiss_overhead.py KITTI/sequences/04 2011_09_26/2011_09_26_drive_0005_sync
+
+Each program runs in a process of its own, in turn, on the same files. KISS-ICP is its own pipeline with its defaults,
+reading the files as its KITTI loaders do. Time is the wall time of the loop over the scans, reading included; ours
+also checks every scan, builds the global map and writes scans.csv meanwhile. What comes after the loop (normals, files)
+is a column of its own. KISS-ICP's poses belong to the end of each sweep; they are interpolated at the scans' stamps,
+where ours are, so that both are compared with the truth at the same instants.
+"""
+
+import argparse
+import functools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evaluation.trajectory_metrics import evaluate_trajectory
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.registry import open_recording
+
+
+class _KittiFiles:
+    """The scans of a KITTI recording for KISS-ICP's pipeline, read and corrected the way its loaders do."""
+
+    def __init__(self, source: Path, has_times: bool) -> None:
+        folder = source / "velodyne_points" / "data"
+        self._files = sorted((folder if folder.is_dir() else source / "velodyne").glob("*.bin"))
+        self._has_times = has_times
+        self.sequence_id = source.name
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __getitem__(self, index: int) -> tuple[FloatArray, FloatArray]:
+        from kiss_icp.pybind import kiss_icp_pybind as pybind
+
+        raw = np.fromfile(self._files[index], dtype=np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
+        points = np.asarray(pybind._correct_kitti_scan(pybind._Vector3dVector(raw)))
+        if not self._has_times:
+            return points, np.array([])
+        return points, 0.5 * (1.0 - np.arctan2(points[:, 1], points[:, 0]) / np.pi)
+
+
+def run_kiss(source: Path) -> dict[str, Any]:
+    """KISS-ICP's own pipeline on the recording."""
+    from kiss_icp.pipeline import OdometryPipeline
+
+    recording = open_recording(source)
+    scans = list(recording.scans())
+    stamps = np.array([scan.stamp for scan in scans])
+    ends = np.array([s.stamp if s.time_offsets is None else s.stamp + s.time_offsets.max() for s in scans])
+    del scans
+    pipeline = OdometryPipeline(_KittiFiles(source, has_times=bool((ends > stamps).all())))
+    started = time.perf_counter()
+    pipeline._run_pipeline()
+    elapsed_s = time.perf_counter() - started
+    within = stamps >= ends[0]
+    at_stamps = Trajectory(stamps[within], Trajectory(ends, pipeline.poses).at(stamps[within]))
+    return _report(at_stamps, elapsed_s / len(ends), 0.0)
+
+
+def run_ours(source: Path) -> dict[str, Any]:
+    """Our run on the recording."""
+    from lidarslam.config import Config
+    from lidarslam.core.trajectory_io import read_tum
+    from lidarslam.run import RunRequest, execute
+
+    with tempfile.TemporaryDirectory() as folder:
+        started = time.perf_counter()
+        outcome = execute(RunRequest(source, Path(folder) / "run", Config()), lambda *_: None)
+        whole_s = time.perf_counter() - started
+        trajectory = read_tum(Path(folder) / "run" / "trajectory.tum")
+    loop_s = outcome.summary.elapsed_s
+    return _report(trajectory, loop_s / len(trajectory), whole_s - loop_s)
+
+
+def _report(trajectory: Trajectory, s_per_scan: float, after_s: float) -> dict[str, Any]:
+    return {
+        "stamps": trajectory.stamps.tolist(),
+        "poses": trajectory.T_world_lidar.tolist(),
+        "ms_per_scan": 1e3 * s_per_scan,
+        "after_s": after_s,
+    }
+
+
+def _in_process(program: str, source: Path) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, __file__, "--only", program, str(source)]
+        environment = os.environ | {"kiss_icp_out_dir": folder}
+        done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def ate_m(runs: list[dict[str, Any]], reference: Trajectory) -> list[float]:
+    """ATE of each run's trajectory, over the scans that all of them have."""
+    trajectories = [Trajectory(np.array(run["stamps"]), np.array(run["poses"])) for run in runs]
+    common = functools.reduce(np.intersect1d, [trajectory.stamps.round(6) for trajectory in trajectories])
+    chosen = [t.select(np.isin(t.stamps.round(6), common)) for t in trajectories]
+    return [evaluate_trajectory(trajectory, reference).errors.ate_rmse_m for trajectory in chosen]
+
+
+def compare(source: Path, rounds: int) -> None:
+    """Run both in turn and print a table."""
+    runs: dict[str, list[dict[str, Any]]] = {"kiss": [], "ours": []}
+    for _ in range(rounds):
+        for program, results in runs.items():
+            results.append(_in_process(program, source))
+    reference = open_recording(source).ground_truth
+    ates = [float("nan")] * 2 if reference is None else ate_m([runs["kiss"][-1], runs["ours"][-1]], reference)
+    print(f"\n{source.name}: {rounds} rounds, median [min, max]")
+    for name, results, ate in zip(("KISS-ICP's pipeline", "lidarslam run"), runs.values(), ates, strict=True):
+        ms = [result["ms_per_scan"] for result in results]
+        after_s = np.median([result["after_s"] for result in results])
+        print(
+            f"  {name:<20} ATE {ate:.4f} m   {np.median(ms):6.1f} [{min(ms):.1f}, {max(ms):.1f}] ms a scan"
+            f"   {after_s:4.1f} s after the loop"
+        )
+    pairs = zip(runs["ours"], runs["kiss"], strict=True)
+    ratios = [ours["ms_per_scan"] / kiss["ms_per_scan"] for ours, kiss in pairs]
+    print(
+        f"  ATE differs by {1e3 * (ates[1] - ates[0]):+.2f} mm; time a scan is"
+        f" {np.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}] times KISS-ICP's"
+    )
+
+
+def main() -> None:
+    """Parse the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="+", type=Path, help="KITTI sequences/NN folders or raw drive folders")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--only", choices=["kiss", "ours"], help=argparse.SUPPRESS)
+    arguments: Any = parser.parse_args()
+    for source in arguments.sources:
+        if arguments.only is None:
+            compare(source, arguments.rounds)
+        else:
+            print(json.dumps({"kiss": run_kiss, "ours": run_ours}[arguments.only](source)))
+
+
+if __name__ == "__main__":
+    main()

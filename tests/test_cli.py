@@ -1,0 +1,121 @@
+"""The command line as a stranger meets it: help, exit statuses, one-line errors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+@pytest.fixture
+def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """Five scans with ground truth."""
+    folder = tmp_path / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans[:5]):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    assert lidarslam("--help").exit_code == 0
+    for name in main.commands:
+        result = lidarslam(name, "--help")
+        assert result.exit_code == 0
+        assert f"lidarslam {name}" in result.output.split("Example:")[-1], name
+
+
+def test_the_version_is_the_packages() -> None:
+    assert lidarslam("--version").output == "lidarslam 0.1.0\n"
+
+
+def test_info_says_what_a_folder_holds(recording: Path) -> None:
+    result = lidarslam("info", recording)
+    assert result.exit_code == 0
+    for words in ("scan-folder", "0.4 s at 10.00 Hz", "9,000 in the first scan", "ground_truth.tum", "point time"):
+        assert words in result.output
+
+
+def test_run_prints_what_was_built_and_how_good_it_is(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    result = lidarslam("run", recording, "--out", out, "--odometry", "kiss-icp", "--no-mapping", "--rerun", "off")
+    assert result.exit_code == 0
+    assert "5 scans" in result.output
+    assert "against ground truth: ATE 0.0" in result.output
+    assert f"written to {out}" in result.output
+    assert json.loads((out / "summary.json").read_text())["scans"] == 5
+
+
+def test_run_exits_with_3_when_tracking_was_lost(recording: Path, tmp_path: Path) -> None:
+    np.save(recording / "000003.npy", np.full((100, 3), np.nan))
+    result = lidarslam("run", recording, "--out", tmp_path / "run")
+    assert result.exit_code == 3
+    assert "LOST on scan 3: 0 points are too few to register" in result.output
+    assert (tmp_path / "run" / "map.ply").exists()
+
+
+def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> None:
+    prior = recording / "ground_truth.tum"
+    assert lidarslam("run", recording, "--out", tmp_path / "run", "--prior", prior).exit_code == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["trajectory"]["ate_rmse_m"] < 1e-6
+    both = lidarslam("run", recording, "--out", tmp_path / "x", "--prior", prior, "--odometry", "kiss-icp")
+    assert both.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["info", "no/such/place"], 1, "no such file or folder"),
+        (["info", "{recording}", "--reader", "ros"], 1, "no reader is called 'ros'; there are: kitti-odometry"),
+        (["run", "{recording}"], 2, "Missing option '--out'"),
+        (["run", "{recording}", "--out", "{out}", "--odometry", "loam"], 2, "'loam' is not one of"),
+        (["run", "{recording}", "--out", "{out}", "--step", "0"], 2, "0 is not in the range x>=1"),
+        (["run", "{recording}", "--out", "{out}", "--start", "9"], 1, "none of its 5 scans is left"),
+        (["run", "{recording}", "--out", "{out}", "--set", "odometry.kiss=1"], 1, "did you mean kiss_icp?"),
+        (["run", "{recording}", "--out", "{out}", "--odometry", "constant-velocity"], 1, "only predicts"),
+        (["run", "{recording}", "--out", "{recording}/000000.npy"], 1, "a file is in the way"),
+        (["config", "--set", "reader.rate_hz=fast"], 1, "reader.rate_hz='fast'"),
+    ],
+)
+def test_mistakes_get_one_line(
+    recording: Path, tmp_path: Path, arguments: list[str], status: int, message: str
+) -> None:
+    places = {"recording": recording, "out": tmp_path / "out"}
+    result = lidarslam(*(argument.format(**places) for argument in arguments))
+    assert result.exit_code == status
+    assert message in result.stderr
+    assert "Traceback" not in result.output
+    if status == 1:
+        assert result.stderr.count("\n") == 1
+        assert result.stdout == ""
+
+
+def test_an_earlier_run_is_replaced_only_when_asked(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert lidarslam("run", recording, "--out", out, "--stop", 2).exit_code == 0
+    refused = lidarslam("run", recording, "--out", out)
+    assert refused.exit_code == 1
+    assert "--overwrite" in refused.stderr
+    assert lidarslam("run", recording, "--out", out, "--overwrite").exit_code == 0
+    assert json.loads((out / "summary.json").read_text())["scans"] == 5
+
+
+def test_config_prints_yaml_that_loads_again(tmp_path: Path) -> None:
+    result = lidarslam("config", "--set", "odometry.kiss_icp.voxel_size_m=0.5")
+    assert "voxel_size_m: 0.5" in result.output
+    file = tmp_path / "config.yaml"
+    file.write_text(result.output)
+    assert lidarslam("config", "--config", file).output == result.output

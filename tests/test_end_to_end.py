@@ -1,0 +1,205 @@
+"""The main job, from a recording on disk to a run directory, and what it says about itself."""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from lidarslam.config import load_config
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
+from lidarslam.pipeline import ScanResult
+from lidarslam.run import InOrder, RunRequest, execute
+
+INDOOR = ["odometry.kiss_icp.voxel_size_m=0.2", "odometry.kiss_icp.max_range_m=30", "global_map.voxel_size_m=0.1"]
+
+
+def quiet(number: int, total: int, result: ScanResult) -> None:
+    """No progress bar."""
+
+
+@pytest.fixture
+def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """The drive through the room as a folder of .npy scans with their times, stamps and ground truth."""
+    folder = tmp_path / "room scans"
+    folder.mkdir()
+    fields = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
+    for index, scan in enumerate(room_scans):
+        table = np.empty(len(scan), dtype=fields)
+        table["x"], table["y"], table["z"] = scan.points.T
+        table["time"] = scan.time_offsets
+        np.save(folder / f"{index:06d}.npy", table)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder
+
+
+def test_a_run_writes_what_the_contract_names(
+    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
+) -> None:
+    out = tmp_path / "run"
+    outcome = execute(RunRequest(recording, out, load_config(None, INDOOR), pcd=True), quiet)
+
+    trajectory = read_tum(out / "trajectory.tum")
+    np.testing.assert_allclose(trajectory.stamps, room_truth.stamps, atol=1e-9)
+    truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
+    assert np.linalg.norm(trajectory.positions - truth[:, :3, 3], axis=1).max() < 0.035
+    np.testing.assert_allclose(read_kitti_poses(out / "trajectory.kitti"), trajectory.T_world_lidar, atol=1e-6)
+    assert (out / "odometry.tum").read_text() == (out / "trajectory.tum").read_text()
+
+    cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
+    in_room = transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points))
+    distance = room.distance_to_surface(in_room)
+    assert np.median(distance) < 0.02
+    assert np.percentile(distance, 99) < 0.08
+    assert len(o3d.io.read_point_cloud(str(out / "map.pcd")).points) == len(cloud.points)
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["scans"] == 20
+    assert summary["lost_scans"] == 0
+    assert summary["duration_s"] == pytest.approx(1.9)
+    assert summary["length_m"] == pytest.approx(room_truth.length_m, rel=0.02)
+    assert summary["map_points"] == len(cloud.points)
+    assert set(summary["ms_per_scan"]) == {"total", "read", "odometry", "deskew", "check", "map"}
+    assert summary["ms_per_scan"]["total"]["p95"] >= summary["ms_per_scan"]["total"]["median"] > 0.0
+    assert summary["peak_rss_mb"] > 50.0
+
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["association"]["matched"] == 20
+    assert metrics["trajectory"]["ate_rmse_m"] < 0.02
+    assert outcome.metrics is not None
+
+    with (out / "scans.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["stamp"]) for row in rows] == pytest.approx(room_truth.stamps)
+    assert {row["status"] for row in rows} == {"ok"}
+    assert not list(out.glob(".partial*"))
+
+
+def test_what_config_yaml_says_gives_the_same_run_again(recording: Path, tmp_path: Path) -> None:
+    execute(RunRequest(recording, tmp_path / "a", load_config(None, INDOOR), start=2, stop=9, step=2), quiet)
+    again = load_config(tmp_path / "a" / "config.yaml")
+    execute(RunRequest(recording, tmp_path / "b", again, start=2, stop=9, step=2), quiet)
+    first = read_tum(tmp_path / "a" / "trajectory.tum")
+    np.testing.assert_allclose(first.stamps, [0.3, 0.5, 0.7, 0.9], atol=1e-9)
+    # KISS-ICP adds up its residuals on several threads, in no fixed order.
+    second = read_tum(tmp_path / "b" / "trajectory.tum")
+    np.testing.assert_allclose(first.T_world_lidar, second.T_world_lidar, atol=1e-6)
+
+
+def test_an_external_trajectory_builds_an_exact_map(
+    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
+) -> None:
+    config = load_config(None, ["odometry.method=external", "global_map.voxel_size_m=0.1"])
+    prior = recording / "ground_truth.tum"
+    execute(RunRequest(recording, tmp_path / "run", config, prior=prior), quiet)
+    cloud = o3d.io.read_point_cloud(str(tmp_path / "run" / "map.ply"))
+    in_room = transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points))
+    assert np.median(room.distance_to_surface(in_room)) < 1e-5
+    assert room.distance_to_surface(in_room).max() < 0.06
+
+
+def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -> None:
+    for index in (9, 10):
+        table = np.load(recording / f"{index:06d}.npy")
+        table["x"] = np.nan
+        np.save(recording / f"{index:06d}.npy", table)
+    seen: list[Status] = []
+    request = RunRequest(recording, tmp_path / "run", load_config(None, INDOOR))
+    outcome = execute(request, lambda _number, _total, result: seen.append(result.status))
+    (stretch,) = outcome.summary.lost
+    assert (stretch.first, stretch.last) == (9, 10)
+    assert "too few" in stretch.reason
+    assert seen[8:12] == [Status.OK, Status.LOST, Status.LOST, Status.DEGRADED] or seen[11] is Status.OK
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["lost_scans"] == 2
+    assert any("18000 invalid points" in warning for warning in summary["warnings"])
+
+
+def test_scans_that_go_back_in_time_are_left_out_and_counted() -> None:
+    scans = [Scan(np.ones((1, 3)), stamp) for stamp in (0.0, 0.1, 0.1, 0.05, 0.2)]
+    kept = InOrder(scans)
+    assert [scan.stamp for scan in kept] == [0.0, 0.1, 0.2]
+    assert kept.skipped == 2
+
+
+def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    out = tmp_path / "run"
+    config = load_config(None, [*INDOOR, "viewer.map_every=5"])
+    execute(RunRequest(recording, out, config, rerun="save", stop=11), quiet)
+    reader = RrdReader(out / "recording.rrd")
+    rows: Counter[str] = Counter()
+    for chunk in reader.stream():
+        rows[chunk.entity_path] += 0 if chunk.is_static else chunk.num_rows
+    assert rows["/world/lidar"] == rows["/world/lidar/scan"] == rows["/plots/ms"] == 11
+    assert rows["/plots/inliers"] == rows["/world/trajectory"] == 10
+    assert rows["/world/map"] == 2, "after scans 5 and 10; there is none yet after the first"
+    assert "/world/ground_truth" in rows
+    assert len(reader.blueprints()) == 1
+
+
+@pytest.mark.real_data
+def test_kitti_odometry_is_as_accurate_as_kiss_icps_own_pipeline(real_data: Path, tmp_path: Path) -> None:
+    from kiss_icp.config import load_config as kiss_config
+    from kiss_icp.datasets.kitti import KITTIOdometryDataset
+    from kiss_icp.kiss_icp import KissICP
+    from kiss_icp.metrics import absolute_trajectory_error
+
+    source = real_data / "kitti_odometry_04"
+    files = KITTIOdometryDataset(source, "04")
+    library, poses = KissICP(kiss_config(None)), []
+    for index in range(len(files)):
+        library.register_frame(*files[index])
+        poses.append(library.last_pose)
+    _, expected_m = absolute_trajectory_error(files.gt_poses[: len(files)], np.array(poses))
+    outcome = execute(RunRequest(source, tmp_path / "run", load_config(None, ["reader.sequence='04'"])), quiet)
+    assert outcome.metrics is not None
+    assert abs(outcome.metrics.errors.ate_rmse_m - expected_m) < 0.002
+    assert outcome.summary.lost_scans == 0
+    camera_poses = read_kitti_poses(tmp_path / "run" / "trajectory.kitti")
+    truth = read_kitti_poses(source / "poses" / "04.txt")[: len(camera_poses)]
+    assert np.linalg.norm(camera_poses[-1, :3, 3] - truth[-1, :3, 3]) < 0.5, "both in the camera frame"
+
+
+@pytest.mark.real_data
+def test_kitti_raw_is_deskewed_as_by_kiss_icp(real_data: Path, tmp_path: Path) -> None:
+    from kiss_icp.config import load_config as kiss_config
+    from kiss_icp.kiss_icp import KissICP
+
+    from evaluation.trajectory_metrics import evaluate_trajectory
+    from lidarslam.datasets.registry import open_recording
+
+    drive = real_data / "kitti_raw_0005" / "2011_09_26" / "2011_09_26_drive_0005_sync"
+    recording = open_recording(drive)
+    library, poses, ends = KissICP(kiss_config(None)), [], []
+    for scan in recording.scans():
+        assert scan.time_offsets is not None
+        azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+        library.register_frame(scan.points, 0.5 * (1.0 - azimuth / np.pi))
+        poses.append(library.last_pose)
+        ends.append(scan.stamp + scan.time_offsets.max())
+    execute(RunRequest(drive, tmp_path / "run", load_config()), quiet)
+    ours = read_tum(tmp_path / "run" / "trajectory.tum").select(slice(1, None))
+    # KISS-ICP's poses belong to the end of each sweep: compare at our stamps, from the second on.
+    theirs = Trajectory(ours.stamps, Trajectory(np.array(ends), np.array(poses)).at(ours.stamps))
+    assert recording.ground_truth is not None
+    errors = [evaluate_trajectory(each, recording.ground_truth).errors for each in (theirs, ours)]
+    assert abs(errors[0].ate_rmse_m - errors[1].ate_rmse_m) < 0.002
+
+
+def test_the_room_is_not_a_trivial_test(room: Any, drive: Callable[[FloatArray], FloatArray]) -> None:
+    """Without compensation the sweep is smeared by more than the errors allowed above."""
+    scan = room.sweep(drive, 1.0)
+    in_room = transform_points(drive(np.array([1.0]))[0], scan.points)
+    assert np.percentile(room.distance_to_surface(in_room), 99) > 0.08
