@@ -1,6 +1,7 @@
 """The command line: every command parses, imports what it needs, calls one function, and says what came of it."""
 
 import logging
+import signal
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -39,7 +40,9 @@ class _Group(click.Group):
             ctx.exit(EXIT_MENDABLE)
 
 
-@click.group("lidarslam", cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    "lidarslam", cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.version_option(package_name="lidarslam", message="%(prog)s %(version)s")
 @click.option("-v", "--verbose", is_flag=True, help="Say more about what is going on.")
 def main(verbose: bool) -> None:
@@ -229,14 +232,14 @@ def _formats() -> Iterable[str]:
     lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000"""
 )
 @click.option("--out", type=_PATH, required=True, metavar="DIR", help="Folder that the recording is made in.")
-@click.option("--world", type=_Registered(_worlds), default="office", show_default=True, help="Where.")
-@click.option("--sensor", type=_Registered(_sensors), default="vlp-16", show_default=True, help="With what LiDAR.")
+@click.option("--world", type=_Registered(_worlds), default="office", show_default=True, help="Place to record in.")
+@click.option("--sensor", type=_Registered(_sensors), default="vlp-16", show_default=True, help="LiDAR to record with.")
 @click.option(
     "--motion",
     type=_Registered(_motions),
-    help="How what carries the LiDAR moves.  [default: handheld, on a trajectory car]",
+    help="What carries the LiDAR.  [default: handheld; car on a trajectory]",
 )
-@click.option("--trajectory", type=_FILE, metavar="FILE", help="Move along a trajectory, TUM or KITTI.")
+@click.option("--trajectory", type=_FILE, metavar="FILE", help="TUM or KITTI file to move along.")
 @click.option(
     "--mount", type=_Registered(_mounts), default="upright", show_default=True, help="How the LiDAR is mounted."
 )
@@ -244,7 +247,7 @@ def _formats() -> Iterable[str]:
     "--scans", type=click.IntRange(min=1), help="How many scans.  [default: 300, or as long as the trajectory lasts]"
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same recording.")
-@click.option("--format", type=_Registered(_formats), default="mcap", show_default=True, help="What files.")
+@click.option("--format", type=_Registered(_formats), default="mcap", show_default=True, help="Format of the files.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Make a recording in a simulated world, with the exact trajectory and the exact map."""
@@ -258,6 +261,56 @@ def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: 
     with show_count(out.name) as progress:
         summary = record(request, progress)
     click.echo(format_summary(request, summary))
+
+
+@main.command(
+    epilog="""lidarslam view runs/04
+    lidarslam view runs/04 runs/wheels --web
+    lidarslam view runs/04 --picture map.png"""
+)
+@click.argument("runs", type=_PATH, nargs=-1, required=True)
+@click.option("--web", is_flag=True, help="Serve a browser instead of opening a window.")
+@click.option("--save", type=_PATH, metavar="FILE.rrd", help="Write a Rerun recording instead of opening a window.")
+@click.option("--picture", type=_PATH, metavar="FILE.png", help="Draw the map of one run, or a .ply file, instead.")
+@_config_options
+def view(
+    runs: tuple[Path, ...],
+    web: bool,
+    save: Path | None,
+    picture: Path | None,
+    config_file: Path | None,
+    settings: tuple[str, ...],
+) -> None:
+    """Look at finished runs in Rerun: trajectories, maps, and where tracking was lost."""
+    from lidarslam.finished_run import load_run
+
+    if picture is not None:
+        _draw_map(runs, picture)
+        return
+    config = _resolve(config_file, settings)
+    finished = [load_run(path) for path in runs]
+    from lidarslam.rerun_viewer import show_runs
+
+    show_runs(finished, config.viewer, save, web)
+    if save is not None:
+        click.echo(f"written to {save}")
+    elif web:
+        click.echo("serving until you press Ctrl-C")
+        signal.pause()
+
+
+def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
+    from lidarslam.core.errors import InputError
+    from lidarslam.finished_run import load_map
+    from lidarslam.picture import draw, height_colours, save_picture
+
+    if len(runs) != 1:
+        raise click.UsageError("--picture draws one map; name one run")
+    points = load_map(runs[0])
+    if not len(points):
+        raise InputError(f"{runs[0]}: holds no map to draw")
+    save_picture(picture, draw(points, height_colours(points)))
+    click.echo(f"written to {picture}")
 
 
 @main.command(epilog="lidarslam config --set odometry.kiss_icp.voxel_size_m=0.5")

@@ -1,16 +1,18 @@
 """Runs in Rerun; the only file that imports it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from lidarslam.config import ViewerConfig
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.finished_run import FinishedRun
+from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
 
 _SCAN_TIMELINE = "scan"
@@ -20,6 +22,7 @@ _TIME_TIMELINE = "time"
 _STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
 _REFERENCE_COLOUR = (0, 158, 115)
 _SCAN_COLOUR = (240, 228, 66)
+_RUN_COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0))
 # Negative radii are in points on the screen, whatever the zoom.
 _PATH_RADIUS, _SCAN_RADIUS, _MAP_RADIUS = -3.0, -1.5, -1.0
 # Entity, title, and the names of its series.
@@ -135,13 +138,34 @@ def _every_nth(points: FloatArray, count: int) -> FloatArray:
     return points[:: max(1, -(-len(points) // count))]
 
 
-def height_colours(points: FloatArray) -> NDArray[np.uint8]:
-    """Colours (N, 3) from dark blue over green to yellow with the height of points (N, 3), outliers clipped."""
-    if not len(points):
-        return np.empty((0, 3), dtype=np.uint8)
-    low, high = np.percentile(points[:, 2], [2.0, 98.0])
-    level = np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0)
-    stops = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)
-    position = np.linspace(0.0, 1.0, len(stops))
-    channels = [np.interp(level, position, stops[:, channel]) for channel in range(3)]
-    return np.stack(channels, axis=1).astype(np.uint8)
+def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | None, web: bool) -> None:
+    """Finished runs in one view: trajectories, maps, and where tracking was lost.
+
+    Args:
+        runs: what to show; each gets an entity of its own.
+        config: how much is shown.
+        save: the .rrd file to write, instead of a window.
+        web: serve a browser, instead of a window; it serves as long as the process lives.
+    """
+    recording = rr.RecordingStream("lidarslam")
+    if save is not None:
+        recording.save(save)
+    elif web:
+        rr.serve_web_viewer(connect_to=recording.serve_grpc())
+    else:
+        recording.spawn()
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for number, run in enumerate(runs):
+        _log_run(recording, f"world/{number}_{run.name}", run, number, config)
+    recording.flush()
+
+
+def _log_run(recording: rr.RecordingStream, entity: str, run: FinishedRun, number: int, config: ViewerConfig) -> None:
+    colour = _RUN_COLOURS[number % len(_RUN_COLOURS)]
+    positions = run.trajectory.positions
+    path = rr.LineStrips3D([positions], colors=[colour], radii=_PATH_RADIUS, labels=[run.name])
+    recording.log(f"{entity}/trajectory", path, static=True)
+    lost = rr.Points3D(positions[run.lost], colors=[_STATUS_COLOURS[Status.LOST]], radii=2.0 * _PATH_RADIUS)
+    recording.log(f"{entity}/lost", lost, static=True)
+    points = _every_nth(run.map_points, config.map_points)
+    recording.log(f"{entity}/map", rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS), static=True)

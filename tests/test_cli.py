@@ -119,3 +119,18 @@ def test_config_prints_yaml_that_loads_again(tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(result.output)
     assert lidarslam("config", "--config", file).output == result.output
+
+
+def test_view_writes_a_recording_and_a_picture(recording: Path, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    assert lidarslam("run", recording, "--out", tmp_path / "run").exit_code == 0
+    saved = lidarslam("view", tmp_path / "run", tmp_path / "run", "--save", tmp_path / "both.rrd")
+    assert saved.exit_code == 0
+    entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "both.rrd").stream()}
+    assert {"/world/0_run/map", "/world/0_run/trajectory", "/world/1_run/map"} <= entities
+    drawn = lidarslam("view", tmp_path / "run", "--picture", tmp_path / "map.png")
+    assert drawn.exit_code == 0
+    assert (tmp_path / "map.png").stat().st_size > 1_000
+    assert lidarslam("view", recording).exit_code == 1
+    assert lidarslam("view", recording, "--picture", tmp_path / "none.png").exit_code == 1

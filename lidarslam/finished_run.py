@@ -1,0 +1,64 @@
+"""Runs read back from disk."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam import run_directory as files
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """What is looked at of a run.
+
+    Attributes:
+        name: of its directory.
+        trajectory: the final poses.
+        lost: (N,) which of them were lost.
+        map_points: (M, 3), none when the map is missing.
+    """
+
+    name: str
+    trajectory: Trajectory
+    lost: NDArray[np.bool_]
+    map_points: FloatArray
+
+
+def load_run(path: Path) -> FinishedRun:
+    """Read a run directory.
+
+    Raises:
+        InputError: there is no run.
+    """
+    if not (path / files.TRAJECTORY_TUM).is_file():
+        raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
+    trajectory = read_tum(path / files.TRAJECTORY_TUM)
+    return FinishedRun(path.resolve().name, trajectory, _lost(path / files.SCANS_CSV, trajectory), load_map(path))
+
+
+def load_map(path: Path) -> FloatArray:
+    """The points (M, 3) of a run directory's map, or of a .ply or .pcd file; none when there is no such file."""
+    import open3d as o3d
+
+    file = path / files.MAP_PLY if path.is_dir() else path
+    if not file.is_file():
+        return np.empty((0, 3))
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        return np.array(o3d.io.read_point_cloud(file).points, dtype=np.float64).reshape(-1, 3)
+
+
+def _lost(scans_csv: Path, trajectory: Trajectory) -> NDArray[np.bool_]:
+    lost = np.zeros(len(trajectory), dtype=np.bool_)
+    if scans_csv.is_file():
+        with scans_csv.open(encoding="utf-8", newline="") as rows:
+            statuses = [row["status"] for row in csv.DictReader(rows)]
+        lost[: len(statuses)] = [status == Status.LOST.value for status in statuses[: len(lost)]]
+    return lost

@@ -1,0 +1,118 @@
+"""A point cloud as a picture, drawn without a window or a graphics card."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import OutputError
+from lidarslam.core.geometry import FloatArray
+
+# Viridis at five stops: even in lightness, readable under every colour blindness.
+_PALETTE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)
+_BACKGROUND = (255, 255, 255)
+_FIELD_OF_VIEW_DEG = 40.0
+# Eye-dome lighting (Boucheny, 2009): how strongly a pixel behind its neighbours is darkened.
+_EDGE_STRENGTH = 12.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a cloud is looked at from.
+
+    Attributes:
+        azimuth_deg: direction the camera looks from, counter-clockwise from x.
+        elevation_deg: how far above the horizon; 90 looks straight down.
+        width, height: of the picture, pixels.
+    """
+
+    azimuth_deg: float = -120.0
+    elevation_deg: float = 40.0
+    width: int = 1600
+    height: int = 900
+
+
+def height_colours(points: FloatArray) -> NDArray[np.uint8]:
+    """Colours (N, 3) by the height of points (N, 3), the lowest and highest 2 % clipped."""
+    if not len(points):
+        return np.empty((0, 3), dtype=np.uint8)
+    low, high = np.percentile(points[:, 2], [2.0, 98.0])
+    level = np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0)
+    stops = np.linspace(0.0, 1.0, len(_PALETTE))
+    return np.stack([np.interp(level, stops, _PALETTE[:, c]) for c in range(3)], axis=1).astype(np.uint8)
+
+
+def draw(points: FloatArray, colours: NDArray[np.uint8], camera: Camera | None = None) -> NDArray[np.uint8]:
+    """The picture (height, width, 3) of points (N, 3) with colours (N, 3), in perspective, shaded by depth.
+
+    The camera is as far away as it takes to see nearly all of the points.
+    """
+    camera = camera or Camera()
+    seen = _to_camera(points, camera)
+    depth, index = _rasterise(seen, camera)
+    picture = np.full((camera.height, camera.width, 3), _BACKGROUND, dtype=np.uint8)
+    covered = index >= 0
+    shade = _eye_dome(depth)[covered, None]
+    picture[covered] = (colours[index[covered]] * shade).astype(np.uint8)
+    return picture
+
+
+def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write a picture (height, width, 3) as .png or .jpg.
+
+    Raises:
+        OutputError: it could not be written.
+    """
+    import open3d as o3d
+
+    image = o3d.geometry.Image(np.ascontiguousarray(picture).data)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        written = o3d.io.write_image(path, image)
+    if not written:
+        raise OutputError(f"{path}: the picture could not be written; it must end in .png or .jpg")
+
+
+def _to_camera(points: FloatArray, camera: Camera) -> FloatArray:
+    """Points (N, 3) as pixel column, pixel row and depth."""
+    azimuth, elevation = np.deg2rad([camera.azimuth_deg, camera.elevation_deg])
+    towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    up = np.cross(towards, right)
+    low, high = np.percentile(points, [1.0, 99.0], axis=0) if len(points) else np.zeros((2, 3))
+    view = (points - 0.5 * (low + high)) @ np.stack([right, up, towards], axis=1)
+    focal = 0.5 * camera.height / np.tan(0.5 * np.deg2rad(_FIELD_OF_VIEW_DEG))
+    half = 0.47 * np.array([camera.width, camera.height])
+    needed = focal * np.abs(view[:, :2]) / half + view[:, 2:3]
+    distance = max(float(np.percentile(needed.max(axis=1), 99.0)), 1e-3) if len(points) else 1.0
+    depth = distance - view[:, 2]
+    scale = focal / np.where(depth > 0.0, depth, np.nan)
+    column, row = 0.5 * camera.width + scale * view[:, 0], 0.5 * camera.height - scale * view[:, 1]
+    return np.stack([column, row, depth], axis=1)
+
+
+def _rasterise(seen: FloatArray, camera: Camera, splat: int = 2) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Depth (inf where empty) and index (-1 where empty) of the nearest point at every pixel."""
+    order = np.flatnonzero(np.isfinite(seen).all(axis=1))
+    order = order[np.argsort(-seen[order, 2], kind="stable")]  # nearest last, so that it stays
+    depth = np.full((camera.height, camera.width), np.inf)
+    index = np.full((camera.height, camera.width), -1, dtype=np.int64)
+    corner = np.floor(seen[order, :2]).astype(np.int64)
+    offsets = np.stack(np.meshgrid(range(splat), range(splat), indexing="ij"), axis=-1).reshape(-1, 2)
+    pixels = (corner[:, None] + offsets).reshape(-1, 2)
+    owner = np.repeat(order, len(offsets))
+    inside = (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
+    column, row = pixels[inside].T
+    depth[row, column] = seen[owner[inside], 2]
+    index[row, column] = owner[inside]
+    return depth, index
+
+
+def _eye_dome(depth: FloatArray) -> FloatArray:
+    """Brightness (0 to 1) of every pixel: darker the farther it lies behind its neighbours."""
+    far = np.where(np.isfinite(depth), depth, np.nanmax(depth[np.isfinite(depth)], initial=1.0))
+    logarithm = np.log2(far)
+    behind = np.zeros_like(depth)
+    for step, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1), (2, 0), (-2, 0), (2, 1), (-2, 1)):
+        behind += np.maximum(0.0, logarithm - np.roll(logarithm, step, axis=axis))
+    return np.exp(-_EDGE_STRENGTH * behind / 8.0)
