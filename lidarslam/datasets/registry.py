@@ -38,8 +38,13 @@ def _is_kitti_raw(source: Path) -> bool:
 
 def _is_rosbag(source: Path) -> bool:
     if source.is_dir():
-        return (source / "metadata.yaml").is_file()
+        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file()
     return source.suffix in (".bag", ".db3", ".mcap")
+
+
+def _bag_of_folder(folder: Path) -> Path:
+    """The rosbag1 file that bears its folder's name, as simulated recordings have it beside their truth and map."""
+    return folder / f"{folder.resolve().name}.bag"
 
 
 def _is_scan_folder(source: Path) -> bool:
@@ -88,5 +93,7 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
         InputError: the source cannot be read by the chosen reader.
     """
     config = config or ReaderConfig()
-    module = import_module(READERS[choose_reader(source, config.name)].module)
-    return cast(Recording, module.open_recording(source, config))
+    name = choose_reader(source, config.name)
+    if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
+        source = _bag_of_folder(source)
+    return cast(Recording, import_module(READERS[name].module).open_recording(source, config))

@@ -3,15 +3,27 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Boxes, Cylinders
+
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def rotation_z(yaw: float) -> FloatArray:
     """(3, 3) turn about the vertical, radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotation_along(step: FloatArray) -> FloatArray:
+    """(3, 3) with x along the step (3,), y level, z upwards; for an upright step, y along the world's."""
+    x = step / np.linalg.norm(step)
+    across = np.array([-x[1], x[0], 0.0])
+    length = float(np.linalg.norm(across))
+    y = across / length if length > 1e-9 else np.array([0.0, 1.0, 0.0])
+    return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
 @dataclass
@@ -44,9 +56,33 @@ class Builder:
         """A cylinder between the centres of its ends (3,)."""
         self._cylinders.append((np.asarray(start, float), np.asarray(end, float), radius))
 
+    def beam(self, start: FloatArray, end: FloatArray, width: float, height: float) -> None:
+        """A straight beam between the centres of its ends (3,), its upper face turned up as far as its slope allows."""
+        step = np.asarray(end, float) - np.asarray(start, float)
+        middle = np.asarray(start, float) + 0.5 * step
+        self.box(middle, np.array([np.linalg.norm(step), width, height]), R=rotation_along(step))
+
     def pole(self, xy: FloatArray, z: tuple[float, float], radius: float) -> None:
         """An upright cylinder at (2,), from height z[0] to z[1]."""
         self.cylinder(np.array([xy[0], xy[1], z[0]]), np.array([xy[0], xy[1], z[1]]), radius)
+
+    def block(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> None:
+        """A box along the axes, between two opposite corners."""
+        a, b = np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+        self.box(0.5 * (a + b), b - a)
+
+    def place(self, part: "Builder", T_world_part: FloatArray) -> None:
+        """Add everything of `part`, which was drawn in its own frame."""
+        R, t = T_world_part[:3, :3], T_world_part[:3, 3]
+        self._boxes += [(R @ centre + t, half_size, R @ R_part) for centre, half_size, R_part in part._boxes]
+        self._cylinders += [(R @ start + t, R @ end + t, radius) for start, end, radius in part._cylinders]
+
+    def selected(self, boxes: NDArray[np.bool_], cylinders: NDArray[np.bool_]) -> "Builder":
+        """Those boxes and cylinders for which the masks, one entry for each, are true."""
+        return Builder(
+            [one for one, keep in zip(self._boxes, boxes, strict=True) if keep],
+            [one for one, keep in zip(self._cylinders, cylinders, strict=True) if keep],
+        )
 
     @property
     def boxes(self) -> Boxes:

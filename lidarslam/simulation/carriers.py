@@ -1,0 +1,113 @@
+"""What carries the LiDAR: how fast it goes, how it takes corners, how it sways."""
+
+from dataclasses import dataclass
+
+from lidarslam.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Swing:
+    """One sine of a carrier's sway.
+
+    Attributes:
+        axis: "x", "y", "z" (metres; forwards, left, up), "roll", "pitch" or "yaw" (degrees).
+        amplitude: in that unit.
+        frequency_hz: before the seed varies it by a tenth.
+        stepwise: whether it follows the carrier's gait, so that all such swings keep one common frequency.
+    """
+
+    axis: str
+    amplitude: float
+    frequency_hz: float
+    stepwise: bool = False
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """A kind of motion.
+
+    Attributes:
+        name: as on the command line.
+        speed_mps: where nothing slows it down.
+        acceleration, side_acceleration: limits along and across, m/s^2.
+        turn_rate_deg, turn_acceleration_deg: about z, degrees a second (squared).
+        stop_angle_deg: at sharper corners it stops and turns on the spot.
+        swings_deg: turns there and back before it takes a corner's new direction.
+        half_width_m: of its body, for staying within the route's free side.
+        footprint_m: radius over which it averages the ground.
+        leans_with_ground: whether it takes the ground's pitch and roll.
+        banks: whether it leans into its accelerations, as what flies must.
+        flight_height_m: above the ground, where the route is high enough; 0 for what does not fly.
+        sensor_height_m: of the LiDAR above the body's origin, which is on the ground or is the flying body.
+        smoothing_s: half the time over which accelerations set in.
+        sway: its sines while it moves.
+    """
+
+    name: str
+    speed_mps: float
+    acceleration: float
+    side_acceleration: float
+    turn_rate_deg: float
+    turn_acceleration_deg: float
+    stop_angle_deg: float
+    half_width_m: float
+    footprint_m: float
+    sensor_height_m: float
+    smoothing_s: float
+    swings_deg: tuple[float, ...] = ()
+    leans_with_ground: bool = True
+    banks: bool = False
+    flight_height_m: float = 0.0
+    sway: tuple[Swing, ...] = ()
+
+
+_RUMBLE = (Swing("z", 0.0015, 6.0), Swing("roll", 0.25, 4.3), Swing("pitch", 0.25, 5.1))
+# Heights: 1.73 m is KITTI's. The legged robot's gait of 2 Hz and its amplitudes are those of a trotting quadruped of
+# 30 to 50 kg, the pedestrian's of a LiDAR on a hand-held stick; both are round figures, not measurements.
+_TABLE = (
+    Carrier(
+        "car", 12.0, 1.8, 2.4, 45.0, 60.0, 135.0, 1.0, 1.3, 1.73, smoothing_s=0.5,
+        sway=(Swing("pitch", 0.25, 1.3), Swing("roll", 0.25, 1.1), Swing("z", 0.01, 1.3)),
+    ),
+    Carrier(
+        "handheld", 1.3, 0.8, 1.0, 80.0, 200.0, 135.0, 0.3, 0.4, 1.5, smoothing_s=0.3, leans_with_ground=False,
+        sway=(
+            Swing("z", 0.02, 1.8, stepwise=True), Swing("y", 0.02, 0.9, stepwise=True),
+            Swing("pitch", 1.5, 1.8, stepwise=True), Swing("roll", 1.5, 0.9, stepwise=True),
+            Swing("yaw", 8.0, 0.23), Swing("pitch", 4.0, 0.31), Swing("roll", 3.0, 0.37), Swing("y", 0.06, 0.13),
+        ),
+    ),
+    Carrier(
+        "legged", 1.1, 0.8, 0.8, 70.0, 200.0, 135.0, 0.35, 0.5, 0.75, smoothing_s=0.3,
+        sway=(
+            Swing("z", 0.02, 2.0, stepwise=True), Swing("y", 0.015, 2.0, stepwise=True),
+            Swing("roll", 2.5, 2.0, stepwise=True), Swing("pitch", 1.8, 2.0, stepwise=True),
+            Swing("yaw", 1.0, 2.0, stepwise=True), Swing("y", 0.05, 0.11),
+        ),
+    ),
+    Carrier("tracked", 1.2, 0.8, 1.0, 120.0, 500.0, 10.0, 0.35, 0.4, 0.6, smoothing_s=0.06, sway=_RUMBLE),
+    Carrier(
+        "tracked-harsh", 1.2, 0.8, 1.0, 180.0, 900.0, 10.0, 0.35, 0.4, 0.6, smoothing_s=0.06,
+        swings_deg=(90.0, -90.0), sway=_RUMBLE,
+    ),
+    Carrier(
+        "drone", 2.5, 1.5, 1.5, 60.0, 150.0, 135.0, 0.4, 1.5, 0.0, smoothing_s=0.4, leans_with_ground=False,
+        banks=True, flight_height_m=2.0,
+        sway=(
+            Swing("z", 0.25, 0.09), Swing("y", 0.08, 0.17), Swing("x", 0.03, 0.29), Swing("yaw", 3.0, 0.13),
+            Swing("roll", 0.6, 0.9), Swing("pitch", 0.6, 0.8),
+        ),
+    ),
+)  # fmt: skip
+CARRIERS: dict[str, Carrier] = {carrier.name: carrier for carrier in _TABLE}
+
+
+def find_carrier(name: str) -> Carrier:
+    """The carrier of that name.
+
+    Raises:
+        InputError: there is no such carrier.
+    """
+    if name not in CARRIERS:
+        raise InputError(f"no motion is called {name!r}; there are: {', '.join(CARRIERS)}")
+    return CARRIERS[name]

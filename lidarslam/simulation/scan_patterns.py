@@ -1,0 +1,142 @@
+"""Where a LiDAR looks during one sweep, and when."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+
+
+class Rays(NamedTuple):
+    """The rays of one sweep in the order of time, shot by shot: `lasers` rays to each of the `columns` shots.
+
+    Attributes:
+        directions: (N, 3) float64, unit, in the LiDAR frame (x forward, z up).
+        fractions: (N,) when within the sweep each is fired, 0 at its start, below 1 at its end; never decreasing.
+        rings: (N,) int32, the laser.
+    """
+
+    directions: FloatArray
+    fractions: FloatArray
+    rings: NDArray[np.int32]
+
+
+class ScanPattern(Protocol):
+    """What a sensor needs to know of its optics; N = columns * lasers."""
+
+    @property
+    def columns(self) -> int:
+        """Shots a sweep."""
+
+    @property
+    def lasers(self) -> int:
+        """Rays a shot."""
+
+    @property
+    def column_angle(self) -> float:
+        """Angle between two shots of the same laser, radians."""
+
+    def rays(self, scan_index: int) -> Rays:
+        """The rays of one sweep."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spinning:
+    """A column of lasers that turns once a sweep.
+
+    Attributes:
+        elevations_deg: (L,) of each laser, by ring.
+        azimuth_offsets_deg: (L,) seen from above, counter-clockwise from the middle of the column.
+        firing: (L,) when within its column's time slot each laser fires, in [0, 1); the column turns on meanwhile.
+        columns: number of columns in a turn.
+        start_azimuth_deg: where the turn starts, counter-clockwise from x.
+        clockwise: the sense of rotation, seen from above.
+    """
+
+    elevations_deg: FloatArray
+    azimuth_offsets_deg: FloatArray
+    firing: FloatArray
+    columns: int
+    start_azimuth_deg: float = 180.0
+    clockwise: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("azimuth_offsets_deg", "firing"):
+            if getattr(self, name).shape != self.elevations_deg.shape:
+                raise ValueError(f"Spinning.{name} must be {self.elevations_deg.shape}")
+        if self.firing.min() < 0.0 or self.firing.max() >= 1.0:
+            raise ValueError("Spinning.firing must lie in [0, 1)")
+
+    @property
+    def lasers(self) -> int:
+        """Rays a column."""
+        return len(self.elevations_deg)
+
+    @property
+    def column_angle(self) -> float:
+        """Angle between two columns, radians."""
+        return 2.0 * np.pi / self.columns
+
+    @cached_property
+    def _rays(self) -> Rays:
+        order = np.argsort(self.firing, kind="stable")
+        fractions = (np.arange(self.columns)[:, None] + self.firing[order]) / self.columns
+        turned = (-2.0 if self.clockwise else 2.0) * np.pi * fractions
+        azimuth = np.deg2rad(self.start_azimuth_deg + self.azimuth_offsets_deg[order]) + turned
+        elevation = np.broadcast_to(np.deg2rad(self.elevations_deg[order]), azimuth.shape)
+        rings = np.broadcast_to(order.astype(np.int32), azimuth.shape)
+        return Rays(directions(azimuth.ravel(), elevation.ravel()), fractions.ravel(), rings.ravel())
+
+    def rays(self, scan_index: int) -> Rays:  # noqa: ARG002  every turn is like the other
+        """The rays of one turn, the same arrays for each."""
+        return self._rays
+
+
+@dataclass(frozen=True, eq=False)
+class Rosette:
+    """Lasers that draw a pattern which goes on from sweep to sweep and does not close within any recording.
+
+    The line of sight turns about z while it nods up and down; the two frequencies and the sweep rate have irrational
+    ratios. The lasers nod with phases spread over a period.
+
+    Attributes:
+        elevation_range_deg: lowest and highest elevation.
+        lasers: rays fired at a time.
+        columns: shots a sweep.
+        turns_per_sweep, nods_per_sweep: of the line of sight.
+    """
+
+    elevation_range_deg: tuple[float, float]
+    lasers: int
+    columns: int
+    turns_per_sweep: float
+    nods_per_sweep: float
+
+    @property
+    def column_angle(self) -> float:
+        """Largest angle between two shots of the same laser, radians."""
+        low, high = np.deg2rad(self.elevation_range_deg)
+        nod = 2.0 * (high - low) * self.nods_per_sweep / self.columns
+        return float(np.hypot(nod, 2.0 * np.pi * self.turns_per_sweep / self.columns))
+
+    def rays(self, scan_index: int) -> Rays:
+        """The rays of the sweep with that index."""
+        fractions = np.arange(self.columns) / self.columns
+        sweeps = scan_index + fractions[:, None]
+        phase = self.nods_per_sweep * sweeps + np.arange(self.lasers) / self.lasers
+        # A triangle wave covers all elevations evenly, as the real pattern does to within a factor of two.
+        rising = 2.0 * np.abs(np.mod(phase, 1.0) - 0.5)
+        low, high = np.deg2rad(self.elevation_range_deg)
+        elevation = low + rising * (high - low)
+        azimuth = np.broadcast_to(np.pi - 2.0 * np.pi * np.mod(self.turns_per_sweep * sweeps, 1.0), elevation.shape)
+        rings = np.tile(np.arange(self.lasers, dtype=np.int32), self.columns)
+        return Rays(directions(azimuth.ravel(), elevation.ravel()), np.repeat(fractions, self.lasers), rings)
+
+
+def directions(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
+    """Unit vectors (N, 3) of azimuths (N,), counter-clockwise from x, and elevations (N,), upwards; radians."""
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)

@@ -1,0 +1,188 @@
+"""Town houses: facades of piers and bands before a recessed core, bays, balconies, roofs.
+
+A house is drawn in its own frame: the origin at the left end of its front as seen from within, x along the front, y
+into the house, z up from the pavement.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.simulation.worlds.building import Builder, rotation_z
+
+# Walls go this far down: houses stand level on streets that slope.
+FOUNDATION_M = 2.0
+# Faces that would lie in one plane are set apart by this much.
+_OFFSET_M = 0.02
+
+
+@dataclass(frozen=True)
+class _Style:
+    """What all facades of one house have in common.
+
+    Attributes:
+        storeys, storey_m: how many, and how high each.
+        recess_m: of the windows behind the wall.
+        axis_m: about the distance between windows.
+        opening: of it, how much is window.
+        sill_m, lintel_m: where a window starts and ends above its floor; `ground_...` for the ground floor.
+    """
+
+    storeys: int
+    storey_m: float
+    recess_m: float
+    axis_m: float
+    opening: float
+    sill_m: float
+    lintel_m: float
+    ground_sill_m: float
+    ground_lintel_m: float
+
+    @property
+    def top_m(self) -> float:
+        return self.storeys * self.storey_m + 0.3
+
+    def openings(self, width: float) -> FloatArray:
+        """(K, 2) where along a facade each column of windows starts and ends."""
+        columns = max(1, round(width / self.axis_m))
+        pitch = width / columns
+        middle = pitch * (np.arange(columns) + 0.5)
+        return middle[:, None] + 0.5 * self.opening * pitch * np.array([-1.0, 1.0])
+
+
+def house(rng: np.random.Generator, width: float, depth: float, open_sides: tuple[bool, bool]) -> Builder:
+    """A house of two to five storeys; `open_sides` says whether its left and right sides have windows too."""
+    part = Builder()
+    style = _draw_style(rng)
+    recess, top = style.recess_m, style.top_m
+    left, right = (recess * is_open for is_open in open_sides)
+    low, high = np.array([left, recess, -FOUNDATION_M]), np.array([width - right, depth, top])
+    openings = style.openings(width)
+    door = int(rng.integers(len(openings)))
+    passage = bool(width > 9.0 and rng.random() < 0.2)
+    if passage:  # a way through to the yard in place of the door
+        x0, x1 = openings[door].mean() + np.array([-1.4, 1.4]).clip(-openings[door].mean() + 0.4, None)
+        x1 = min(x1, width - 0.4)
+        part.block((low[0], low[1], low[2]), (x0, high[1], 3.0))
+        part.block((x1, low[1], low[2]), (high[0], high[1], 3.0))
+        part.block((low[0], low[1], 3.0), (high[0], high[1], high[2]))
+        openings = openings[(openings[:, 1] < x0 - 0.1) | (openings[:, 0] > x1 + 0.1)]
+        openings = np.concatenate([openings, [[x0, x1]]])
+        openings = openings[np.argsort(openings[:, 0])]
+        door = int(np.flatnonzero(openings[:, 0] == x0)[0])
+    else:
+        part.block((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    _facade(part, style, width, openings, door, passage)
+    _ornaments(part, rng, style, openings, door)
+    for is_open, corner, yaw in zip(open_sides, ((0.0, depth), (width, 0.0)), (-0.5 * np.pi, 0.5 * np.pi), strict=True):
+        if is_open:
+            side = Builder()
+            _facade(side, style, depth, style.openings(depth))
+            part.place(side, make_transform(rotation_z(yaw), [*corner, 0.0]))
+    _roof(part, rng, width, depth, top)
+    return part
+
+
+def _draw_style(rng: np.random.Generator) -> _Style:
+    storey = rng.uniform(2.9, 3.5)
+    is_shop = rng.random() < 0.3
+    sill = rng.uniform(0.7, 1.0)
+    return _Style(
+        storeys=int(rng.integers(2, 6)),
+        storey_m=storey,
+        recess_m=rng.uniform(0.14, 0.38),
+        axis_m=rng.uniform(2.1, 3.4),
+        opening=rng.uniform(0.4, 0.62),
+        sill_m=sill,
+        lintel_m=rng.uniform(sill + 1.2, storey - 0.25),
+        ground_sill_m=0.35 if is_shop else sill + 0.1,
+        ground_lintel_m=2.6 if is_shop else rng.uniform(2.2, 2.6),
+    )
+
+
+def _facade(
+    part: Builder, style: _Style, width: float, openings: FloatArray, door: int = -1, is_passage: bool = False
+) -> None:
+    """Piers between the columns of windows, bands between the storeys; the column `door` is open to the ground."""
+    back, top = style.recess_m + _OFFSET_M, style.top_m
+    edges = np.concatenate([[0.0], openings.ravel(), [width]]).reshape(-1, 2)
+    for x0, x1 in edges:
+        if x1 - x0 > 0.05:
+            part.block((x0, 0.0, -FOUNDATION_M), (x1, back, top))
+    sills = [style.ground_sill_m, *(style.storey_m * k + style.sill_m for k in range(1, style.storeys)), top]
+    lintels = [style.ground_lintel_m, *(style.storey_m * k + style.lintel_m for k in range(1, style.storeys))]
+    for low, high in zip(lintels, sills[1:], strict=True):
+        part.block((0.01, _OFFSET_M, low), (width - 0.01, back, high))
+    spans = [(0.01, width - 0.01)]
+    if door >= 0:
+        spans = [(0.01, openings[door, 0]), (openings[door, 1], width - 0.01)]
+    for x0, x1 in spans:
+        part.block((x0, _OFFSET_M, -FOUNDATION_M), (x1, back, sills[0]))
+    if door >= 0 and not is_passage:
+        x0, x1 = openings[door]
+        part.block((x0, -0.32, -0.6), (x1, back, 0.14))
+
+
+def _ornaments(part: Builder, rng: np.random.Generator, style: _Style, openings: FloatArray, door: int) -> None:
+    """Cornice, downpipe, awning, and a bay or balconies on the upper floors."""
+    x0, x1 = 0.0, float(openings[-1, 1])
+    pipe = rng.choice([x0 + 0.12, x1 + 0.2])
+    part.pole(np.array([pipe, -0.07]), (-0.5, style.top_m - 0.1), 0.05)
+    if style.ground_sill_m < 0.5 and rng.random() < 0.7:
+        start, end = np.array([0.5 * (x0 + x1), -rng.uniform(0.9, 1.3), 2.55]), np.array([0.5 * (x0 + x1), 0.05, 3.0])
+        part.beam(start, end, 0.85 * (x1 - x0), 0.05)
+    elif rng.random() < 0.35:
+        _bay(part, style, openings[int(rng.integers(len(openings)))], rng.uniform(0.5, 0.9))
+    if rng.random() < 0.35:
+        for column in np.flatnonzero(rng.random(len(openings)) < 0.3):
+            for storey in range(1, style.storeys):
+                if column != door and rng.random() < 0.7:
+                    _balcony(part, openings[column], storey * style.storey_m, rng.uniform(0.8, 1.2))
+
+
+def _bay(part: Builder, style: _Style, opening: FloatArray, reach: float) -> None:
+    """A box with windows of its own before the upper floors of one column."""
+    x0, x1 = opening[0] - 0.25, opening[1] + 0.25
+    low, high = style.storey_m - 0.05, style.top_m - 0.4
+    part.block((x0 + 0.1, -reach + 0.12, low), (x1 - 0.1, 0.1, high))
+    for x in (x0, x1 - 0.16):
+        part.block((x, -reach, low), (x + 0.16, -reach + 0.2, high))
+    for k in range(1, style.storeys + 1):
+        z0 = low if k == 1 else (k - 1) * style.storey_m + style.lintel_m
+        z1 = high if k == style.storeys else k * style.storey_m + style.sill_m
+        if z1 - z0 > 0.05:
+            part.block((x0 + _OFFSET_M, -reach + _OFFSET_M, z0), (x1 - _OFFSET_M, 0.1, z1))
+
+
+def _balcony(part: Builder, opening: FloatArray, floor: float, reach: float) -> None:
+    """A slab with a railing of bars."""
+    x0, x1 = opening[0] - 0.3, opening[1] + 0.3
+    part.block((x0, -reach, floor - 0.16), (x1, 0.1, floor))
+    part.block((x0, -reach, floor + 0.95), (x1, -reach + 0.05, floor + 1.0))
+    for x in (x0, x1 - 0.05):
+        part.block((x, -reach + 0.06, floor + 0.1), (x + 0.04, 0.05, floor + 1.0))
+    for x in np.linspace(x0, x1 - 0.04, max(3, round((x1 - x0) / 0.5))):
+        part.block((x, -reach + 0.01, floor - 0.02), (x + 0.04, -reach + 0.04, floor + 0.96))
+
+
+def _roof(part: Builder, rng: np.random.Generator, width: float, depth: float, top: float) -> None:
+    """A flat roof behind a parapet, or a pitched one with its eaves to the street."""
+    part.block((-0.01, -0.22, top - 0.05), (width + 0.01, 0.3, top + 0.18))
+    if rng.random() < 0.45:
+        high = top + rng.uniform(0.5, 0.9)
+        for y in (0.0, depth - 0.3):
+            part.block((0.0, y, top), (width, y + 0.28, high))
+        x = rng.uniform(0.2, 0.6) * width
+        part.block((x, 0.4 * depth, top), (x + 2.4, 0.4 * depth + 3.0, top + 2.4))
+    else:
+        ridge = top + rng.uniform(0.5, 1.0) * 0.5 * depth
+        middle = np.array([0.5 * width, 0.5 * depth, ridge])
+        for eave in (-0.35, depth + 0.35):
+            part.beam(np.array([0.5 * width, eave, top + 0.1]), middle, width, 0.2)
+        for fraction in (0.2, 0.5, 0.8):
+            inset = 0.5 * depth * fraction
+            high = top + fraction * (ridge - top)
+            part.block((0.05, inset, top - 0.1), (width - 0.05, depth - inset, high))
+    x, y = rng.uniform(0.1, 0.85) * width, rng.uniform(0.55, 0.8) * depth
+    part.block((x, y, top - 0.1), (x + 0.9, y + 0.5, top + rng.uniform(2.0, 4.0)))

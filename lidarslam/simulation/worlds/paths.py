@@ -1,0 +1,127 @@
+"""Closed lines on the plane: ways through a world, and how far things are from them."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.world import HeightField, Route
+from lidarslam.simulation.worlds.building import Builder
+from lidarslam.simulation.worlds.clearance import sample_route
+
+
+def loop_length(loop: FloatArray) -> float:
+    """Length of the closed polyline (M, D)."""
+    return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
+
+
+def resample_loop(loop: FloatArray, spacing_m: float) -> FloatArray:
+    """Points (N, D) at equal distances, about `spacing_m`, along the closed polyline (M, D)."""
+    closed = np.concatenate([loop, loop[:1]])
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    count = max(3, round(at[-1] / spacing_m))
+    wanted = np.arange(count) * (at[-1] / count)
+    return np.stack([np.interp(wanted, at, column) for column in closed.T], axis=1)
+
+
+def offset_loop(corners: FloatArray, right_m: float) -> FloatArray:
+    """The closed polyline (M, 2) moved to the right of its direction; corners must not be hairpins."""
+    along = np.roll(corners, -1, axis=0) - corners
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    after = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    before = np.roll(after, 1, axis=0)
+    mitre = (before + after) / (1.0 + (before * after).sum(axis=1, keepdims=True))
+    return np.asarray(corners + right_m * mitre)
+
+
+def turns_left(corners: FloatArray) -> NDArray[np.bool_]:
+    """(M,) whether the closed polyline (M, 2) turns to the left at each corner."""
+    into, out = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    return np.asarray(into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0] > 0.0)
+
+
+def round_corners(corners: FloatArray, radii: FloatArray, step_m: float) -> FloatArray:
+    """The closed polyline (M, 2) with arcs of `radii` (M,) for corners, in points (N, 2) `step_m` apart on the arcs."""
+    pieces = []
+    befores, afters = np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0)
+    for before, corner, after, radius in zip(befores, corners, afters, radii, strict=True):
+        into = (corner - before) / np.linalg.norm(corner - before)
+        out = (after - corner) / np.linalg.norm(after - corner)
+        turn = np.arctan2(into[0] * out[1] - into[1] * out[0], into @ out)
+        start = corner - radius * np.tan(0.5 * abs(turn)) * into
+        left = np.array([-into[1], into[0]])
+        angles = abs(turn) * np.linspace(0.0, 1.0, 1 + max(1, int(np.ceil(radius * abs(turn) / step_m))))
+        sideways = np.sign(turn) * (1.0 - np.cos(angles))
+        pieces.append(start + radius * (np.sin(angles)[:, None] * into + sideways[:, None] * left))
+    return np.concatenate(pieces)
+
+
+def subdivide_loop(loop: FloatArray, spacing_m: float) -> FloatArray:
+    """The closed polyline (M, D) with points (N, D) added, so that none is farther than `spacing_m` from the next."""
+    following = np.roll(loop, -1, axis=0)
+    counts = np.maximum(1, np.ceil(np.linalg.norm(following - loop, axis=1) / spacing_m).astype(int))
+    legs = zip(loop, following, counts, strict=True)
+    return np.concatenate([a + (b - a) * (np.arange(count) / count)[:, None] for a, b, count in legs])
+
+
+def winding_loop(
+    rng: np.random.Generator, length_m: float, harmonics: int, wobble: float, min_radius_m: float
+) -> FloatArray:
+    """A smooth closed line (N, 2) around the origin, counter-clockwise, points half a metre apart.
+
+    The distance from the origin sways with `harmonics` waves per turn at most; lines with bends tighter than
+    `min_radius_m` are drawn again, with ever smaller sway.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)[:-1]
+    wave = np.arange(2, harmonics + 1)
+    while True:
+        size, phase = rng.uniform(0.4, 1.0, len(wave)) / wave, rng.uniform(0.0, 2.0 * np.pi, len(wave))
+        radius = 1.0 + wobble * (size * np.cos(angle[:, None] * wave + phase)).sum(axis=1)
+        loop = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        loop *= length_m / loop_length(loop)
+        closed = np.concatenate([loop, loop[:1]])
+        spline = CubicSpline(np.append(angle, 2.0 * np.pi), closed, bc_type="periodic")
+        speed, bend = spline(angle, 1), spline(angle, 2)
+        curvature = np.abs(speed[:, 0] * bend[:, 1] - speed[:, 1] * bend[:, 0]) / np.linalg.norm(speed, axis=1) ** 3
+        if curvature.max() * min_radius_m <= 1.0 and radius.min() > 0.3:
+            fine = spline(np.linspace(0.0, 2.0 * np.pi, 4001)[:-1])
+            return resample_loop(fine, 0.5)
+        wobble *= 0.97
+
+
+def distance_to_loop(xy: FloatArray, loop: FloatArray) -> FloatArray:
+    """Distance (N,) of points (N, 2) from the closed polyline (M, 2), good to 0.1 m from a decimetre on."""
+    distance, _ = cKDTree(resample_loop(loop, 0.2)).query(xy)
+    return np.asarray(distance)
+
+
+def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:
+    """Points (N, 3) on the ground at (N, 2)."""
+    return np.column_stack([xy, ground.height_at(xy)])
+
+
+def prune(part: Builder, route: Route, margin_m: float = 0.1) -> Builder:
+    """Cut leaves and branches out of the route's free space: those that come near it at all go entirely.
+
+    A box counts as large as the upright round block around it, so this is for small things.
+    """
+    boxes, cylinders = part.boxes, part.cylinders
+    reach = (np.abs(boxes.R_world_box) @ boxes.half_sizes[:, :, None])[:, :, 0]
+    floor = _highest_within(boxes.centres[:, :2], np.hypot(reach[:, 0], reach[:, 1]) + margin_m, route)
+    keep_boxes = boxes.centres[:, 2] - reach[:, 2] > floor + route.free_height_m + margin_m
+
+    fraction = np.linspace(0.0, 1.0, 13)[:, None]
+    axis = (cylinders.starts[:, None, :] + fraction * (cylinders.ends - cylinders.starts)[:, None, :]).reshape(-1, 3)
+    radii = np.repeat(cylinders.radii, len(fraction))
+    # Between two samples of its axis a cylinder comes a little nearer than at them.
+    floor = _highest_within(axis[:, :2], radii + 2.0 * margin_m, route)
+    above = axis[:, 2] - radii > floor + route.free_height_m + 2.0 * margin_m
+    return part.selected(keep_boxes, above.reshape(len(cylinders), -1).all(axis=1))
+
+
+def _highest_within(xy: FloatArray, margins_m: FloatArray, route: Route) -> FloatArray:
+    """z (N,) of the highest point of the route whose free side comes within the margins (N,) of (N, 2), or -inf."""
+    path = sample_route(route, 0.2)
+    near = cKDTree(path[:, :2]).query_ball_point(xy, route.free_side_m + margins_m)
+    return np.array([path[indices, 2].max(initial=-np.inf) for indices in near])

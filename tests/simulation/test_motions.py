@@ -1,0 +1,223 @@
+"""Motions are continuous, physical, on the ground, and come round."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp, is_rigid, make_transform
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.carriers import CARRIERS
+from lidarslam.simulation.given_motion import motion_along
+from lidarslam.simulation.motions import rotations
+from lidarslam.simulation.rounded_path import RoundedPath, corner_windows, straightened
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.speed_profile import TIME_STEP_S, rest_to_rest
+
+STEP_S = 0.005
+# name: largest acceleration along, across and up (m/s^2), turn rate (deg/s) and angular acceleration (deg/s^2); the
+# sway of what walks counts.
+LIMITS = {
+    "car": (3.0, 4.0, 3.0, 60.0, 120.0),
+    "handheld": (2.5, 4.5, 6.0, 110.0, 400.0),
+    "legged": (2.5, 4.5, 6.0, 100.0, 500.0),
+    "tracked": (2.0, 2.0, 6.0, 121.0, 520.0),
+    "tracked-harsh": (2.0, 2.0, 6.0, 181.0, 920.0),
+    "drone": (3.0, 3.0, 4.0, 90.0, 300.0),
+}
+
+
+@pytest.fixture(scope="module", params=list(CARRIERS))
+def motion(request, yard):
+    return motion_along_route(request.param, yard, seed=4)
+
+
+@pytest.fixture(scope="module")
+def poses(motion):
+    """Times and poses of a lap and a bit more."""
+    times = np.arange(0.0, motion.duration_s + 5.0, STEP_S)
+    return times, motion.pose_at(times)
+
+
+def yaw_of(T):
+    return np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+
+
+def test_limits_are_physical(motion, poses):
+    _, T = poses
+    acceleration = np.gradient(np.gradient(T[:, :3, 3], STEP_S, axis=0), STEP_S, axis=0)
+    along, across, up, rate, angular = LIMITS[motion.name]
+    assert is_rigid(T)
+    assert np.abs((acceleration * T[:, :3, 0]).sum(axis=1)).max() < along
+    assert np.abs((acceleration * T[:, :3, 1]).sum(axis=1)).max() < across
+    assert np.abs(acceleration[:, 2]).max() < up
+    turning = np.rad2deg(np.gradient(yaw_of(T), STEP_S))
+    assert np.abs(turning).max() < rate
+    assert np.abs(np.gradient(turning, STEP_S)).max() < angular
+
+
+def test_position_and_velocity_are_continuous(motion):
+    times = np.linspace(0.0, 1.2 * motion.duration_s, 2000)
+    for fine in (1e-3, 1e-4):
+        before, now, after = (motion.pose_at(times + shift)[:, :3, 3] for shift in (-fine, 0.0, fine))
+        assert np.abs(after - now).max() < 15.0 * fine
+        assert np.abs(after - 2.0 * now + before)[2:].max() < 10.0 * fine**2 + 1e-11
+
+
+def test_starts_at_rest(motion):
+    T = motion.pose_at(np.linspace(0.0, 0.5, 50))
+    np.testing.assert_allclose(T, np.broadcast_to(T[:1], T.shape), atol=1e-9)
+
+
+def test_laps_come_round_exactly(motion):
+    laps = motion.duration_s * np.arange(4)
+    np.testing.assert_allclose(motion.pose_at(laps), motion.pose_at(np.zeros(4)), atol=1e-9)
+    quarter = motion.pose_at(np.array([0.25, 1.25]) * motion.duration_s)
+    assert np.linalg.norm(quarter[0, :3, 3] - motion.pose_at(np.zeros(1))[0, :3, 3]) > 5.0
+    sway = 0.6 if motion.name == "drone" else 0.3
+    assert np.linalg.norm(quarter[0, :3, 3] - quarter[1, :3, 3]) < sway
+
+
+def test_stays_within_the_free_side(motion, poses, yard):
+    _, T = poses
+    a = yard.route.waypoints[:, :2]
+    legs = np.roll(a, -1, axis=0) - a
+    offsets = T[::20, None, :2, 3] - a
+    along = np.clip((offsets * legs).sum(axis=-1) / (legs**2).sum(axis=-1), 0.0, 1.0)
+    away = np.linalg.norm(offsets - along[..., None] * legs, axis=-1).min(axis=1)
+    assert away.max() < yard.route.free_side_m - CARRIERS[motion.name].half_width_m + 0.15
+
+
+def test_follows_the_ground(motion, poses, yard):
+    _, T = poses
+    above = T[::20, 2, 3] - yard.ground_at(T[::20, :2, 3])
+    if motion.name == "drone":
+        assert 1.4 < above.min() < above.max() < 2.6
+    else:
+        assert np.abs(above).max() < 0.08
+
+
+def test_wheels_lean_with_the_ground(yard):
+    motion = motion_along_route("tracked", yard, seed=4)
+    T = motion.pose_at(np.arange(0.0, motion.duration_s, 0.1))
+    ahead = T[:, :3, 3] + 0.3 * T[:, :3, 0]
+    left = T[:, :3, 3] + 0.3 * T[:, :3, 1]
+    assert np.abs(ahead[:, 2] - yard.ground_at(ahead[:, :2])).max() < 0.03
+    assert np.abs(left[:, 2] - yard.ground_at(left[:, :2])).max() < 0.03
+
+
+@pytest.mark.parametrize(("name", "rate"), [("tracked", 120.0), ("tracked-harsh", 180.0)])
+def test_tracked_turns_on_the_spot(name, rate, yard):
+    motion = motion_along_route(name, yard, seed=4)
+    times = np.arange(0.0, motion.duration_s, STEP_S)
+    T = motion.pose_at(times)
+    turning = np.rad2deg(np.gradient(yaw_of(T), STEP_S))
+    speed = np.linalg.norm(np.gradient(T[:, :2, 3], STEP_S, axis=0), axis=1)
+    np.testing.assert_allclose(np.abs(turning).max(), rate, rtol=0.005)
+    assert speed[np.abs(turning) > 10.0].max() < 1e-3
+    assert np.abs(turning[speed > 0.05]).max() < 10.0
+    if name == "tracked-harsh":
+        np.testing.assert_allclose([turning.min(), turning.max()], [-rate, rate], rtol=0.005)
+
+
+def test_legged_sways_with_its_gait(yard):
+    motion = motion_along_route("legged", yard, seed=4)
+    times = np.arange(10.0, 18.0, 0.01)
+    height = motion.pose_at(times)[:, 2, 3]
+    spectrum = np.abs(np.fft.rfft((height - np.poly1d(np.polyfit(times, height, 5))(times)) * np.hanning(len(times))))
+    assert 1.5 < np.fft.rfftfreq(len(times), 0.01)[spectrum.argmax()] < 2.5
+
+
+def test_seeds_vary_and_repeat(yard):
+    first, same, other = (motion_along_route("handheld", yard, seed) for seed in (1, 1, 2))
+    times = np.linspace(0.0, 30.0, 100)
+    np.testing.assert_array_equal(first.pose_at(times), same.pose_at(times))
+    assert np.abs(first.pose_at(times) - other.pose_at(times)).max() > 0.1
+
+
+def test_unknown_motion_is_answered_with_the_choices(yard):
+    with pytest.raises(InputError, match=r"'train'.*car, handheld, legged, tracked, tracked-harsh, drone"):
+        motion_along_route("train", yard, 0)
+
+
+def test_a_given_trajectory_is_followed_on_the_ground(yard):
+    stamps = 100.0 + 0.1 * np.arange(80)
+    steps = exp(np.tile([0.0, 0.0, 0.01, 0.4, 0.0, 0.0], (80, 1)))
+    T = [make_transform(np.eye(3), [-10.0, -9.0, 50.0])]
+    for step in steps[1:]:
+        T.append(T[-1] @ step)
+    trajectory = Trajectory(stamps, np.stack(T))
+    motion = motion_along(trajectory, yard)
+    followed = motion.pose_at(stamps - 100.0)
+    np.testing.assert_allclose(followed[:, :2, 3], trajectory.positions[:, :2], atol=1e-9)
+    np.testing.assert_allclose(yaw_of(followed), yaw_of(trajectory.T_world_lidar), atol=1e-9)
+    assert np.abs(followed[:, 2, 3] - yard.ground_at(followed[:, :2, 3])).max() < 0.08
+    np.testing.assert_allclose(motion.pose_at(np.array([20.0])), followed[-1:], atol=1e-12)
+    flown = motion_along(trajectory, yard, on_ground=False)
+    np.testing.assert_allclose(flown.pose_at(stamps - 100.0), trajectory.T_world_lidar, atol=1e-9)
+    assert flown.sensor_height_m == 0.0
+
+
+def test_a_given_trajectory_is_smoothed(yard, rng):
+    """Noise of 2 cm at 10 Hz would be accelerations of metres a second squared; the path itself stays."""
+    times = 0.1 * np.arange(300)
+    path = np.stack([-20.0 + 1.3 * times, 3.0 * np.sin(0.3 * times), np.zeros(300)], axis=-1)
+    noisy = path + rng.normal(scale=[0.02, 0.02, 0.0], size=path.shape)
+    yaw = np.arctan2(0.9 * np.cos(0.3 * times), 1.3)
+    trajectory = Trajectory(times, make_transform(rotations(np.zeros(300), np.zeros(300), yaw), noisy))
+    fine = np.arange(0.0, 29.9, 0.01)
+
+    def acceleration(smoothing_s):
+        xy = motion_along(trajectory, yard, smoothing_s=smoothing_s).pose_at(fine)[:, :2, 3]
+        return np.linalg.norm(np.gradient(np.gradient(xy, 0.01, axis=0), 0.01, axis=0), axis=1)[50:-50].max()
+
+    assert acceleration(0.0) > 5.0
+    assert acceleration(0.25) < 1.5
+    smooth = motion_along(trajectory, yard, smoothing_s=0.25).pose_at(times)[:, :2, 3]
+    assert np.linalg.norm(smooth - path[:, :2], axis=1).max() < 0.05
+
+
+def test_a_trajectory_of_a_camera_is_refused(yard):
+    poses = make_transform(np.eye(3), np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 1.0]]))
+    with pytest.raises(InputError, match="camera"):
+        motion_along(Trajectory(np.array([0.0, 1.0]), poses), yard)
+    with pytest.raises(InputError, match="two poses"):
+        motion_along(Trajectory(np.array([0.0]), poses[:1]), yard)
+    upwards = exp(np.array([[0.0, -1.5, 0.0, 0.0, 0.0, 0.0]] * 2))
+    with pytest.raises(InputError, match="80 degrees"):
+        motion_along(Trajectory(np.array([0.0, 1.0]), upwards), yard, on_ground=False)
+
+
+def test_rounded_path_matches_its_derivatives():
+    vertices = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 1.0], [10.0, 8.0, 1.0], [4.0, 12.0, 0.0]])
+    path = RoundedPath(vertices, corner_windows(vertices, corner_m=4.0, cut_m=0.5))
+    u = np.linspace(0.0, path.lengths[-1], 20_001)
+    points, first, second = path.at(u)
+    np.testing.assert_allclose(points[[0, -1]], vertices[[0, -1]], atol=1e-9)
+    np.testing.assert_allclose(np.gradient(points, u, axis=0)[1:-1], first[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(first, u, axis=0)[1:-1], second[1:-1], atol=2e-3)
+    corner = np.linalg.norm(points[:, :2] - [10.0, 0.0], axis=1).min()
+    np.testing.assert_allclose(corner, 0.5, atol=1e-3)  # the window is chosen to cut exactly that much
+
+
+def test_straightening_keeps_the_corners():
+    square = np.array([[0, 0, 0], [5, 0.1, 0], [10, 0, 0], [10, 10, 0], [4, 9.95, 0], [0, 10, 0]], dtype=float)
+    np.testing.assert_array_equal(straightened(square, 0.2), square[[0, 2, 3, 5]])
+    np.testing.assert_array_equal(straightened(square, 0.01), square)
+
+
+def test_speed_profile_keeps_its_limits():
+    positions = np.linspace(0.0, 50.0, 1001)
+    limits = np.where(np.abs(positions - 30.0) < 3.0, 1.0, 6.0)
+    travelled, speeds = rest_to_rest(positions, limits, acceleration=2.0, smoothing_s=0.3)
+    assert travelled[0] == 0.0
+    np.testing.assert_allclose(travelled[-1], 50.0)
+    assert speeds[[0, -1]].max() < 1e-3
+    assert speeds.max() < 6.0 + 1e-9
+    assert np.abs(np.gradient(speeds, TIME_STEP_S)).max() < 2.0 + 1e-6
+    assert speeds[np.abs(travelled - 30.0) < 2.0].max() < 1.01
+
+
+def test_rotations_are_in_the_order_yaw_pitch_roll():
+    R = rotations(np.array([0.1]), np.array([0.2]), np.array([0.3]))[0]
+    turns = [exp([0, 0, 0.3, 0, 0, 0]), exp([0, 0.2, 0, 0, 0, 0]), exp([0.1, 0, 0, 0, 0, 0])]
+    np.testing.assert_allclose(R, (turns[0] @ turns[1] @ turns[2])[:3, :3], atol=1e-12)

@@ -1,0 +1,86 @@
+"""Closed lines: lengths, offsets and arcs with known answers; the free space cut out of what grows."""
+
+import numpy as np
+import pytest
+
+from lidarslam.simulation.world import Route
+from lidarslam.simulation.worlds import paths
+from lidarslam.simulation.worlds.building import Builder
+from lidarslam.simulation.worlds.street_network import StreetNetwork
+
+RECTANGLE = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 10.0], [0.0, 10.0]])
+
+
+def test_resampled_points_are_evenly_spaced():
+    points = paths.resample_loop(RECTANGLE, 0.5)
+    np.testing.assert_allclose(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1), 0.5)
+    assert paths.loop_length(RECTANGLE) == 60.0
+
+
+def test_the_right_of_a_counter_clockwise_line_is_outside():
+    np.testing.assert_allclose(
+        paths.offset_loop(RECTANGLE, 2.0), [[-2.0, -2.0], [22.0, -2.0], [22.0, 12.0], [-2.0, 12.0]]
+    )
+    np.testing.assert_allclose(paths.offset_loop(RECTANGLE[::-1], 2.0)[0], [2.0, 8.0])
+
+
+def test_rounded_corners_are_arcs_of_their_radii():
+    radii = np.array([1.0, 2.0, 3.0, 4.0])
+    points = paths.round_corners(RECTANGLE, radii, 0.05)
+    assert paths.loop_length(points) == pytest.approx(60.0 - (2.0 - 0.5 * np.pi) * radii.sum(), abs=0.01)
+    near = points[(points[:, 0] > 17.0) & (points[:, 1] > 7.0)]
+    np.testing.assert_allclose(np.linalg.norm(near - [17.0, 7.0], axis=1), 3.0)
+
+
+def test_left_and_right_turns_are_told_apart():
+    assert paths.turns_left(RECTANGLE).all()
+    assert not paths.turns_left(RECTANGLE[::-1]).any()
+
+
+def test_subdividing_keeps_the_corners_and_the_line():
+    points = paths.subdivide_loop(RECTANGLE, 3.0)
+    assert np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1).max() <= 3.0
+    assert paths.loop_length(points) == pytest.approx(60.0)
+    assert all((points == corner).all(axis=1).any() for corner in RECTANGLE)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_winding_loops_have_their_length_and_no_tight_bend(seed):
+    loop = paths.winding_loop(np.random.default_rng(seed), 200.0, 6, 0.6, 4.0)
+    assert paths.loop_length(loop) == pytest.approx(200.0, rel=0.01)
+    ahead = np.roll(loop, -1, axis=0) - loop
+    turn = np.angle(np.exp(1j * np.diff(np.arctan2(ahead[:, 1], ahead[:, 0]))))
+    assert np.abs(turn).max() < 1.1 * 0.5 / 4.0
+    assert np.abs(turn).std() > 0.01  # not a circle
+
+
+def test_distance_is_to_the_line_and_not_to_its_corners():
+    distance = paths.distance_to_loop(np.array([[10.0, 5.0], [10.03, -3.0], [25.0, 5.0]]), RECTANGLE)
+    np.testing.assert_allclose(distance, [5.0, 3.0, 5.0], atol=0.01)
+
+
+def test_pruning_cuts_what_hangs_into_the_way_and_nothing_else():
+    route = Route(np.column_stack([RECTANGLE, np.zeros(4)]), 1.0, 1.0, 2.5, 1.0)
+    part = Builder()
+    for x, y, z in ((10.0, 0.5, 1.0), (10.0, 0.5, 4.0), (10.0, 3.0, 1.0)):
+        part.box((x, y, z), (0.4, 0.4, 0.4))
+    part.cylinder(np.array([10.0, 4.0, 1.0]), np.array([10.0, 0.5, 2.0]), 0.05)
+    part.cylinder(np.array([10.0, 4.0, 3.0]), np.array([10.0, 0.5, 4.0]), 0.05)
+    kept = paths.prune(part, route)
+    np.testing.assert_allclose(kept.boxes.centres[:, 1:], [[0.5, 4.0], [3.0, 1.0]])
+    np.testing.assert_allclose(kept.cylinders.starts[:, 2], [3.0])
+
+
+def test_kerbs_run_where_the_road_ends():
+    nodes = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [-40.0, 0.0]])
+    network = StreetNetwork(nodes, ((0, 1), (0, 2), (0, 3)), 6.0, 4.0)
+    at = np.array(
+        [[20.0, 0.0], [20.0, 6.0], [20.0, 9.0], [10.0, 6.0], [6.8, 6.8], [8.0, 8.0], [0.0, -7.0], [43.0, 0.0]]
+    )
+    corner = 4.0 - np.hypot(3.2, 3.2), 4.0 - np.hypot(2.0, 2.0)
+    np.testing.assert_allclose(network.kerb_distance(at), [-6.0, 0.0, 3.0, 0.0, *corner, 1.0, -3.0], atol=1e-12)
+    stones = np.array(list(network.kerb_stones()))
+    np.testing.assert_allclose(network.kerb_distance(stones.mean(axis=1)), 0.35, atol=0.06)
+    straight, dead_ends, fillets = 80.0 + 4.0 * 30.0, 3.0 * np.pi * 6.35, np.pi * 3.65
+    length = np.linalg.norm(stones[:, 1] - stones[:, 0], axis=1).sum()
+    assert length == pytest.approx(straight + dead_ends + fillets, rel=0.01)

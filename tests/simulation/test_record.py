@@ -1,0 +1,307 @@
+"""Whole recordings: made, read back, replaced or refused, and by the command line."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial import cKDTree
+
+from lidarslam.cli import main
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.geometry import make_transform, transform_points
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import format_kitti, read_tum, write_tum
+from lidarslam.datasets.ply import read_ply
+from lidarslam.datasets.point_table import coordinates
+from lidarslam.datasets.registry import open_recording
+from lidarslam.simulation import record as record_module
+from lidarslam.simulation.record import record
+from lidarslam.simulation.recording_motion import read_trajectory
+from lidarslam.simulation.recording_request import RecordRequest
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import Boxes, HeightField, Route, World
+from lidarslam.simulation.writers.registry import FORMATS
+
+SCANS = 3
+
+
+@pytest.fixture(autouse=True)
+def worlds(monkeypatch):
+    """Every world is a hall of 15 x 10 x 4 m with three crates: built in no time."""
+
+    def build(name, seed):
+        floor = HeightField(np.array([-8.0, -6.0]), 1.0, np.zeros((17, 13)))
+        walls = [
+            (7.7, 0, 2, 0.2, 5.4, 2),
+            (-7.7, 0, 2, 0.2, 5.4, 2),
+            (0, 5.2, 2, 7.9, 0.2, 2),
+            (0, -5.2, 2, 7.9, 0.2, 2),
+        ]
+        walls += [(3, 0.5, 1, 1, 0.6, 1), (-3, -0.2, 0.5, 0.8, 0.6, 0.5), (0, 1, 1.5, 0.5, 0.5, 1.5)]
+        table = np.array(walls, dtype=np.float64)
+        corners = np.array([[-5.5, -3.2, 0.0], [5.5, -3.2, 0.0], [5.5, 3.2, 0.0], [-5.5, 3.2, 0.0]])
+        boxes = Boxes(table[:, :3], table[:, 3:], np.tile(np.eye(3), (len(table), 1, 1)))
+        return World(name, seed, Route(corners, 1.0, 1.0, 4.0, 3.0), boxes, height_fields=(floor,))
+
+    monkeypatch.setattr(record_module, "build_world", build)
+
+
+def request(out, **changes):
+    values = {
+        "world": "hall", "sensor": "vlp-16", "motion": "tracked", "mount": "tilted", "scans": SCANS, "seed": 4,
+        "format": "mcap",
+    }  # fmt: skip
+    return RecordRequest(out, **{**values, **changes})
+
+
+def silently(number, total):
+    pass
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_recording_of_every_format_is_true(name, tmp_path):
+    out = tmp_path / "recordings" / "a hall"
+    told = []
+    summary = record(request(out, format=name), lambda *numbers: told.append(numbers))
+    assert told == [(1, SCANS), (2, SCANS), (3, SCANS)]
+    assert [entry.name for entry in out.parent.iterdir()] == ["a hall"]
+    true_map = cKDTree(coordinates(read_ply(out / "map.ply")))
+    assert true_map.n == summary.map_points
+    truth = read_tum(out / "ground_truth.tum")
+    for source in {out, summary.source}:
+        recording = open_recording(source)
+        assert len(recording) == summary.scans == SCANS
+        assert recording.describe().ground_truth is not None
+        np.testing.assert_allclose(recording.ground_truth.stamps, truth.stamps, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(recording.ground_truth.T_world_lidar, truth.T_world_lidar, atol=2e-8)
+        for number, scan in enumerate(recording.scans()):
+            assert scan.stamp == pytest.approx(truth.stamps[number], abs=1e-9)
+            # It starts at rest, so that the points need no compensation.
+            assert (scan.time_offsets is None) == (name == "kitti")
+            points = transform_points(truth.T_world_lidar[number], scan.points)
+            distances, _ = true_map.query(points)
+            assert np.median(distances) < 0.035  # half the distance between samples of the map
+            assert np.quantile(distances, 0.99) < 0.12
+
+
+def test_driver_of_the_sensor(tmp_path):
+    for sensor, topic in [("xt32", "/lidar_points"), ("livox", "/livox/lidar")]:
+        record(request(tmp_path / sensor, sensor=sensor, scans=1), silently)
+        assert open_recording(tmp_path / sensor).describe().topic == topic
+
+
+def test_same_request_same_bytes(tmp_path):
+    for name in ("kitti", "ply"):
+        folders = [tmp_path / str(i) / name for i in range(2)]
+        for folder in folders:
+            record(request(folder, format=name, scans=2), silently)
+        files = [sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file()) for folder in folders]
+        assert files[0] == files[1]
+        for path in files[0]:
+            if path.name != "README.md":  # which names the folder
+                assert (folders[0] / path).read_bytes() == (folders[1] / path).read_bytes()
+    other = tmp_path / "other"
+    record(request(other, format="ply", scans=2, seed=5), silently)
+    assert (other / "scan_000000.ply").read_bytes() != (tmp_path / "0" / "ply" / "scan_000000.ply").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["kitti", "rosbag1", "mcap"])
+def test_readme_says_how_it_was_made_and_what_to_type(name, tmp_path):
+    out = tmp_path / "hall"
+    summary = record(request(out, format=name, scans=1), silently)
+    text = (out / "README.md").read_text()
+    assert f"lidarslam simulate --out {out} --world hall --sensor vlp-16 --motion tracked --mount tilted" in text
+    assert f"--scans 1 --seed 4 --format {name}\n" in text
+    assert f"lidarslam run {summary.source} --out runs/hall" in text
+    assert summary.source.exists()
+    for entry in out.iterdir():
+        if entry.suffix in (".tum", ".ply"):
+            assert entry.name in text
+
+
+def test_nothing_is_left_of_a_recording_that_failed(tmp_path):
+    def interrupt(number, total):
+        assert not (tmp_path / "hall").exists()
+        raise KeyboardInterrupt
+
+    for name in FORMATS:
+        with pytest.raises(KeyboardInterrupt):
+            record(request(tmp_path / "hall", format=name), interrupt)
+        assert not list(tmp_path.iterdir())
+
+
+def test_what_a_kill_leaves_is_hidden_and_incomplete(tmp_path):
+    seen = []
+
+    def look(number, total):
+        seen.extend(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))
+
+    record(request(tmp_path / "hall", format="ply"), look)
+    assert all(str(path).startswith(".hall.partial-") for path in seen)
+    assert not {"README.md", "map.ply", "ground_truth.tum"} & {path.name for path in seen}
+
+
+def test_an_earlier_recording_is_replaced_only_when_asked_for(tmp_path):
+    out = tmp_path / "hall"
+    record(request(out, format="ply"), silently)
+    before = (out / "scan_000002.ply").read_bytes()
+    with pytest.raises(OutputError, match=r"holds a recording already.*--overwrite"):
+        record(request(out, format="ply", scans=1), silently)
+    assert (out / "scan_000002.ply").read_bytes() == before
+    record(request(out, format="mcap", scans=1, overwrite=True), silently)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "README.md", "ground_truth.tum", "hall.mcap", "map.ply", "metadata.yaml",
+    ]  # fmt: skip
+    assert [path.name for path in tmp_path.iterdir()] == ["hall"]
+
+
+def test_a_failed_replacement_keeps_the_earlier_recording(tmp_path):
+    out = tmp_path / "hall"
+    record(request(out), silently)
+    before = (out / "hall.mcap").read_bytes()
+    with pytest.raises(InputError, match="no sensor"):
+        record(request(out, sensor="sonar", overwrite=True), silently)
+    assert (out / "hall.mcap").read_bytes() == before
+
+
+def test_other_peoples_files_are_never_replaced(tmp_path):
+    out = tmp_path / "photos"
+    out.mkdir()
+    (out / "cat.png").touch()
+    with pytest.raises(OutputError, match=r"holds other files \(cat.png\)"):
+        record(request(out, overwrite=True), silently)
+    with pytest.raises(OutputError, match="a file is in the way"):
+        record(request(out / "cat.png", overwrite=True), silently)
+    with pytest.raises(OutputError, match="cannot be written"):
+        record(request(out / "cat.png" / "hall"), silently)
+    recording = tmp_path / "hall"
+    record(request(recording, scans=1), silently)
+    (recording / "runs").mkdir()
+    with pytest.raises(OutputError, match=r"more than a simulated recording \(runs\)"):
+        record(request(recording, scans=1, overwrite=True), silently)
+    assert (recording / "runs").is_dir()
+
+
+def test_an_empty_folder_may_become_a_recording(tmp_path):
+    record(request(tmp_path / "new" / "deep", scans=1), silently)
+    (tmp_path / "empty").mkdir()
+    record(request(tmp_path / "empty", scans=1), silently)
+    assert len(open_recording(tmp_path / "empty")) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"format": "pcap"}, "no recording format .* kitti, ply"),
+        ({"sensor": "sonar"}, "no sensor .* vlp-16"),
+        ({"motion": "crawl"}, "no motion .* handheld"),
+        ({"mount": "loose"}, "no mount .* upside-down"),
+    ],
+)
+def test_unknown_names(changes, told, tmp_path):
+    with pytest.raises(InputError, match=told):
+        record(request(tmp_path / "hall", **changes), silently)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def given():
+    """A second: straight on, then a gentle turn, x forwards."""
+    stamps = 100.0 + 0.1 * np.arange(11)
+    yaw = np.concatenate([np.zeros(5), np.linspace(0.0, 0.2, 6)])
+    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(11)
+    R = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=-1).reshape(-1, 3, 3)
+    step = 0.15 * np.stack([c, s, zero], axis=-1)
+    return Trajectory(stamps, make_transform(R, np.cumsum(step, axis=0) - [5.0, 3.0, -0.8]))
+
+
+def test_along_a_tum_trajectory(tmp_path, given):
+    path = tmp_path / "given.tum"
+    write_tum(path, given)
+    # What is carried by hand takes the poses as they are.
+    summary = record(
+        request(tmp_path / "a", trajectory=path, motion="handheld", mount="upright", format="kitti", scans=None),
+        silently,
+    )
+    assert summary.scans == 10
+    truth = open_recording(tmp_path / "a").ground_truth
+    np.testing.assert_allclose(truth.stamps, given.stamps[:-1] - 100.0, atol=1e-6)
+    np.testing.assert_allclose(truth.T_world_lidar, given.T_world_lidar[:-1], atol=1e-6)
+    text = (tmp_path / "a" / "README.md").read_text()
+    assert f"--trajectory {path} --motion handheld" in text
+    assert "handheld along given.tum" in text
+
+
+def test_a_car_follows_a_trajectory_on_the_ground(tmp_path, given):
+    path = tmp_path / "given.tum"
+    write_tum(path, given)
+    record(request(tmp_path / "a", trajectory=path, motion="car", mount="upright", scans=5, format="ply"), silently)
+    positions = open_recording(tmp_path / "a").ground_truth.positions
+    np.testing.assert_allclose(positions[:, :2], given.positions[:5, :2], atol=1e-6)
+    np.testing.assert_allclose(positions[:, 2], 1.73, atol=1e-3)
+
+
+def test_more_scans_than_the_trajectory_has(tmp_path, given):
+    path = tmp_path / "given.tum"
+    write_tum(path, given)
+    with pytest.raises(InputError, match=r"lasts 1.0 s, enough for 10 scans of a vlp-16, got --scans 11"):
+        record(request(tmp_path / "a", trajectory=path, scans=11), silently)
+
+
+def test_kitti_pose_files_are_those_of_a_camera(tmp_path, given):
+    # A car that drives along x and turns left: in camera axes it goes along z and turns about -y.
+    yaw = 0.3
+    T_cam0_cam = np.tile(np.eye(4), (2, 1, 1))
+    T_cam0_cam[1, :3, :3] = [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
+    T_cam0_cam[1, :3, 3] = [-0.2, -0.1, 2.0]
+    path = tmp_path / "00.txt"
+    path.write_text(format_kitti(T_cam0_cam))
+    trajectory = read_trajectory(path)
+    np.testing.assert_allclose(trajectory.stamps, [0.0, 0.1])
+    np.testing.assert_allclose(trajectory.positions[1], [2.0, 0.2, 0.1], atol=1e-9)
+    np.testing.assert_allclose(trajectory.T_world_lidar[1, :2, 0], [np.cos(yaw), np.sin(yaw)], atol=1e-8)
+    (tmp_path / "odd.txt").write_text("1 2 3\n")
+    with pytest.raises(InputError, match="expected 8 numbers, got 3"):
+        read_trajectory(tmp_path / "odd.txt")
+
+
+def test_command(tmp_path):
+    out = tmp_path / "hall"
+    arguments = ["simulate", "--out", str(out), "--world", "hall", "--scans", "2"]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, done.output
+    assert f"next: lidarslam run {out} --out runs/hall" in done.output
+    assert "2 scans of a vlp-16 (upright, handheld) in hall, seed 0" in done.output
+    again = CliRunner().invoke(main, arguments)
+    assert again.exit_code == 1
+    assert "holds a recording already" in again.output
+    assert CliRunner().invoke(main, [*arguments, "--overwrite"]).exit_code == 0
+    shown = CliRunner().invoke(main, ["info", str(out)])
+    assert shown.exit_code == 0
+    assert "/velodyne_points" in shown.output
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "choice"),
+    [("--world", "moon", "street"), ("--sensor", "sonar", "os1-128"), ("--motion", "crawl", "legged"),
+     ("--mount", "loose", "upside-down"), ("--format", "pcap", "rosbag1"), ("--scans", "0", "x>=1"),
+     ("--seed", "-1", "x>=0"), ("--trajectory", "absent.tum", "does not exist")],
+)  # fmt: skip
+def test_command_misused(option, value, choice, tmp_path):
+    done = CliRunner().invoke(main, ["simulate", "--out", str(tmp_path / "x"), option, value])
+    assert done.exit_code == 2
+    assert choice in done.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_lists_the_choices_and_an_example():
+    done = CliRunner().invoke(main, ["simulate", "--help"])
+    assert done.exit_code == 0
+    for name in ("street", "hdl-32e", "legged", "tilted", "rosbag2", "lidarslam simulate --out"):
+        assert name in done.output
+
+
+def test_every_sensor_has_a_driver_that_can_be_written():
+    from lidarslam.simulation.sensor_table import SENSORS
+    from lidarslam.simulation.writers.driver_clouds import DRIVERS
+
+    assert {find_sensor(name).driver for name in SENSORS} <= set(DRIVERS)

@@ -1,0 +1,201 @@
+"""Scans put back by the true poses lie on the world's surfaces; the same seed gives the same bytes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import inverse, transform_points
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.noise import bloom, measure, range_sigma, reflectivity, return_probability, scan_rng
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensor import RangeModel
+from lidarslam.simulation.sensors import find_sensor
+
+EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
+NOISY = RangeModel(0.3, 100.0, 0.01, 0.0003, 0.003, 0.002)
+
+
+@pytest.fixture(scope="module")
+def simulation(yard):
+    motion = motion_along_route("tracked-harsh", yard, seed=2)
+    return Simulation(yard, find_sensor("vlp-16"), motion, mount_pose("upright", 0.6), 300, seed=5)
+
+
+@pytest.fixture(scope="module")
+def turning(simulation):
+    """The scan of the fastest turn."""
+    yaw = np.unwrap(np.arctan2(*simulation.ground_truth.T_world_lidar[:, [1, 0], 0].T))
+    return int(np.abs(np.diff(yaw)).argmax())
+
+
+def exact(simulation):
+    return replace(simulation, sensor=replace(simulation.sensor, ranging=EXACT))
+
+
+def in_world(simulation, scan):
+    """The points, each by the true pose at its own time."""
+    T = simulation.T_world_lidar_at(scan.stamp + scan.time_offsets)
+    return np.einsum("nij,nj->ni", T[:, :3, :3], scan.points) + T[:, :3, 3]
+
+
+def same_bytes(a, b):
+    return all(
+        x.tobytes() == y.tobytes()
+        for x, y in [
+            (a.scan.points, b.scan.points),
+            (a.scan.time_offsets, b.scan.time_offsets),
+            (a.scan.rings, b.scan.rings),
+            (a.intensities, b.intensities),
+        ]
+    )
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "os1-64", "livox"])
+@pytest.mark.parametrize("mount", ["upright", "tilted"])
+def test_exact_scans_lie_on_the_surfaces(sensor, mount, simulation, distance_to_yard):
+    model = replace(find_sensor(sensor), ranging=EXACT)
+    simulated = exact(replace(simulation, sensor=model, T_body_lidar=mount_pose(mount, 0.6)))
+    for index in (0, 37, 120):
+        sweep = simulated.scan(index)
+        points = in_world(simulated, sweep.scan)[~sweep.moving]
+        assert len(points) > 3000
+        assert distance_to_yard(points).max() < 1e-3
+
+
+def test_the_sweep_rolls(simulation, turning, distance_to_yard):
+    """With one pose for the whole sweep the points are far off when the sensor turns."""
+    simulated = exact(simulation)
+    sweep = simulated.scan(turning)
+    still = transform_points(simulated.ground_truth.T_world_lidar[turning], sweep.scan.points)
+    assert np.quantile(distance_to_yard(still[~sweep.moving]), 0.75) > 0.2
+    assert distance_to_yard(in_world(simulated, sweep.scan)[~sweep.moving]).max() < 1e-3
+
+
+def test_noise_stays_within_five_sigma(simulation):
+    model = replace(NOISY, beam_divergence=0.0)
+    noisy = replace(simulation, sensor=replace(simulation.sensor, ranging=model))
+    sweep = noisy.scan(50)
+    errors = np.linalg.norm(sweep.scan.points, axis=1) - sweep.true_ranges
+    sigma = range_sigma(model, sweep.true_ranges, np.ones(len(errors)))
+    assert np.abs(errors / sigma).max() < 5.0
+    np.testing.assert_allclose(np.std(errors / sigma), 1.0, atol=0.03)
+    assert abs(np.mean(errors / sigma)) < 0.03
+
+
+def test_scan_is_what_a_driver_delivers(simulation):
+    sweep = simulation.scan(7)
+    scan = sweep.scan
+    assert scan.stamp == pytest.approx(0.7)
+    assert scan.time_offsets.min() >= 0.0
+    assert scan.time_offsets.max() < 0.1
+    assert (np.diff(scan.time_offsets) >= 0.0).all()
+    np.testing.assert_array_equal(scan.points, scan.points.astype(np.float32))
+    assert scan.rings.dtype == np.int32
+    assert sweep.intensities.dtype == np.float32
+    assert 0.0 <= sweep.intensities.min() < sweep.intensities.max() <= 255.0
+    assert 0.5 * 28_800 < len(scan) < 28_800
+    assert len(sweep.true_ranges) == len(sweep.moving) == len(scan)
+
+
+def test_same_seed_same_bytes_in_any_order(simulation):
+    again = replace(simulation)
+    later = again.scan(9)
+    for index in (3, 9, 4):
+        assert same_bytes(simulation.scan(index), again.scan(index))
+    assert same_bytes(simulation.scan(9), later)
+    assert not same_bytes(simulation.scan(9), replace(simulation, seed=6).scan(9))
+
+
+def test_is_a_scan_sequence(simulation):
+    assert len(simulation) == 300
+    assert "yard" in simulation.name
+    stamps = [scan.stamp for scan in simulation.scans(10, 20, 4)]
+    np.testing.assert_allclose(stamps, [1.0, 1.4, 1.8])
+    truth = simulation.ground_truth
+    assert len(truth) == 300
+    np.testing.assert_allclose(truth.T_world_lidar[10:20:4], simulation.T_world_lidar_at(np.array(stamps)), atol=1e-12)
+    assert next(simulation.scans(299)).stamp == pytest.approx(29.9)
+
+
+def test_the_mount_is_between_body_and_lidar(simulation):
+    times = np.array([3.0, 8.0])
+    T_body_lidar = inverse(simulation.motion.pose_at(times)) @ simulation.T_world_lidar_at(times)
+    np.testing.assert_allclose(T_body_lidar, np.stack([simulation.T_body_lidar] * 2), atol=1e-12)
+
+
+def test_upside_down_flips_the_scan(simulation):
+    """At rest, the ground is above a sensor that hangs, and what was left is right."""
+    hanging = exact(replace(simulation, T_body_lidar=mount_pose("upside-down", 0.6)))
+    upright = exact(simulation).scan(0)
+    flipped = hanging.scan(0)
+    down, up = (sweep.scan.points[sweep.scan.rings == ring] for sweep, ring in ((upright, 0), (flipped, 15)))
+    assert down[:, 2].max() < 0.0 < up[:, 2].min()
+    np.testing.assert_allclose(np.median(down[:, 2]), -np.median(up[:, 2]), rtol=0.02)
+    left = down[np.abs(np.rad2deg(np.arctan2(down[:, 1], down[:, 0])) - 90.0).argmin()]
+    right = up[np.abs(np.rad2deg(np.arctan2(up[:, 1], up[:, 0])) + 90.0).argmin()]
+    np.testing.assert_allclose(left, right * [1.0, -1.0, -1.0], atol=0.05)
+
+
+def test_movers_are_recorded(simulation):
+    assert any(simulation.scan(index).moving.sum() > 20 for index in range(0, 300, 20))
+
+
+def test_noise_grows_with_range_and_slant():
+    ranges, cosines = np.array([5.0, 50.0, 50.0]), np.array([1.0, 1.0, 0.3])
+    near, far, slanted = range_sigma(NOISY, ranges, cosines)
+    assert near == pytest.approx(0.0115)
+    assert near < far < slanted
+
+
+def test_returns_fade_with_range_and_slant():
+    p = return_probability(NOISY, np.array([5.0, 100.0, 60.0, 60.0]), np.array([1.0, 1.0, 1.0, 0.1]), np.full(4, 0.8))
+    np.testing.assert_allclose(p[:2], [0.995, 0.4975], atol=1e-3)
+    assert p[2] > 0.95
+    assert p[3] < 0.1
+
+
+def test_dropouts_happen_at_their_rate():
+    n = 100_000
+    measured = measure(NOISY, np.full(n, 10.0), np.ones(n), np.full(n, 0.8), scan_rng(1, 2))
+    assert abs(np.isinf(measured).mean() - 0.005) < 0.001
+    inside = measured[np.isfinite(measured)]
+    np.testing.assert_allclose(inside / 0.002, np.round(inside / 0.002), atol=1e-6)
+
+
+def test_limits_of_range_hold():
+    measured = measure(NOISY, np.array([0.1, 10.0, 150.0, np.inf]), np.ones(4), np.full(4, 0.8), scan_rng(0, 4))
+    assert np.isfinite(measured).tolist() == [False, True, False, False]
+
+
+def test_edges_bloom():
+    """A pole 8 columns wide before a wall: only the columns beside it change, at the rate of the beam's width."""
+    columns, lasers = 2000, 16
+    ranges = np.full((columns, lasers), 20.0)
+    ranges[500:508] = 5.0
+    ranges[1000:1500] = np.inf
+    model = replace(NOISY, beam_divergence=0.003)
+    flat = ranges.ravel()
+    trials = [bloom(model, flat, lasers, 2.0 * np.pi / columns, scan_rng(k, 0)) for k in range(200)]
+    changed = np.mean([edge.reshape(columns, lasers) for _, edge in trials], axis=(0, 2))
+    assert set(np.flatnonzero(changed)) == {499, 508, 1000, 1499}
+    np.testing.assert_allclose(changed[[499, 508, 1000]], 0.003 / (4.0 * np.pi / columns), atol=0.03)
+    bloomed, edge = trials[0]
+    assert set(bloomed[edge]) <= {5.0, 20.0}
+    np.testing.assert_array_equal(bloomed[~edge], flat[~edge])
+
+
+def test_small_steps_give_mixed_ranges():
+    ranges = np.array([[5.0], [6.0]] * 5000)
+    bloomed, edge = bloom(NOISY, ranges.ravel(), 1, 0.003, scan_rng(0, 0))
+    mixed = bloomed[edge]
+    assert 5.0 <= mixed.min() < 5.1
+    assert 5.9 < mixed.max() <= 6.0
+
+
+def test_reflectivity_belongs_to_the_surface():
+    shares = reflectivity(np.array([0, 3, 4, 40, 4_000_000, -2]))
+    assert shares[0] == shares[1]
+    assert len(set(shares[1:5])) == 4
+    assert 0.1 <= shares.min() <= shares.max() <= 0.8

@@ -1,0 +1,106 @@
+"""The reference map holds what was seen, evenly, and nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from lidarslam.simulation.caster import Caster
+from lidarslam.simulation.mesh import Mesh, box_mesh
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.reference_map import SeenSurfaces, reference_map, sample_seen
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import Boxes
+
+# A square of 10 m split into two triangles, facing up.
+SQUARE = Mesh(
+    np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+)
+
+
+def grid(x, y, z):
+    return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
+
+
+@pytest.fixture(scope="module")
+def recording(yard):
+    motion = motion_along_route("tracked", yard, seed=2)
+    return Simulation(yard, find_sensor("vlp-16"), motion, mount_pose("upright", 0.6), 400, seed=5)
+
+
+@pytest.fixture(scope="module")
+def yard_map(recording):
+    return reference_map(recording, spacing_m=0.15, step=40)
+
+
+def test_samples_are_even():
+    seen = SeenSurfaces()
+    points = grid(np.arange(0.05, 10.0, 0.1), np.arange(0.05, 10.0, 0.1), [0.0])
+    seen.add(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.zeros(len(points), dtype=bool))
+    sampled = sample_seen(SQUARE, seen, spacing_m=0.1).points
+    assert abs(len(sampled) - 10_000) < 10
+    np.testing.assert_array_equal(sampled[:, 2], 0.0)
+    gaps, _ = KDTree(sampled).query(points)
+    assert gaps.max() < 0.15
+    alone, _ = KDTree(sampled).query(sampled, k=2)
+    assert np.quantile(alone[:, 1], 0.05) > 0.03
+
+
+def test_only_what_was_seen_is_kept():
+    seen = SeenSurfaces(voxel_m=0.2)
+    points = grid(np.arange(0.05, 5.0, 0.1), np.arange(0.05, 10.0, 0.1), [0.0])
+    seen.add(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.zeros(len(points), dtype=bool))
+    sampled = sample_seen(SQUARE, seen, spacing_m=0.1).points
+    assert 5.0 < sampled[:, 0].max() < 5.4
+    assert len(sample_seen(SQUARE, SeenSurfaces(), 0.1).points) == 0
+
+
+def test_the_far_side_of_a_wall_stays_out():
+    wall = box_mesh(Boxes(np.array([[0.0, 0.0, 1.0]]), np.array([[0.05, 4.0, 1.0]]), np.eye(3)[None]))
+    seen = SeenSurfaces(voxel_m=0.2)
+    points = grid([0.05], np.arange(-4.0, 4.0, 0.1), np.arange(0.0, 2.0, 0.1))
+    seen.add(points, np.tile([1.0, 0.0, 0.0], (len(points), 1)), np.zeros(len(points), dtype=bool))
+    sampled, normals = sample_seen(wall, seen, spacing_m=0.05)
+    np.testing.assert_allclose(sampled[:, 0], 0.05, atol=1e-12)
+    np.testing.assert_allclose(normals, np.tile([1.0, 0.0, 0.0], (len(normals), 1)), atol=1e-12)
+
+
+def test_normals_are_of_the_side_that_was_seen():
+    seen = SeenSurfaces()
+    points = grid(np.arange(0.05, 10.0, 0.1), np.arange(0.05, 10.0, 0.1), [0.0])
+    seen.add(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.ones(len(points), dtype=bool))  # a ceiling
+    normals = sample_seen(SQUARE, seen, spacing_m=0.2).normals
+    np.testing.assert_allclose(normals, np.tile([0.0, 0.0, -1.0], (len(normals), 1)), atol=1e-12)
+
+
+def test_the_map_lies_on_the_world(yard_map, distance_to_yard):
+    assert len(yard_map.points) > 20_000
+    assert distance_to_yard(yard_map.points).max() < 1e-3
+    np.testing.assert_allclose(np.linalg.norm(yard_map.normals, axis=1), 1.0, atol=1e-9)
+
+
+def test_the_map_covers_the_scans(recording, yard_map):
+    sweep = recording.scan(80)
+    T = recording.T_world_lidar_at(sweep.scan.stamp + sweep.scan.time_offsets)
+    points = np.einsum("nij,nj->ni", T[:, :3, :3], sweep.scan.points) + T[:, :3, 3]
+    still = ~sweep.moving & np.isfinite(sweep.true_ranges)
+    gaps, _ = KDTree(yard_map.points).query(points[still])
+    assert np.quantile(gaps, 0.98) < 0.25
+    inside = np.linalg.norm(yard_map.points[:, :2], axis=1).min()
+    assert inside > 2.5  # the middle block's inside is not seen
+
+
+def test_movers_are_not_in_the_map(recording, yard_map):
+    still = replace(recording, world=replace(recording.world, movers=()))
+    assert isinstance(still._caster, Caster)
+    without = reference_map(still, spacing_m=0.15, step=40)
+    gaps, _ = KDTree(without.points).query(yard_map.points)
+    assert gaps.max() < 1e-9
+
+
+def test_the_map_is_the_same_every_time(recording, yard_map):
+    again = reference_map(replace(recording), spacing_m=0.15, step=40)
+    assert again.points.tobytes() == yard_map.points.tobytes()

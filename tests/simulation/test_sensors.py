@@ -1,0 +1,101 @@
+"""Sensors look where their manuals say, in the order of time."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.simulation.mounts import MOUNTS, mount_pose
+from lidarslam.simulation.sensor_table import SENSORS
+from lidarslam.simulation.sensors import find_sensor
+
+# name: rays a sweep, lasers, lowest and highest elevation in degrees
+FACTS = {
+    "vlp-16": (28_800, 16, -15.0, 15.0),
+    "hdl-32e": (69_440, 32, -30.67, 10.67),
+    "hdl-64e": (133_312, 64, -24.33, 2.0),
+    "os0-64": (65_536, 64, -45.46, 45.85),
+    "os1-64": (65_536, 64, -16.611, 16.611),
+    "os1-128": (131_072, 128, -21.82, 20.95),
+    "xt32": (64_000, 32, -16.0, 15.0),
+    "livox": (20_000, 4, -7.0, 52.0),
+}
+
+
+def elevations_deg(directions):
+    return np.rad2deg(np.arcsin(directions[:, 2]))
+
+
+def test_every_sensor_has_its_facts():
+    assert list(SENSORS) == list(FACTS)
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_rays_are_as_published(name):
+    sensor = find_sensor(name)
+    rays_per_scan, lasers, lowest, highest = FACTS[name]
+    directions, fractions, rings = sensor.rays(3)
+    assert directions.shape == (rays_per_scan, 3) == (sensor.rays_per_scan, 3)
+    assert sensor.pattern.lasers == lasers
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
+    assert (np.diff(fractions) >= 0.0).all()
+    assert fractions[0] == 0.0
+    assert fractions[-1] < 1.0
+    assert rings.dtype == np.int32
+    np.testing.assert_array_equal(np.bincount(rings), np.full(lasers, sensor.pattern.columns))
+    angles = elevations_deg(directions)
+    np.testing.assert_allclose([angles.min(), angles.max()], [lowest, highest], atol=0.03)
+
+
+@pytest.mark.parametrize("name", [name for name in FACTS if name != "livox"])
+def test_a_ring_keeps_its_elevation_and_turns_clockwise(name):
+    directions, _, rings = find_sensor(name).rays(0)
+    for ring in (0, rings.max()):
+        own = directions[rings == ring]
+        assert np.ptp(elevations_deg(own)) < 1e-9
+        azimuth = np.unwrap(np.arctan2(own[:, 1], own[:, 0]))
+        assert (np.diff(azimuth) < 0.0).all()
+        np.testing.assert_allclose(np.ptp(azimuth), 2.0 * np.pi, rtol=2e-3)
+
+
+def test_vlp_16_fires_by_its_manual():
+    """Lasers 0, 1, 2 look at -15, 1 and -13 degrees, 2.304 us apart, and the head turns on between them."""
+    directions, fractions, rings = find_sensor("vlp-16").rays(0)
+    np.testing.assert_allclose(elevations_deg(directions[:4]), [-15.0, 1.0, -13.0, 3.0], atol=1e-9)
+    np.testing.assert_array_equal(rings[:4], [0, 8, 1, 9])
+    np.testing.assert_allclose(np.diff(fractions[:16]) * 1800 * 55.296, 2.304, atol=1e-9)
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    np.testing.assert_allclose(azimuth[1] - azimuth[0], -2.0 * np.pi * fractions[1], atol=1e-12)
+
+
+def test_ouster_fires_whole_columns():
+    _, fractions, rings = find_sensor("os1-128").rays(0)
+    assert len(np.unique(fractions)) == 1024
+    np.testing.assert_array_equal(rings[:128], np.arange(128))
+
+
+def test_livox_goes_on_and_does_not_repeat():
+    sensor = find_sensor("livox")
+    sweeps = [sensor.rays(index).directions for index in range(60)]
+    # From the last shot of a sweep to the first of the next it is one step of the pattern.
+    step = np.linalg.norm(sweeps[0][4] - sweeps[0][0])
+    assert np.linalg.norm(sweeps[1][0] - sweeps[0][-4]) < 1.5 * step
+    for later in sweeps[1:]:
+        assert np.median(np.linalg.norm(later - sweeps[0], axis=1)) > 0.05
+
+
+def test_unknown_names_are_answered_with_the_choices():
+    with pytest.raises(InputError, match=r"'vlp16'.*vlp-16, hdl-32e.*livox"):
+        find_sensor("vlp16")
+    with pytest.raises(InputError, match=r"'sideways'.*upright, upside-down, tilted"):
+        mount_pose("sideways", 1.0)
+
+
+def test_mounts_turn_the_sensor():
+    up = {name: mount_pose(name, 1.5)[:3, 2] for name in MOUNTS}
+    np.testing.assert_allclose(up["upright"], [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(up["upside-down"], [0.0, 0.0, -1.0], atol=1e-12)
+    assert 0.8 < up["tilted"][2] < 0.95
+    assert mount_pose("tilted", 1.5)[0, 0] > 0.0
+    assert mount_pose("tilted", 1.5)[2, 0] < 0.0  # looks down to the front
+    for name in MOUNTS:
+        np.testing.assert_array_equal(mount_pose(name, 1.5)[:3, 3], [0.0, 0.0, 1.5])

@@ -1,0 +1,289 @@
+"""Every format, read back with the program's own readers."""
+
+import weakref
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import inverse, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.kitti_calibration import read_calibration, read_tr
+from lidarslam.datasets.registry import open_recording
+from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.writers.bag_messages import MessageSerializer
+from lidarslam.simulation.writers.clock import CLOCK_START_NS, clock_ns
+from lidarslam.simulation.writers.driver_clouds import DRIVERS, find_driver
+from lidarslam.simulation.writers.interface import Rig
+from lidarslam.simulation.writers.kitti import T_CAM_LIDAR, compensate
+from lidarslam.simulation.writers.registry import FORMATS, find_format, load_writer
+
+BAGS = ("rosbag1", "rosbag2", "mcap")
+SWEEP_S = 0.1
+STAMPS = (0.0, 0.1, 0.2, 0.30000000000000004)
+
+
+@pytest.fixture(scope="module")
+def sweeps(room, drive):
+    """Rolling sweeps through the room, stamped at their start, in the float32 that all formats hold."""
+    made = []
+    for stamp in STAMPS:
+        rng = np.random.default_rng(round(10 * stamp))
+        swept = room.sweep(drive, stamp, stamp_at=0.0)
+        points = swept.points.astype(np.float32).astype(np.float64)
+        rings = rng.integers(0, 16, len(points)).astype(np.int32)
+        scan = Scan(points, stamp, swept.time_offsets, rings)
+        made.append(SimulatedScan(scan, rng.integers(0, 256, len(points)).astype(np.float32)))
+    return made
+
+
+@pytest.fixture
+def rig(drive):
+    return make_rig(drive)
+
+
+def make_rig(drive, driver="velodyne"):
+    return Rig(driver, SWEEP_S, drive)
+
+
+def write(name, folder, sweeps, rig):
+    """The recording that the program's reader finds in a folder with the scans."""
+    load_writer(name)(folder, iter(sweeps), rig)
+    return open_recording(find_format(name).source_in(folder))
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("name", BAGS)
+def test_every_driver_in_every_kind_of_bag(name, driver, tmp_path, sweeps, drive):
+    recording = write(name, tmp_path / "room", sweeps, make_rig(drive, driver))
+    assert recording.name == "room"
+    assert len(recording) == len(sweeps)
+    for scan, simulated in zip(recording.scans(), sweeps, strict=True):
+        assert_same(scan, simulated.scan)
+    info = recording.describe()
+    assert info.topic == DRIVERS[driver].topic
+    assert info.point_time.reference == ("absolute" if driver in ("hesai", "livox") else "relative")
+    assert not info.dropped_points
+    assert not info.notes
+
+
+def assert_same(scan, expected):
+    assert scan.stamp == clock_ns(expected.stamp) / 10**9
+    np.testing.assert_array_equal(scan.points, expected.points)
+    np.testing.assert_array_equal(scan.rings, expected.rings)
+    np.testing.assert_allclose(scan.time_offsets, expected.time_offsets, rtol=0.0, atol=5e-7)
+
+
+# What the drivers publish, written down from their sources: name, offset and datatype of each field, then the step.
+_F4, _F8, _U2, _U4 = 7, 8, 4, 6
+_XYZ = [("x", 0, _F4), ("y", 4, _F4), ("z", 8, _F4)]
+PUBLISHED = {
+    "velodyne": ([*_XYZ, ("intensity", 12, _F4), ("ring", 16, _U2), ("time", 18, _F4)], 22),
+    "ouster": (
+        [
+            *_XYZ,
+            ("intensity", 16, _F4),
+            ("t", 20, _U4),
+            ("reflectivity", 24, _U2),
+            ("ring", 26, _U2),
+            ("ambient", 28, _U2),
+            ("range", 32, _U4),
+        ],
+        48,
+    ),
+    "hesai": ([*_XYZ, ("intensity", 12, _F4), ("ring", 16, _U2), ("timestamp", 18, _F8)], 26),
+}
+
+
+@pytest.mark.parametrize("name", BAGS)
+@pytest.mark.parametrize("driver", PUBLISHED)
+def test_messages_are_laid_out_as_the_driver_lays_them_out(name, driver, tmp_path, sweeps, drive):
+    for record_ns, message, simulated in messages(name, driver, tmp_path / "room", sweeps, drive):
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert stamp_ns == clock_ns(simulated.scan.stamp) > CLOCK_START_NS - 1
+        assert record_ns == stamp_ns + round(SWEEP_S * 1e9)
+        fields, step = PUBLISHED[driver]
+        assert [(field.name, field.offset, field.datatype) for field in message.fields] == fields
+        assert {field.count for field in message.fields} == {1}
+        assert (message.point_step, message.row_step) == (step, step * len(simulated.scan))
+        assert (message.height, message.width) == (1, len(simulated.scan))
+        assert message.data.shape == (message.row_step,)
+        assert message.is_dense
+        assert not message.is_bigendian
+
+
+def messages(name, driver, folder, sweeps, drive):
+    """Record stamp and message, decoded by rosbags with the definitions in the bag, with the sweep it was made of."""
+    load_writer(name)(folder, iter(sweeps), make_rig(drive, driver))
+    source = find_format(name).source_in(folder)
+    store = MessageSerializer(ros2=name != "rosbag1").store
+    with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(source) as reader:
+        deserialize = store.deserialize_ros1 if name == "rosbag1" else store.deserialize_cdr
+        found = [(record_ns, deserialize(raw, c.msgtype)) for c, record_ns, raw in reader.messages()]
+        assert [connection.topic for connection in reader.connections] == [DRIVERS[driver].topic]
+    assert len(found) == len(sweeps)
+    return [(*row, simulated) for row, simulated in zip(found, sweeps, strict=True)]
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_livox_messages_are_whole_to_another_decoder(name, tmp_path, sweeps, drive):
+    few = [SimulatedScan(s.scan.select(np.arange(40)), s.intensities[:40]) for s in sweeps]
+    for number, (record_ns, message, simulated) in enumerate(messages(name, "livox", tmp_path / "x", few, drive)):
+        stamp_ns = clock_ns(simulated.scan.stamp)
+        assert (message.timebase, message.point_num, record_ns) == (stamp_ns, 40, stamp_ns + round(SWEEP_S * 1e9))
+        assert message.header.frame_id == "livox_frame"
+        assert getattr(message.header, "seq", number) == number
+        decoded = [[p.x, p.y, p.z] for p in message.points]
+        np.testing.assert_array_equal(decoded, simulated.scan.points)
+        offset_ns = [p.offset_time for p in message.points]
+        np.testing.assert_allclose(offset_ns, 1e9 * simulated.scan.time_offsets, rtol=0.0, atol=0.51)
+        assert [p.line for p in message.points] == simulated.scan.rings.tolist()
+        assert [p.reflectivity for p in message.points] == simulated.intensities.astype(int).tolist()
+
+
+@pytest.mark.parametrize("driver", ["livox", "ouster"])
+@pytest.mark.parametrize("name", BAGS)
+def test_a_scan_without_points(name, driver, tmp_path, sweeps, drive):
+    nothing = SimulatedScan(sweeps[1].scan.select(np.arange(0)), sweeps[1].intensities[:0])
+    recording = write(name, tmp_path / "x", [sweeps[0], nothing, sweeps[2]], make_rig(drive, driver))
+    assert [len(scan) for scan in recording.scans()] == [len(sweeps[0].scan), 0, len(sweeps[2].scan)]
+
+
+def test_driver_values(sweeps):
+    simulated = sweeps[2]
+    ouster = find_driver("ouster").records(simulated, CLOCK_START_NS)
+    np.testing.assert_allclose(ouster["range"], 1e3 * np.linalg.norm(simulated.scan.points, axis=1), atol=0.51)
+    np.testing.assert_array_equal(ouster["reflectivity"], simulated.intensities)
+    velodyne = find_driver("velodyne").records(simulated, CLOCK_START_NS)
+    np.testing.assert_array_equal(velodyne["intensity"], simulated.intensities)
+    np.testing.assert_allclose(velodyne["time"], simulated.scan.time_offsets, rtol=1e-7, atol=1e-12)
+
+
+def test_ply(tmp_path, sweeps, rig):
+    recording = write("ply", tmp_path / "room", sweeps, rig)
+    for scan, simulated in zip(recording.scans(), sweeps, strict=True):
+        assert_same(scan, simulated.scan)
+        np.testing.assert_allclose(scan.time_offsets, simulated.scan.time_offsets, rtol=0.0, atol=0.51e-9)
+    info = recording.describe()
+    assert [f"{field.name} {field.type_name}" for field in info.fields] == [
+        "x float32", "y float32", "z float32", "intensity float32", "t uint32", "ring uint16",
+    ]  # fmt: skip
+    assert (info.point_time.unit, info.point_time.reference) == ("ns", "relative")
+
+
+def test_ply_without_times_and_rings(tmp_path, sweeps, rig):
+    bare = [SimulatedScan(Scan(s.scan.points, s.scan.stamp), s.intensities) for s in sweeps]
+    scan = next(write("ply", tmp_path / "room", bare, rig).scans())
+    assert scan.time_offsets is None
+    assert scan.rings is None
+    assert len(scan) == len(bare[0].scan)
+
+
+def test_kitti_scans_are_compensated_exactly(tmp_path, sweeps, rig, room):
+    recording = write("kitti", tmp_path / "drive", sweeps, rig)
+    assert len(recording) == len(sweeps)
+    for scan, simulated in zip(recording.scans(), sweeps, strict=True):
+        assert scan.stamp == pytest.approx(simulated.scan.stamp, abs=1e-9)
+        assert scan.time_offsets is None
+        T_room_lidar = rig.T_world_lidar_at(np.array([scan.stamp]))[0]
+        # The reader raises the points by KITTI's angle, so what comes out is where the surfaces are.
+        assert room.distance_to_surface(transform_points(T_room_lidar, scan.points)).max() < 2e-5
+        skewed = room.distance_to_surface(transform_points(T_room_lidar, simulated.scan.points))
+        assert skewed.max() > 0.05
+
+
+def test_compensation_moves_each_point_by_the_motion_since_the_stamp(sweeps, rig):
+    scan = sweeps[1].scan
+    moved = compensate(scan, rig)
+    for index in (0, 17, 4000, len(scan) - 1):
+        T_stamp_point = inverse(rig.T_world_lidar_at(np.array(scan.stamp))) @ rig.T_world_lidar_at(
+            np.array(scan.stamp + scan.time_offsets[index])
+        )
+        expected = T_stamp_point @ np.append(scan.points[index], 1.0)
+        np.testing.assert_allclose(moved[index], expected[:3], atol=1e-9)
+    still = Scan(scan.points, scan.stamp)
+    assert compensate(still, rig) is still.points
+
+
+def test_kitti_scans_lie_too_low_like_kittis_own(tmp_path, sweeps, rig):
+    write("kitti", tmp_path / "drive", sweeps, rig)
+    config = ReaderConfig(kitti_elevation_correction_deg=0.0)
+    points = next(open_recording(tmp_path / "drive", config).scans()).points
+    true_points = compensate(sweeps[0].scan, rig)
+    raised_deg = np.rad2deg(elevation(true_points) - elevation(points))
+    np.testing.assert_allclose(raised_deg, 0.205, atol=1e-3)
+
+
+def elevation(points):
+    return np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+
+
+def test_kitti_truth_comes_back_through_the_calibration(tmp_path, sweeps, rig):
+    recording = write("kitti", tmp_path / "drive", sweeps, rig)
+    truth = recording.ground_truth
+    np.testing.assert_allclose(truth.stamps, STAMPS, atol=1e-9)
+    np.testing.assert_allclose(truth.T_world_lidar, rig.T_world_lidar_at(np.array(STAMPS)), atol=1e-8)
+    assert recording.describe().ground_truth == tmp_path / "drive" / "poses" / "00.txt"
+
+
+def test_kitti_calibration(tmp_path, sweeps, rig):
+    write("kitti", tmp_path / "drive", sweeps, rig)
+    path = tmp_path / "drive" / "sequences" / "00" / "calib.txt"
+    np.testing.assert_allclose(read_tr(path), T_CAM_LIDAR, atol=1e-12)
+    # The camera's z is the LiDAR's x, within a degree or so, and the cameras stand on one line across the car.
+    assert np.rad2deg(np.arccos(T_CAM_LIDAR[2, 0])) < 1.5
+    P = [read_calibration(path)[f"P{camera}"].reshape(3, 4) for camera in range(4)]
+    for projection in P:
+        np.testing.assert_array_equal(projection[:, :3], P[0][:, :3])
+    assert [round(-p[0, 3] / p[0, 0], 3) for p in P] == [0.0, 0.537, -0.063, 0.469]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_same_scans_same_bytes(name, tmp_path, sweeps, rig):
+    contents = []
+    for folder in (tmp_path / "a" / "room", tmp_path / "b" / "room"):
+        folder.parent.mkdir()
+        load_writer(name)(folder, iter(sweeps[:2]), rig)
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        contents.append({path.relative_to(folder): path.read_bytes() for path in files})
+    assert contents[0].keys() == contents[1].keys()
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_one_scan_is_held_at_a_time(name, tmp_path, sweeps, rig):
+    alive = weakref.WeakSet()
+    most = 0
+
+    def stream():
+        nonlocal most
+        for number in range(12):
+            source = sweeps[number % len(sweeps)]
+            scan = Scan(source.scan.points, 0.1 * number, source.scan.time_offsets, source.scan.rings)
+            made = SimulatedScan(scan, source.intensities)
+            alive.add(made)
+            yield made
+            del made, scan
+            most = max(most, len(alive))
+
+    load_writer(name)(tmp_path / "room", stream(), rig)
+    assert most == 1  # the writer's own, when the next one is asked for
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
+    load_writer(name)(tmp_path / "room", iter(sweeps[:2]), rig)
+    patterns = find_format(name).files
+    for entry in (tmp_path / "room").iterdir():
+        assert any(entry.match(pattern) for pattern in patterns)
+    assert all(any((tmp_path / "room").glob(pattern)) for pattern in patterns)
+
+
+def test_unknown_names_are_told_the_choice():
+    with pytest.raises(InputError, match=r"'pcap'.*kitti, ply, rosbag1, rosbag2, mcap"):
+        load_writer("pcap")
+    with pytest.raises(InputError, match=r"'sick'.*velodyne, ouster, hesai, livox"):
+        find_driver("sick")
