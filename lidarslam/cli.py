@@ -108,6 +108,16 @@ def _quoted(value: str) -> str:
     return "'" + value.replace("'", "''") + "'"
 
 
+@main.command(epilog="lidarslam demo --out demo")
+@click.option("--out", type=_PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Where it all goes.")
+@click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
+def demo(out: Path, scans: int) -> None:
+    """Record an indoor run in a simulated office, run on it, and say how it went."""
+    from lidarslam.demo import format_demo, run_demo
+
+    click.echo(format_demo(out, run_demo(out, scans)))
+
+
 @main.command(epilog="lidarslam info recordings/2011_09_26_drive_0005_sync")
 @_SOURCE
 @_reader_options
@@ -306,10 +316,10 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
 
     if len(runs) != 1:
         raise click.UsageError("--picture draws one map; name one run")
-    points = load_map(runs[0])
-    if not len(points):
+    cloud = load_map(runs[0])
+    if not len(cloud):
         raise InputError(f"{runs[0]}: holds no map to draw")
-    save_picture(picture, draw(points, height_colours(points)))
+    save_picture(picture, draw(cloud.points, height_colours(cloud.points), cloud.normals))
     click.echo(f"written to {picture}")
 
 

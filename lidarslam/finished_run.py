@@ -13,6 +13,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
+from mapping.global_map import PointCloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +24,7 @@ class FinishedRun:
         name: of its directory.
         trajectory: the final poses.
         lost: (N,) which of them were lost.
-        map_points: (M, 3), none when the map is missing.
+        map_points: (M, 3) in the world, none when the map is missing.
     """
 
     name: str
@@ -41,18 +42,24 @@ def load_run(path: Path) -> FinishedRun:
     if not (path / files.TRAJECTORY_TUM).is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
     trajectory = read_tum(path / files.TRAJECTORY_TUM)
-    return FinishedRun(path.resolve().name, trajectory, _lost(path / files.SCANS_CSV, trajectory), load_map(path))
+    return FinishedRun(
+        path.resolve().name, trajectory, _lost(path / files.SCANS_CSV, trajectory), load_map(path).points
+    )
 
 
-def load_map(path: Path) -> FloatArray:
-    """The points (M, 3) of a run directory's map, or of a .ply or .pcd file; none when there is no such file."""
+def load_map(path: Path) -> PointCloud:
+    """The map of a run directory, or a .ply or .pcd file, with normals; empty when there is no such file."""
     import open3d as o3d
 
     file = path / files.MAP_PLY if path.is_dir() else path
     if not file.is_file():
-        return np.empty((0, 3))
+        return PointCloud(np.empty((0, 3)), np.empty((0, 3)))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        return np.array(o3d.io.read_point_cloud(file).points, dtype=np.float64).reshape(-1, 3)
+        cloud = o3d.io.read_point_cloud(file)
+    points = np.array(cloud.points, dtype=np.float64).reshape(-1, 3)
+    if not cloud.has_normals():
+        return PointCloud(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    return PointCloud(points, np.array(cloud.normals, dtype=np.float64))
 
 
 def _lost(scans_csv: Path, trajectory: Trajectory) -> NDArray[np.bool_]:

@@ -32,6 +32,13 @@ class Camera:
     width: int = 1600
     height: int = 900
 
+    @property
+    def towards(self) -> FloatArray:
+        """Unit vector (3,) from the cloud towards the camera."""
+        azimuth, elevation = np.deg2rad([self.azimuth_deg, self.elevation_deg])
+        horizontal = np.cos(elevation)
+        return np.array([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
+
 
 def height_colours(points: FloatArray) -> NDArray[np.uint8]:
     """Colours (N, 3) by the height of points (N, 3), the lowest and highest 2 % clipped."""
@@ -43,12 +50,21 @@ def height_colours(points: FloatArray) -> NDArray[np.uint8]:
     return np.stack([np.interp(level, stops, _PALETTE[:, c]) for c in range(3)], axis=1).astype(np.uint8)
 
 
-def draw(points: FloatArray, colours: NDArray[np.uint8], camera: Camera | None = None) -> NDArray[np.uint8]:
+def draw(
+    points: FloatArray,
+    colours: NDArray[np.uint8],
+    normals: FloatArray | None = None,
+    camera: Camera | None = None,
+) -> NDArray[np.uint8]:
     """The picture (height, width, 3) of points (N, 3) with colours (N, 3), in perspective, shaded by depth.
 
+    Surfaces whose normals (N, 3) face away are left out, so that one looks through ceilings and near walls into rooms.
     The camera is as far away as it takes to see nearly all of the points.
     """
     camera = camera or Camera()
+    if normals is not None and len(points):
+        facing = normals @ camera.towards > -0.1
+        points, colours = points[facing], colours[facing]
     seen = _to_camera(points, camera)
     depth, index = _rasterise(seen, camera)
     picture = np.full((camera.height, camera.width, 3), _BACKGROUND, dtype=np.uint8)
@@ -75,16 +91,15 @@ def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
 
 def _to_camera(points: FloatArray, camera: Camera) -> FloatArray:
     """Points (N, 3) as pixel column, pixel row and depth."""
-    azimuth, elevation = np.deg2rad([camera.azimuth_deg, camera.elevation_deg])
-    towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    towards, azimuth = camera.towards, np.deg2rad(camera.azimuth_deg)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(towards, right)
-    low, high = np.percentile(points, [1.0, 99.0], axis=0) if len(points) else np.zeros((2, 3))
+    low, high = np.percentile(points, [0.5, 99.5], axis=0) if len(points) else np.zeros((2, 3))
     view = (points - 0.5 * (low + high)) @ np.stack([right, up, towards], axis=1)
     focal = 0.5 * camera.height / np.tan(0.5 * np.deg2rad(_FIELD_OF_VIEW_DEG))
     half = 0.47 * np.array([camera.width, camera.height])
     needed = focal * np.abs(view[:, :2]) / half + view[:, 2:3]
-    distance = max(float(np.percentile(needed.max(axis=1), 99.0)), 1e-3) if len(points) else 1.0
+    distance = max(float(np.percentile(needed.max(axis=1), 99.7)), 1e-3) if len(points) else 1.0
     depth = distance - view[:, 2]
     scale = focal / np.where(depth > 0.0, depth, np.nan)
     column, row = 0.5 * camera.width + scale * view[:, 0], 0.5 * camera.height - scale * view[:, 1]

@@ -4,7 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.run import RunOutcome
-from lidarslam.run_directory import SCANS_CSV
+from lidarslam.run_directory import SCANS_CSV, SUMMARY
+from lidarslam.summary import RunSummary
+
+# Stretches of lost scans that are spelt out; summary.json has them all.
+_STRETCHES = 3
 
 
 def format_outcome(out: Path, outcome: RunOutcome) -> str:
@@ -23,12 +27,18 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield from _accuracy(outcome)
     for warning in summary.warnings:
         yield f"warning: {warning}"
-    for stretch in summary.lost:
+    yield from _lost(summary)
+    yield f"written to {out}"
+
+
+def _lost(summary: RunSummary) -> Iterator[str]:
+    for stretch in summary.lost[:_STRETCHES]:
         scans = f"scan {stretch.first}" if stretch.first == stretch.last else f"scans {stretch.first} to {stretch.last}"
         yield f"LOST on {scans}: {stretch.reason}"
+    if len(summary.lost) > _STRETCHES:
+        yield f"LOST on {len(summary.lost) - _STRETCHES} more stretches"
     if summary.lost_scans:
-        yield f"tracking was lost on {summary.lost_scans} of {summary.scans} scans; {SCANS_CSV} has every scan's status"
-    yield f"written to {out}"
+        yield f"tracking was lost on {summary.lost_scans} of {summary.scans} scans; {SUMMARY} and {SCANS_CSV} say where"
 
 
 def _accuracy(outcome: RunOutcome) -> Iterator[str]:

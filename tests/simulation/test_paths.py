@@ -69,6 +69,7 @@ def test_pruning_cuts_what_hangs_into_the_way_and_nothing_else():
     kept = paths.prune(part, route)
     np.testing.assert_allclose(kept.boxes.centres[:, 1:], [[0.5, 4.0], [3.0, 1.0]])
     np.testing.assert_allclose(kept.cylinders.starts[:, 2], [3.0])
+    assert len(paths.prune(Builder(), route).boxes) == 0
 
 
 def test_kerbs_run_where_the_road_ends():

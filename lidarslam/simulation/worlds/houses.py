@@ -62,15 +62,13 @@ def house(rng: np.random.Generator, width: float, depth: float, open_sides: tupl
     door = int(rng.integers(len(openings)))
     passage = bool(width > 9.0 and rng.random() < 0.2)
     if passage:  # a way through to the yard in place of the door
-        x0, x1 = openings[door].mean() + np.array([-1.4, 1.4]).clip(-openings[door].mean() + 0.4, None)
-        x1 = min(x1, width - 0.4)
+        middle = float(openings[door].mean())
+        x0, x1 = max(middle - 1.4, 0.4), min(middle + 1.4, width - 0.4)
         part.block((low[0], low[1], low[2]), (x0, high[1], 3.0))
         part.block((x1, low[1], low[2]), (high[0], high[1], 3.0))
         part.block((low[0], low[1], 3.0), (high[0], high[1], high[2]))
-        openings = openings[(openings[:, 1] < x0 - 0.1) | (openings[:, 0] > x1 + 0.1)]
-        openings = np.concatenate([openings, [[x0, x1]]])
-        openings = openings[np.argsort(openings[:, 0])]
-        door = int(np.flatnonzero(openings[:, 0] == x0)[0])
+        before, after = openings[openings[:, 1] < x0 - 0.1], openings[openings[:, 0] > x1 + 0.1]
+        openings, door = np.concatenate([before, [[x0, x1]], after]), len(before)
     else:
         part.block((low[0], low[1], low[2]), (high[0], high[1], high[2]))
     _facade(part, style, width, openings, door, passage)

@@ -117,7 +117,7 @@ def prune(part: Builder, route: Route, margin_m: float = 0.1) -> Builder:
     # Between two samples of its axis a cylinder comes a little nearer than at them.
     floor = _highest_within(axis[:, :2], radii + 2.0 * margin_m, route)
     above = axis[:, 2] - radii > floor + route.free_height_m + 2.0 * margin_m
-    return part.selected(keep_boxes, above.reshape(len(cylinders), -1).all(axis=1))
+    return part.selected(keep_boxes, np.asarray(above.reshape(-1, len(fraction)).all(axis=1)))
 
 
 def _highest_within(xy: FloatArray, margins_m: FloatArray, route: Route) -> FloatArray:

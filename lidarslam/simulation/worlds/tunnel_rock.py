@@ -12,7 +12,7 @@ from lidarslam.simulation.worlds.building import smooth_noise
 from lidarslam.simulation.worlds.tunnel_plan import MinePlan
 
 CELL_M = 0.2
-BORDER_M = 5.0
+BORDER_M = 8.0
 # Walls lean: steeper than this and the grid would show as teeth.
 WALL_SLOPE = 3.2
 # Half the width that is left open along the loop whatever the roughness, and the headroom over half of it.
