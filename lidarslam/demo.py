@@ -88,7 +88,8 @@ def _run(name: str, request: RunRequest) -> DemoRow:
 
 def _lines(out: Path, rows: list[DemoRow]) -> Iterator[str]:
     summary = rows[0].outcome.summary
-    yield f"a tracked robot turns on the spot in an office: {summary.scans} scans of a VLP-16, {summary.duration_s:.0f} s"
+    scans = f"{summary.scans} scans of a VLP-16, {summary.duration_s:.0f} s"
+    yield f"a tracked robot turns on the spot in an office: {scans}"
     yield ""
     yield f"{'odometry':<16}{'ATE':>9}{'rotation':>11}{'lost scans':>12}{'ms a scan':>11}"
     for row in rows:
