@@ -1,14 +1,14 @@
 """One scan after another through odometry and into the map: no files, no printing, no window.
 
 Odometry is where the time goes, and one scan's motion must be known before the next can be estimated. What follows
-from a motion (checking it, compensating the sweep, adding it to the map) happens on a second thread meanwhile.
+from a motion (compensating the sweep, checking the motion, adding to the map) happens on a second thread meanwhile,
+one scan later, when the motion after the scan is known as well.
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from mapping.config import GlobalMapConfig
-from mapping.deskew import deskew
+from mapping.deskew import body_velocity, deskew
 from mapping.global_map import GlobalMap, voxel_size_for
 from odometry.consistency import Consistency, ConsistencyCheck
 from odometry.interface import Motion, Odometry
@@ -55,6 +55,24 @@ class ScanResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class _Estimated:
+    """A scan whose motion is known, and what else is needed to go on with it."""
+
+    scan: Scan
+    motion: Motion
+    T_odom_lidar: FloatArray
+    interval_s: float  # since the scan before; 0 for the first
+    stage_ms: dict[str, float]
+
+    @property
+    def velocity(self) -> FloatArray | None:
+        """(6,) between the previous stamp and this one; None when it was not measured."""
+        if self.interval_s <= 0.0 or self.motion.failure is not None:
+            return None
+        return body_velocity(self.motion.T_prev_curr, self.interval_s)
+
+
 class Pipeline:
     """Turns a stream of scans into a stream of results and a global map."""
 
@@ -62,62 +80,53 @@ class Pipeline:
         self._odometry = odometry
         self._check = check
         self._config = config
-        self._T_odom_lidar = np.eye(4)
-        self._previous_stamp: float | None = None
         self._voxel_size_m = config.voxel_size_m
-        self._waiting: Scan | None = None  # the first scan, until a motion says how to compensate it
         self.global_map: GlobalMap | None = None
 
     def run(self, scans: Iterable[Scan]) -> Iterator[ScanResult]:
-        """Process the scans in order; each result comes while the next scan's odometry is at work."""
+        """Process the scans in order; each result comes while a later scan's odometry is at work."""
         job: Future[ScanResult] | None = None
         with ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
-            for follow in self._lead(scans):
+            for estimated, following in _with_next(self._estimate(scans)):
                 if job is not None:
                     yield job.result()
-                job = pool.submit(follow)
+                job = pool.submit(self._follow, estimated, following)
             if job is not None:
                 yield job.result()
-        if self._waiting is not None:  # there never was a second scan
-            self._add(self._waiting.points, np.eye(4))
 
-    def _lead(self, scans: Iterable[Scan]) -> Iterator[Callable[[], ScanResult]]:
-        """Read and estimate scan after scan; what is left to do for each is handed out as a function."""
+    def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Estimated]:
+        """Read and estimate scan after scan."""
+        T_odom_lidar, previous_stamp = np.eye(4), None
         started = time.perf_counter()
         for scan in scans:
             read = time.perf_counter()
             motion = self._odometry.estimate(scan)
             stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
-            interval_s = 0.0 if self._previous_stamp is None else scan.stamp - self._previous_stamp
-            self._previous_stamp = scan.stamp
-            self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
-            yield partial(self._follow, scan, motion, self._T_odom_lidar, interval_s, stage_ms)
+            interval_s = 0.0 if previous_stamp is None else scan.stamp - previous_stamp
+            T_odom_lidar, previous_stamp = T_odom_lidar @ motion.T_prev_curr, scan.stamp
+            yield _Estimated(scan, motion, T_odom_lidar, interval_s, stage_ms)
             started = time.perf_counter()
 
-    def _follow(
-        self, scan: Scan, motion: Motion, T_odom_lidar: FloatArray, interval_s: float, stage_ms: dict[str, float]
-    ) -> ScanResult:
+    def _follow(self, estimated: _Estimated, following: _Estimated | None) -> ScanResult:
         """Everything that follows from a motion: compensate the sweep, check the motion, add to the map."""
+        scan, motion = estimated.scan, estimated.motion
         started = time.perf_counter()
-        thinned = self._thin(scan)
-        points = _compensate(thinned, motion.T_prev_curr, interval_s)
+        points = _compensate(self._thin(scan), estimated.velocity, following.velocity if following else None)
         compensated = time.perf_counter()
         fit = self._check.check(points, motion.T_prev_curr)
         checked = time.perf_counter()
         status, message = _judge(motion, fit)
-        if interval_s == 0.0:
-            self._waiting = thinned
-        else:
-            self._add_waiting(motion.T_prev_curr, interval_s)
-            if status is not Status.LOST:  # a pose that is not believed must not draw walls
-                self._add(points, T_odom_lidar)
-        stage_ms["deskew"] = _ms(started, compensated)
-        stage_ms["check"] = _ms(compensated, checked)
-        stage_ms["map"] = _ms(checked, time.perf_counter())
+        if status is not Status.LOST:  # a pose that is not believed must not draw walls
+            self._add(points, estimated.T_odom_lidar)
+        followed_ms = {
+            "deskew": _ms(started, compensated),
+            "check": _ms(compensated, checked),
+            "map": _ms(checked, time.perf_counter()),
+        }
         return ScanResult(
             stamp=scan.stamp,
-            T_world_lidar=T_odom_lidar,
-            T_odom_lidar=T_odom_lidar,
+            T_world_lidar=estimated.T_odom_lidar,
+            T_odom_lidar=estimated.T_odom_lidar,
             status=status,
             message=message,
             points=points,
@@ -126,7 +135,7 @@ class Pipeline:
             points_used=motion.points_used,
             residual_m=fit.residual_m,
             inlier_ratio=fit.inlier_ratio,
-            stage_ms=stage_ms,
+            stage_ms=estimated.stage_ms | followed_ms,
         )
 
     def _thin(self, scan: Scan) -> Scan:
@@ -139,12 +148,6 @@ class Pipeline:
         squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
         return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
 
-    def _add_waiting(self, T_prev_curr: FloatArray, interval_s: float) -> None:
-        """Add the first scan, which waited for the second's motion to be compensated with."""
-        first, self._waiting = self._waiting, None
-        if first is not None:
-            self._add(_compensate(first, T_prev_curr, interval_s), np.eye(4))
-
     def _add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         if self._voxel_size_m is None:  # no scan had a point so far
             return
@@ -153,11 +156,27 @@ class Pipeline:
         self.global_map.add(points, T_world_lidar)
 
 
-def _compensate(scan: Scan, T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
-    """The scan's points as seen from the pose at its stamp."""
-    if scan.time_offsets is None:
+def _with_next(items: Iterable[_Estimated]) -> Iterator[tuple[_Estimated, _Estimated | None]]:
+    """Each item with the one after it, None after the last."""
+    held: _Estimated | None = None
+    for item in items:
+        if held is not None:
+            yield held, item
+        held = item
+    if held is not None:
+        yield held, None
+
+
+def _compensate(scan: Scan, before: FloatArray | None, after: FloatArray | None) -> FloatArray:
+    """The scan's points as seen from the pose at its stamp.
+
+    A sweep lies between two motions. Stamps stand at its start in most recordings, so that going on with the motion
+    before would be a guess; the one after it is known by now.
+    """
+    known = [velocity for velocity in (before, after) if velocity is not None]
+    if scan.time_offsets is None or not known:
         return scan.points
-    return deskew(scan.points, scan.time_offsets, T_prev_curr, interval_s)
+    return deskew(scan.points, scan.time_offsets, known[0], known[-1])
 
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.mesh import Mesh, world_mesh
+from lidarslam.simulation.mesh_pieces import Pieces, pieces_near
 from lidarslam.simulation.recorder import Simulation
 
 KeyArray = NDArray[np.int64]
@@ -20,8 +21,6 @@ _BITS, _HALF = 19, 1 << 18
 _SECTOR_AXES = np.array([[0.86, 0.36, 0.36], [-0.48, 0.81, 0.34], [-0.17, -0.46, 0.87]])
 # Of Roberts' R2 sequence, whose points fill the unit square evenly: 1/g and 1/g^2 with g^3 = g + 1.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
-_NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
-_CELL_STRIDES = np.array([1, 1 << 20, 1 << 40])
 
 
 class ReferenceMap(NamedTuple):
@@ -47,7 +46,7 @@ class SeenSurfaces:
 
     def add(self, points: FloatArray, normals: FloatArray, from_behind: NDArray[np.bool_]) -> None:
         """Add hits (N, 3) with their surfaces' outward normals (N, 3) and whether they were met from inside (N,)."""
-        self._pending.append(np.unique(_keys(points, normals, self.voxel_m) | from_behind))
+        self._pending.append(_unique(_keys(points, normals, self.voxel_m) | from_behind))
         if sum(map(len, self._pending)) > max(_BLOCK, len(self._keys)):
             self._merge()
 
@@ -57,11 +56,11 @@ class SeenSurfaces:
         keys = self._keys
         for axis in range(3):
             step = np.int64(1) << (_BITS * axis + 4)
-            keys = np.unique(np.concatenate([keys - step, keys, keys + step]))
+            keys = _unique(np.concatenate([keys - step, keys, keys + step]))
         return keys
 
     def _merge(self) -> None:
-        self._keys = np.unique(np.concatenate([self._keys, *self._pending]))
+        self._keys = _unique(np.concatenate([self._keys, *self._pending]))
         self._pending.clear()
 
 
@@ -90,61 +89,84 @@ def add_sweep(seen: SeenSurfaces, simulation: Simulation, index: int) -> None:
 def sample_seen(mesh: Mesh, seen: SeenSurfaces, spacing_m: float = 0.05) -> ReferenceMap:
     """Samples of the mesh, one to each `spacing_m` squared, in or next to voxels that were seen.
 
-    Memory is bounded by what was seen; the mesh is gone through in blocks.
+    Time and memory are those of what was seen, not of the mesh, which is gone through once.
     """
     around = seen.around()
+    pieces = pieces_near(mesh, _cells(around), seen.voxel_m)
+    facing = pieces.normals
+    sectors = _sectors(facing)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
-    for sampled, facing in _samples(_near(mesh, around, seen.voxel_m), spacing_m):
-        keys = _keys(sampled, facing, seen.voxel_m)
-        front, behind = _contains(around, keys), _contains(around, keys | 1)
-        points.append(sampled[front | behind])
-        normals.append(np.where(front[:, None], facing, -facing)[front | behind])
+    for sampled, piece in _samples(pieces, spacing_m):
+        front, behind = _sides(around, _voxels(sampled, seen.voxel_m) | sectors[piece])
+        kept = np.flatnonzero(front | behind)
+        points.append(sampled[kept])
+        normals.append(facing[piece[kept]] * np.where(front[kept], 1.0, -1.0)[:, None])
     return ReferenceMap(np.concatenate(points), np.concatenate(normals))
 
 
-def _near(mesh: Mesh, around: KeyArray, voxel_m: float) -> Mesh:
-    """The mesh without those of its small triangles that are far from all seen voxels; the rest need no sampling."""
-    coarse_m = 8.0 * voxel_m
-    shifts = 4 + _BITS * np.arange(3)
-    cells = np.unique(((around[:, None] >> shifts & (1 << _BITS) - 1) - _HALF) >> 3, axis=0)
-    corners = mesh.vertices[mesh.triangles]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    keep = (high - low).max(axis=1, initial=0.0) > coarse_m
-    small = np.flatnonzero(~keep)
-    # A small triangle has no point in a cell that does not touch its middle's.
-    near = np.unique((cells[:, None] + _NEIGHBOURS).reshape(-1, 3) @ _CELL_STRIDES)
-    middle = np.floor(0.5 * (low + high)[small] / coarse_m).astype(np.int64)
-    keep[small] = _contains(near, middle @ _CELL_STRIDES)
-    return Mesh(mesh.vertices, mesh.triangles[keep])
+def _samples(pieces: Pieces, spacing_m: float) -> Iterator[tuple[FloatArray, NDArray[np.intp]]]:
+    """Blocks of points (N, 3) and the pieces (N,) they are on.
+
+    Sample n of the mesh is where the area before it is n + 1/2 times a sample's share, so that the samples of a piece
+    are the same, whichever other pieces were seen.
+    """
+    a, b, c = np.moveaxis(pieces.corners, 1, 0)
+    first, end = (np.ceil(area / spacing_m**2 - 0.5).astype(np.int64) for area in (pieces.starts, pieces.ends))
+    until = np.cumsum(end - first)
+    for start in range(0, int(until[-1]) if len(until) else 0, _BLOCK):
+        place = np.arange(start, min(start + _BLOCK, until[-1]))
+        piece = np.searchsorted(until, place, side="right")
+        u, v = _even_in_triangle(end[piece] - (until[piece] - place))
+        corner = a[piece]
+        yield corner + u[:, None] * (b - a)[piece] + v[:, None] * (c - a)[piece], piece
 
 
-def _samples(mesh: Mesh, spacing_m: float) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Blocks of points and unit normals: equal areas each have a point, wherever triangles begin and end."""
-    normals = mesh.normals
-    doubled = np.linalg.norm(normals, axis=1)
-    until = np.cumsum(0.5 * doubled)
-    count = int(until[-1] / spacing_m**2) if len(until) else 0
-    for start in range(0, count, _BLOCK):
-        number = np.arange(start, min(start + _BLOCK, count))
-        triangle = np.searchsorted(until, (number + 0.5) * spacing_m**2)
-        a, b, c = (mesh.vertices[mesh.triangles[triangle, k]] for k in range(3))
-        u, v = np.mod(np.multiply.outer(_R2, number + 1.0), 1.0)
-        outside = u + v > 1.0  # the square's other half is folded back onto the triangle
-        u, v = np.where(outside, 1.0 - u, u)[:, None], np.where(outside, 1.0 - v, v)[:, None]
-        yield a + u * (b - a) + v * (c - a), normals[triangle] / doubled[triangle, None]
+def _even_in_triangle(numbers: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """u and v (N,) with u + v <= 1, evenly spread over the triangle for any run of numbers (N,).
+
+    The square's points are pressed into the triangle without folding it, which would lay points on one another
+    (Heitz, A Low-Distortion Map Between Triangle and Square, 2019).
+    """
+    u, v = np.mod(np.multiply.outer(_R2, numbers + 1.0), 1.0)
+    less = 0.5 * np.minimum(u, v)
+    return np.where(v > u, less, u - less), np.where(v > u, v - less, less)
 
 
 def _keys(points: FloatArray, normals: FloatArray, voxel_m: float) -> KeyArray:
-    """One number for each point's voxel and the sector, of six, that its normal lies in; the lowest bit is free."""
-    i, j, k = np.floor(points / voxel_m).astype(np.int64).T + _HALF
+    """One number for each point's voxel and the sector that its normal lies in; the lowest bit is free."""
+    return _voxels(points, voxel_m) | _sectors(normals)
+
+
+def _voxels(points: FloatArray, voxel_m: float) -> KeyArray:
+    """The upper bits (N,) of the keys of points (N, 3)."""
+    i, j, k = np.floor(points.T / voxel_m).astype(np.int64) + _HALF
+    return np.asarray(((k << _BITS | j) << _BITS | i) << 4)
+
+
+def _sectors(normals: FloatArray) -> KeyArray:
+    """The sector (N,), of six, of normals (N, 3), as bits 1 to 3 of the keys."""
     leaning = normals @ _SECTOR_AXES.T
     axis = np.abs(leaning).argmax(axis=1)
-    sector = 2 * axis + (leaning[np.arange(len(axis)), axis] > 0.0)
-    return np.asarray((((k << _BITS | j) << _BITS | i) << 3 | sector) << 1)
+    return np.asarray((2 * axis + (leaning[np.arange(len(axis)), axis] > 0.0)) << 1)
 
 
-def _contains(sorted_keys: KeyArray, keys: KeyArray) -> NDArray[np.bool_]:
+def _cells(sorted_keys: KeyArray) -> KeyArray:
+    """The voxels (N, 3) that the keys belong to, each once."""
+    voxels = _unique(sorted_keys >> 4)
+    return np.asarray((voxels[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF)
+
+
+def _sides(sorted_keys: KeyArray, keys: KeyArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether a point's side was seen (N,), and its far side (N,), whose key comes right after it."""
     if not len(sorted_keys):
-        return np.zeros(len(keys), dtype=bool)
-    place = np.minimum(np.searchsorted(sorted_keys, keys), len(sorted_keys) - 1)
-    return np.asarray(sorted_keys[place] == keys)
+        return np.zeros(len(keys), dtype=bool), np.zeros(len(keys), dtype=bool)
+    last = len(sorted_keys) - 1
+    place = np.searchsorted(sorted_keys, keys)
+    front = sorted_keys[np.minimum(place, last)] == keys
+    return front, sorted_keys[np.minimum(place + front, last)] == keys | 1
+
+
+def _unique(keys: KeyArray) -> KeyArray:
+    """The same as `np.unique`, which hashes whole numbers and is slower where many are the same."""
+    keys = np.sort(keys)
+    return np.asarray(keys[np.concatenate([[True], np.diff(keys) > 0])] if len(keys) else keys)

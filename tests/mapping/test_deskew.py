@@ -5,33 +5,51 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import exp, inverse
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from mapping.deskew import deskew
+from mapping.deskew import body_velocity, deskew
+
+
+def exponentials(points: FloatArray, offsets: FloatArray, velocity: FloatArray) -> FloatArray:
+    moved = [exp(offset * velocity)[:3] @ [*point, 1.0] for point, offset in zip(points, offsets, strict=True)]
+    return np.array(moved)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-7, 0.0])
 def test_equals_the_exponential_of_every_points_time(rng: np.random.Generator, scale: float) -> None:
     points = rng.normal(0.0, 10.0, (200, 3))
     offsets = rng.uniform(-0.1, 0.1, 200)
-    xi = np.array([0.3 * scale, -0.2 * scale, 0.5 * scale, 1.0, 0.2, -0.1])
-    expected = [exp(offset / 0.1 * xi)[:3] @ [*point, 1.0] for point, offset in zip(points, offsets, strict=True)]
-    np.testing.assert_allclose(deskew(points, offsets, exp(xi), 0.1), expected, atol=1e-9)
+    velocity = np.array([3.0 * scale, -2.0 * scale, 5.0 * scale, 10.0, 2.0, -1.0])
+    expected = exponentials(points, offsets, velocity)
+    np.testing.assert_allclose(deskew(points, offsets, velocity, velocity), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.05, 0.05), (0.0, 0.1), (-0.1, 0.0)])
+def test_points_before_and_after_the_stamp_move_with_their_own_velocity(
+    rng: np.random.Generator, low: float, high: float
+) -> None:
+    points, offsets = rng.normal(0.0, 10.0, (200, 3)), rng.uniform(low, high, 200)
+    before, after = rng.normal(size=(2, 6))
+    expected = np.where(
+        offsets[:, None] < 0.0, exponentials(points, offsets, before), exponentials(points, offsets, after)
+    )
+    np.testing.assert_allclose(deskew(points, offsets, before, after), expected, atol=1e-9)
 
 
 def test_straightens_the_walls_of_a_room(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
     scan, T_room_lidar = room_scans[5], room_truth.T_world_lidar[5]
-    T_prev_curr = inverse(room_truth.T_world_lidar[4]) @ T_room_lidar
+    velocity = body_velocity(inverse(room_truth.T_world_lidar[4]) @ T_room_lidar, 0.1)
     assert scan.time_offsets is not None
-    straight = deskew(scan.points, scan.time_offsets, T_prev_curr, 0.1)
-    for points, limit in ((straight, 1e-9), (scan.points, None)):
-        in_room = points @ T_room_lidar[:3, :3].T + T_room_lidar[:3, 3]
-        error = room.distance_to_surface(in_room).max()
-        assert error < limit if limit else error > 0.05, "compensated exactly; not so without"
+    straight = deskew(scan.points, scan.time_offsets, velocity, velocity)
+    assert room.distance_to_surface(transform_points(T_room_lidar, straight)).max() < 1e-9
+    assert room.distance_to_surface(transform_points(T_room_lidar, scan.points)).max() > 0.05, "not so without"
 
 
-def test_nothing_to_do_without_points_or_without_an_interval(rng: np.random.Generator) -> None:
-    points = rng.normal(size=(4, 3))
-    assert deskew(points, np.zeros(4), exp([0.1] * 6), 0.0) is points
-    assert len(deskew(np.empty((0, 3)), np.empty(0), exp([0.1] * 6), 0.1)) == 0
+def test_a_velocity_makes_its_motion_in_its_time(rng: np.random.Generator) -> None:
+    velocity = rng.normal(size=6)
+    np.testing.assert_allclose(body_velocity(exp(0.3 * velocity), 0.3), velocity, atol=1e-9)
+
+
+def test_nothing_to_do_without_points() -> None:
+    assert len(deskew(np.empty((0, 3)), np.empty(0), np.ones(6), np.ones(6))) == 0

@@ -7,7 +7,7 @@ from lidarslam.core.geometry import exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from mapping.deskew import deskew
+from mapping.deskew import body_velocity, deskew
 from odometry.config import ConsistencyConfig
 from odometry.consistency import Consistency, ConsistencyCheck, plane_distances
 
@@ -20,7 +20,8 @@ def check() -> ConsistencyCheck:
 def fit(check: ConsistencyCheck, scans: list[Scan], truth: Trajectory, error: list[float]) -> Consistency:
     """The fit of two true sweeps under the true motion followed by an error."""
     T_prev_curr = inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[1]
-    points = [deskew(s.points, s.time_offsets, T_prev_curr, 0.1) for s in scans[:2] if s.time_offsets is not None]
+    velocity = body_velocity(T_prev_curr, 0.1)
+    points = [deskew(s.points, s.time_offsets, velocity, velocity) for s in scans[:2] if s.time_offsets is not None]
     assert check.check(points[0], np.eye(4)).status is Status.OK
     return check.check(points[1], T_prev_curr @ exp(error))
 

@@ -1,0 +1,160 @@
+"""Rays against height fields in torch: a coarse march, and an exact test where a ray may meet the surface."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from lidarslam.simulation.world import HeightField
+
+# A step of the march spans this many cells horizontally; longer steps are fewer and meet more that they have to test.
+_CELLS = 4
+# Steps that are looked at together: rays that met something nearby are dropped before the next ones.
+_STEPS = 16
+# How far a ray may pass from a window's heights and is still tested, for rounding.
+_SLACK_M = 1e-3
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Height fields of W worlds, F each, of at most (X, Y) points, with U x V windows.
+
+    Window (u, v) is all grid points within `_CELLS` cells of point (u, v) * `_CELLS` along either axis: whatever
+    piece of a line is at most `_CELLS` cells long lies within the window nearest to its middle.
+
+    Attributes:
+        origins: (W, F, 2) float64 world position of the first grid point.
+        cells_m: (W, F) float64.
+        last: (W, F, 2) float32 greatest index along either axis, -1 where there is no field.
+        bounds: (W, F, 2) float32 lowest and highest z.
+        heights: (W, F, X, Y) float32.
+        lowest, highest: (W, F, U, V) float32 z in each window.
+    """
+
+    origins: Tensor
+    cells_m: Tensor
+    last: Tensor
+    bounds: Tensor
+    heights: Tensor
+    lowest: Tensor
+    highest: Tensor
+
+    @classmethod
+    def from_worlds(cls, worlds: Sequence[Sequence[HeightField]], device: torch.device | str = "cpu") -> "Fields":
+        """The fields of each world, in their order."""
+        shapes = [field.heights.shape for fields in worlds for field in fields]
+        most = max(len(fields) for fields in worlds)
+        size = np.max([(2, 2), *shapes], axis=0)
+        heights = np.zeros((len(worlds), most, *size))
+        origins, cells_m = np.zeros((len(worlds), most, 2)), np.ones((len(worlds), most))
+        last, bounds = np.full((len(worlds), most, 2), -1.0), np.zeros((len(worlds), most, 2))
+        for w, fields in enumerate(worlds):
+            for f, field in enumerate(fields):
+                missing = [(0, int(n)) for n in size - field.heights.shape]
+                # Repeating the border keeps the windows there as tight as elsewhere.
+                heights[w, f] = np.pad(field.heights, missing, mode="edge")
+                origins[w, f], cells_m[w, f] = field.origin_xy, field.cell_m
+                last[w, f] = np.array(field.heights.shape) - 1.0
+                bounds[w, f] = field.heights.min(), field.heights.max()
+        surface = torch.tensor(heights, dtype=torch.float32, device=device)
+        double = (torch.tensor(array, dtype=torch.float64, device=device) for array in (origins, cells_m))
+        single = (torch.tensor(array, dtype=torch.float32, device=device) for array in (last, bounds))
+        return cls(*double, *single, surface, -_window_maxima(-surface), _window_maxima(surface))
+
+
+def _window_maxima(heights: Tensor) -> Tensor:
+    """(W, F, U, V) greatest of heights (W, F, X, Y) in each window."""
+    if not heights.numel():
+        return heights.new_zeros(*heights.shape[:2], 1, 1)
+    return max_pool2d(heights, 2 * _CELLS + 1, stride=_CELLS, padding=_CELLS, ceil_mode=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _GridRays:
+    """N rays in the grid units of one height field each.
+
+    Attributes:
+        p, d: (3, N) origin and direction; x and y in cells (per metre of range), z in metres.
+        t_in, t_out: (N,) range at which each enters and leaves the space above and below the field.
+        stride: (N,) metres of range to a step of the march.
+        field: (N,) index of the field among all worlds'.
+        number: (N,) which ray it is.
+    """
+
+    p: Tensor
+    d: Tensor
+    t_in: Tensor
+    t_out: Tensor
+    stride: Tensor
+    field: Tensor
+    number: Tensor
+
+    def take(self, index: Tensor) -> "_GridRays":
+        """Some of them."""
+        return _GridRays(
+            self.p[:, index],
+            self.d[:, index],
+            self.t_in[index],
+            self.t_out[index],
+            self.stride[index],
+            self.field[index],
+            self.number[index],
+        )
+
+
+def meet_fields(
+    fields: Fields, world: Tensor, reference: Tensor, origins: Tensor, directions: Tensor, ranges: Tensor
+) -> None:
+    """Shorten the ranges of rays that meet a height field nearer, from above or from below.
+
+    Args:
+        fields: of W worlds.
+        world: (B,) which world each image sees.
+        reference: (B, 3) float64 world position that the image's origins are relative to.
+        origins, directions: (3, B, N) float32, directions unit, axes of the world.
+        ranges: (B, N) how far to look, changed in place.
+    """
+    flat = ranges.view(-1)
+    for f in range(fields.heights.shape[1]):
+        rays = _grid_rays(fields, f, world, reference, origins, directions, ranges)
+        first = 0
+        while len(rays.number):
+            _march(fields, rays, first, flat)
+            first += _STEPS
+            reached = rays.t_in + first * rays.stride
+            rays = rays.take(torch.nonzero(reached < torch.minimum(rays.t_out, flat[rays.number])).squeeze(1))
+
+
+def _grid_rays(
+    fields: Fields, f: int, world: Tensor, reference: Tensor, origins: Tensor, directions: Tensor, ranges: Tensor
+) -> _GridRays:
+    """The rays that come by the f-th field of their world, cut to the box around it."""
+    cell = fields.cells_m[world, f, None]
+    base = torch.cat([(reference[:, :2] - fields.origins[world, f]) / cell, reference[:, 2:]], dim=1)
+    scale = torch.cat([1.0 / cell.expand(-1, 2), torch.ones_like(cell)], dim=1).float()
+    # (B, 3) -> (3, B, 1) beside (3, B, N)
+    base, scale = (array.float().T[..., None] for array in (base, scale))
+    p, d = base + scale * origins, scale * directions
+    bounds, last = fields.bounds[world, f], fields.last[world, f]
+    lowest = torch.cat([torch.zeros_like(last), bounds[:, :1] - _SLACK_M], dim=1).T[..., None]
+    highest = torch.cat([last, bounds[:, 1:] + _SLACK_M], dim=1).T[..., None]
+    slope = 1.0 / _nonzero(d)
+    one, other = (lowest - p) * slope, (highest - p) * slope
+    t_in = torch.minimum(one, other).amax(dim=0).clamp(min=0.0)
+    t_out = torch.minimum(torch.maximum(one, other).amin(dim=0), ranges)
+    here = (t_in < t_out) & (last[:, :1] > 0.0)
+    number = torch.nonzero(here.view(-1)).squeeze(1)
+    stride = _CELLS / torch.hypot(d[0], d[1]).clamp(min=_TINY)
+    field = (world * fields.heights.shape[1] + f)[:, None].expand_as(ranges)
+    # (3, B, N) -> (3, B * N), (B, N) -> (B * N)
+    return _GridRays(
+        p.flatten(1), d.flatten(1), t_in.view(-1), t_out.view(-1), stride.view(-1), field.reshape(-1), number
+    ).take_numbered()
+
+
+def _nonzero(d: Tensor) -> Tensor:
+    return torch.where(d.abs() < _TINY, torch.full_like(d, _TINY), d)
