@@ -73,6 +73,16 @@ class _Estimated:
         return body_velocity(self.motion.T_prev_curr, self.interval_s)
 
 
+@dataclass(frozen=True, eq=False)
+class _Compensated:
+    """A scan that waits to be added to the map until the motion it was compensated with is checked."""
+
+    thinned: Scan
+    velocity_before: FloatArray | None
+    points: FloatArray
+    T_world_lidar: FloatArray
+
+
 class Pipeline:
     """Turns a stream of scans into a stream of results and a global map."""
 
@@ -81,6 +91,7 @@ class Pipeline:
         self._check = check
         self._config = config
         self._voxel_size_m = config.voxel_size_m
+        self._waiting: _Compensated | None = None
         self.global_map: GlobalMap | None = None
 
     def run(self, scans: Iterable[Scan]) -> Iterator[ScanResult]:
@@ -93,6 +104,7 @@ class Pipeline:
                 job = pool.submit(self._follow, estimated, following)
             if job is not None:
                 yield job.result()
+        self._add_waiting(Status.OK)
 
     def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Estimated]:
         """Read and estimate scan after scan."""
@@ -111,13 +123,15 @@ class Pipeline:
         """Everything that follows from a motion: compensate the sweep, check the motion, add to the map."""
         scan, motion = estimated.scan, estimated.motion
         started = time.perf_counter()
-        points = _compensate(self._thin(scan), estimated.velocity, following.velocity if following else None)
+        thinned = self._thin(scan)
+        points = _compensate(thinned, estimated.velocity, following.velocity if following else None)
         compensated = time.perf_counter()
         fit = self._check.check(points, motion.T_prev_curr)
         checked = time.perf_counter()
         status, message = _judge(motion, fit)
+        self._add_waiting(status)
         if status is not Status.LOST:  # a pose that is not believed must not draw walls
-            self._add(points, estimated.T_odom_lidar)
+            self._waiting = _Compensated(thinned, estimated.velocity, points, estimated.T_odom_lidar)
         followed_ms = {
             "deskew": _ms(started, compensated),
             "check": _ms(compensated, checked),
@@ -148,12 +162,17 @@ class Pipeline:
         squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
         return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
 
-    def _add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
-        if self._voxel_size_m is None:  # no scan had a point so far
+    def _add_waiting(self, next_status: Status) -> None:
+        """Add the scan before to the map; not as compensated with a motion that has turned out to be wrong."""
+        scan, self._waiting = self._waiting, None
+        if scan is None or self._voxel_size_m is None:  # no scan had a point so far
             return
+        points = scan.points
+        if next_status is Status.LOST:
+            points = _compensate(scan.thinned, scan.velocity_before, None)
         if self.global_map is None:
             self.global_map = GlobalMap(self._voxel_size_m)
-        self.global_map.add(points, T_world_lidar)
+        self.global_map.add(points, scan.T_world_lidar)
 
 
 def _with_next(items: Iterable[_Estimated]) -> Iterator[tuple[_Estimated, _Estimated | None]]:

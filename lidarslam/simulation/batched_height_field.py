@@ -151,9 +151,84 @@ def _grid_rays(
     stride = _CELLS / torch.hypot(d[0], d[1]).clamp(min=_TINY)
     field = (world * fields.heights.shape[1] + f)[:, None].expand_as(ranges)
     # (3, B, N) -> (3, B * N), (B, N) -> (B * N)
-    return _GridRays(
-        p.flatten(1), d.flatten(1), t_in.view(-1), t_out.view(-1), stride.view(-1), field.reshape(-1), number
-    ).take_numbered()
+    every = torch.arange(ranges.numel(), device=ranges.device)
+    rays = _GridRays(
+        p.flatten(1), d.flatten(1), t_in.view(-1), t_out.view(-1), stride.view(-1), field.reshape(-1), every
+    )
+    return rays.take(number)
+
+
+def _march(fields: Fields, rays: _GridRays, first: int, ranges: Tensor) -> None:
+    """Look at the steps from `first` on; shorten the ranges (all rays,) in place."""
+    t_in, t_out, stride = rays.t_in[:, None], rays.t_out[:, None], rays.stride[:, None]
+    step = first + torch.arange(_STEPS, device=ranges.device)
+    # Both ends of a step are reckoned alike, so that it begins at the very point where the one before it ends.
+    start, end = t_in + step * stride, torch.minimum(t_in + (step + 1) * stride, t_out)  # (n, steps)
+    z_start, z_end = (rays.p[2, :, None] + rays.d[2, :, None] * t for t in (start, end))
+    low, high = _window_bounds(fields, rays, 0.5 * (start + end))
+    may_meet = (torch.maximum(z_start, z_end) >= low - _SLACK_M) & (torch.minimum(z_start, z_end) <= high + _SLACK_M)
+    ray, step = torch.nonzero(may_meet & (start < t_out), as_tuple=True)
+    met = _first_crossing(fields, rays.take(ray), start[ray, step], end[ray, step])
+    ranges.scatter_reduce_(0, rays.number[ray], met, "amin")
+
+
+def _window_bounds(fields: Fields, rays: _GridRays, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest z (n, steps) in the windows nearest to the rays at ranges t (n, steps)."""
+    columns = fields.lowest.shape[-1]
+    limits = (fields.lowest.shape[-2] - 1, columns - 1)
+    u, v = (
+        ((rays.p[k, :, None] + rays.d[k, :, None] * t) / _CELLS + 0.5).long().clamp(0, limits[k]) for k in range(2)
+    )
+    index = (rays.field[:, None] * fields.lowest.shape[-2] + u) * columns + v
+    return fields.lowest.view(-1)[index], fields.highest.view(-1)[index]
+
+
+def _first_crossing(fields: Fields, rays: _GridRays, start: Tensor, end: Tensor) -> Tensor:
+    """Range (K,) at which each ray first meets the surface between two ranges (K,), inf where it does not.
+
+    Along the ray the surface is straight between the lines of the grid, x = i, y = j and x - y = k: the height of the
+    ray above it, known at those, is linear in between, and its zero exact.
+    """
+    t = torch.cat(
+        [
+            _line_crossings(rays.p[0], rays.d[0], start, end, _CELLS),
+            _line_crossings(rays.p[1], rays.d[1], start, end, _CELLS),
+            # Along a piece as long as _CELLS cells x - y changes by no more than sqrt(2) times that.
+            _line_crossings(rays.p[0] - rays.p[1], rays.d[0] - rays.d[1], start, end, int(1.4143 * _CELLS) + 1),
+        ],
+        dim=1,
+    )
+    t = torch.cat([start[:, None], t.sort(dim=1).values, end[:, None]], dim=1)  # (K, all lines + 2)
+    x, y, z = (rays.p[k, :, None] + rays.d[k, :, None] * t for k in range(3))
+    above = z - _surface_at(fields, rays.field[:, None], x, y)
+    one, other = above[:, :-1], above[:, 1:]
+    crosses = (one > 0.0) != (other > 0.0)
+    share = one / torch.where(crosses, one - other, torch.ones_like(one))
+    met = t[:, :-1] + (t[:, 1:] - t[:, :-1]) * share
+    return torch.where(crosses, met, torch.inf).amin(dim=1)
+
+
+def _line_crossings(p: Tensor, d: Tensor, start: Tensor, end: Tensor, count: int) -> Tensor:
+    """Ranges (K, count) at which p + d t (K,) passes whole numbers after `start`; those beyond `end` are at `end`."""
+    here = p + d * start
+    forward = d > 0.0
+    first = torch.where(forward, here.floor() + 1.0, here.ceil() - 1.0)
+    onward = torch.where(forward, 1.0, -1.0)[:, None] * torch.arange(count, device=p.device)
+    t = (first[:, None] + onward - p[:, None]) / _nonzero(d)[:, None]
+    return torch.minimum(torch.maximum(t, start[:, None]), end[:, None])
+
+
+def _surface_at(fields: Fields, field: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """z of the surface's triangles at grid positions x and y, which lie within the field."""
+    rows, columns = fields.heights.shape[-2:]
+    last = fields.last.view(-1, 2)[field]
+    i, j = (torch.minimum(a.clamp(min=0.0).floor(), last[..., k] - 1.0) for k, a in enumerate((x, y)))
+    u, v = x - i, y - j
+    here = (field * rows + i.long()) * columns + j.long()
+    heights = fields.heights.view(-1)
+    z00, z11 = heights[here], heights[here + columns + 1]
+    corner = heights[here + torch.where(u >= v, columns, 1)]
+    return z00 + torch.maximum(u, v) * (corner - z00) + torch.minimum(u, v) * (z11 - corner)
 
 
 def _nonzero(d: Tensor) -> Tensor:
