@@ -23,19 +23,22 @@ class _RateColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:5.1f} scans/s")
 
 
-@contextlib.contextmanager
-def show_progress(name: str) -> Iterator[ProgressCallback]:
-    """A bar on standard error with scans a second and the state of tracking; nothing where no terminal is attached."""
+def _bar(*more: ProgressColumn) -> Progress:
+    """A bar on standard error; silent where no terminal is attached."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[state]}"),
     )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
+    return Progress(*columns, *more, console=Console(stderr=True), disable=not sys.stderr.isatty())
+
+
+@contextlib.contextmanager
+def show_progress(name: str) -> Iterator[ProgressCallback]:
+    """A bar with scans a second and the state of tracking."""
+    with _bar(TextColumn("{task.fields[state]}")) as bar:
         task = bar.add_task(name, total=None, state="")
         lost = 0
 
@@ -50,14 +53,7 @@ def show_progress(name: str) -> Iterator[ProgressCallback]:
 
 @contextlib.contextmanager
 def show_count(name: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on standard error that is told the number of the scan just finished, from 1, and how many there are."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+    """A bar that is told the number of the scan just finished, from 1, and how many there are."""
+    with _bar() as bar:
         task = bar.add_task(name, total=None)
         yield lambda number, total: bar.update(task, completed=number, total=total)

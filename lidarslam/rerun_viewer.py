@@ -1,5 +1,6 @@
 """Runs in Rerun; the only file that imports it."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from lidarslam.config import ViewerConfig
+from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
@@ -48,7 +50,7 @@ class RerunViewer:
         self._recording = rr.RecordingStream("lidarslam")
         self._last_position: FloatArray | None = None
         if spawn:
-            self._recording.spawn(connect=False)
+            _open_window(self._recording)
         sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [rr.FileSink(save)]
         if spawn:
             sinks.append(rr.GrpcSink())
@@ -111,6 +113,20 @@ class RerunViewer:
         self._last_position = position.copy()
 
 
+def _open_window(recording: rr.RecordingStream) -> None:
+    """Start the viewer that came with the library, which stands beside this Python and perhaps not on the path.
+
+    Raises:
+        OutputError: it cannot be started.
+    """
+    beside = Path(sys.executable).with_name("rerun")
+    try:
+        rr.spawn(connect=False, executable_path=str(beside) if beside.is_file() else None, recording=recording)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise OutputError(f"the Rerun window cannot be opened ({reason}); write a file instead") from error
+
+
 def _blueprint() -> rrb.Blueprint:
     """A 3D view beside time series, with the panels that newcomers do not need folded."""
     whole_past = [
@@ -153,7 +169,8 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
     elif web:
         rr.serve_web_viewer(connect_to=recording.serve_grpc())
     else:
-        recording.spawn()
+        _open_window(recording)
+        recording.connect_grpc()
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for number, run in enumerate(runs):
         _log_run(recording, f"world/{number}_{run.name}", run, number, config)
