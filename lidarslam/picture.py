@@ -12,7 +12,11 @@ from lidarslam.core.geometry import FloatArray
 # Viridis at five stops: even in lightness, readable under every colour blindness.
 _PALETTE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)
 _BACKGROUND = (255, 255, 255)
-_FIELD_OF_VIEW_DEG = 40.0
+# How far away the camera stands, in diameters of the cloud: near enough for perspective.
+_DISTANCE = 1.2
+# What must be in view, as percentiles: a few stray points do not count.
+_FRAMED_PERCENT = (0.2, 99.8)
+_FILLED = 0.92
 # Eye-dome lighting (Boucheny, 2009): how strongly a pixel behind its neighbours is darkened.
 _EDGE_STRENGTH = 12.0
 
@@ -59,7 +63,7 @@ def draw(
     """The picture (height, width, 3) of points (N, 3) with colours (N, 3), in perspective, shaded by depth.
 
     Surfaces whose normals (N, 3) face away are left out, so that one looks through ceilings and near walls into rooms.
-    The camera is as far away as it takes to see nearly all of the points.
+    Nearly all of the points are in view and fill the picture.
     """
     camera = camera or Camera()
     if normals is not None and len(points):
@@ -90,20 +94,21 @@ def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
 
 
 def _to_camera(points: FloatArray, camera: Camera) -> FloatArray:
-    """Points (N, 3) as pixel column, pixel row and depth."""
+    """Points (N, 3) as pixel column, pixel row and depth; nearly all of them fill the picture."""
+    if not len(points):
+        return np.empty((0, 3))
     towards, azimuth = camera.towards, np.deg2rad(camera.azimuth_deg)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(towards, right)
-    low, high = np.percentile(points, [0.5, 99.5], axis=0) if len(points) else np.zeros((2, 3))
-    view = (points - 0.5 * (low + high)) @ np.stack([right, up, towards], axis=1)
-    focal = 0.5 * camera.height / np.tan(0.5 * np.deg2rad(_FIELD_OF_VIEW_DEG))
-    half = 0.47 * np.array([camera.width, camera.height])
-    needed = focal * np.abs(view[:, :2]) / half + view[:, 2:3]
-    distance = max(float(np.percentile(needed.max(axis=1), 99.7)), 1e-3) if len(points) else 1.0
+    low, high = np.percentile(points, _FRAMED_PERCENT, axis=0)
+    view = (points - 0.5 * (low + high)) @ np.stack([right, -up, towards], axis=1)
+    distance = _DISTANCE * max(float(np.linalg.norm(high - low)), 1e-3)
     depth = distance - view[:, 2]
-    scale = focal / np.where(depth > 0.0, depth, np.nan)
-    column, row = 0.5 * camera.width + scale * view[:, 0], 0.5 * camera.height - scale * view[:, 1]
-    return np.stack([column, row, depth], axis=1)
+    plane = view[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None]
+    low, high = np.nanpercentile(plane, _FRAMED_PERCENT, axis=0)
+    size = np.array([camera.width, camera.height])
+    zoom = float((_FILLED * size / np.maximum(high - low, 1e-9)).min())
+    return np.column_stack([0.5 * size + zoom * (plane - 0.5 * (low + high)), depth])
 
 
 def _rasterise(seen: FloatArray, camera: Camera, splat: int = 2) -> tuple[FloatArray, NDArray[np.int64]]:
