@@ -249,7 +249,13 @@ def _formats() -> Iterable[str]:
     type=_Registered(_motions),
     help="What carries the LiDAR.  [default: handheld; car on a trajectory]",
 )
-@click.option("--trajectory", type=_FILE, metavar="FILE", help="TUM or KITTI file to move along.")
+@click.option(
+    "--trajectory",
+    type=_FILE,
+    metavar="FILE",
+    help="TUM or KITTI file to move along, KITTI's smoothed over 0.25 s. The street is built around it; elsewhere it"
+    " has to keep clear of what stands there.",
+)
 @click.option(
     "--mount", type=_Registered(_mounts), default="upright", show_default=True, help="How the LiDAR is mounted."
 )

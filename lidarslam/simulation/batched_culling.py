@@ -78,7 +78,8 @@ def within_range(centres: Tensor, radii: Tensor, reach: Tensor) -> Tensor:
     """
     near = torch.linalg.vector_norm(centres, dim=-1) - radii <= reach[:, None]
     most = int(near.sum(dim=1).max()) if near.numel() else 0
-    return near.int().argsort(dim=1, descending=True, stable=True)[:, :most]
+    order: Tensor = near.int().argsort(dim=1, descending=True, stable=True)
+    return order[:, :most]
 
 
 def pairs_that_may_meet(cones: Cones, centres: Tensor, radii: Tensor, comparisons: int) -> Iterator[Pairs]:
@@ -108,6 +109,5 @@ def _may_meet(cones: Cones, part: tuple[slice, slice], centres: Tensor, radii: T
     aside2 = (distance2 - along**2).mul_(cosine**2)
     # The cone's side passes the centre at a distance of aside * cosine - along * sine.
     allowed = torch.addcmul(radius, along, sine)
-    ahead = (along >= -radius) | (cosine <= 0.0)
-    inside = aside2 <= allowed.clamp(min=0.0) ** 2
-    return ahead & (inside | (cosine <= 0.0)) & (allowed >= 0.0)
+    meets: Tensor = (along >= -radius) & (allowed >= 0.0) & (aside2 <= allowed**2)
+    return meets | ((cosine <= 0.0) & (radius > 0.0))

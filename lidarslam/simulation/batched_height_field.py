@@ -1,76 +1,17 @@
 """Rays against height fields in torch: a coarse march, and an exact test where a ray may meet the surface."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
-from lidarslam.simulation.world import HeightField
+from lidarslam.simulation.batched_fields import WINDOW_CELLS, Fields, surface_at, window_bounds
 
-# A step of the march spans this many cells horizontally; longer steps are fewer and meet more that they have to test.
-_CELLS = 4
 # Steps that are looked at together: rays that met something nearby are dropped before the next ones.
 _STEPS = 16
 # How far a ray may pass from a window's heights and is still tested, for rounding.
 _SLACK_M = 1e-3
 _TINY = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Fields:
-    """Height fields of W worlds, F each, of at most (X, Y) points, with U x V windows.
-
-    Window (u, v) is all grid points within `_CELLS` cells of point (u, v) * `_CELLS` along either axis: whatever
-    piece of a line is at most `_CELLS` cells long lies within the window nearest to its middle.
-
-    Attributes:
-        origins: (W, F, 2) float64 world position of the first grid point.
-        cells_m: (W, F) float64.
-        last: (W, F, 2) float32 greatest index along either axis, -1 where there is no field.
-        bounds: (W, F, 2) float32 lowest and highest z.
-        heights: (W, F, X, Y) float32.
-        lowest, highest: (W, F, U, V) float32 z in each window.
-    """
-
-    origins: Tensor
-    cells_m: Tensor
-    last: Tensor
-    bounds: Tensor
-    heights: Tensor
-    lowest: Tensor
-    highest: Tensor
-
-    @classmethod
-    def from_worlds(cls, worlds: Sequence[Sequence[HeightField]], device: torch.device | str = "cpu") -> "Fields":
-        """The fields of each world, in their order."""
-        shapes = [field.heights.shape for fields in worlds for field in fields]
-        most = max(len(fields) for fields in worlds)
-        size = np.max([(2, 2), *shapes], axis=0)
-        heights = np.zeros((len(worlds), most, *size))
-        origins, cells_m = np.zeros((len(worlds), most, 2)), np.ones((len(worlds), most))
-        last, bounds = np.full((len(worlds), most, 2), -1.0), np.zeros((len(worlds), most, 2))
-        for w, fields in enumerate(worlds):
-            for f, field in enumerate(fields):
-                missing = [(0, int(n)) for n in size - field.heights.shape]
-                # Repeating the border keeps the windows there as tight as elsewhere.
-                heights[w, f] = np.pad(field.heights, missing, mode="edge")
-                origins[w, f], cells_m[w, f] = field.origin_xy, field.cell_m
-                last[w, f] = np.array(field.heights.shape) - 1.0
-                bounds[w, f] = field.heights.min(), field.heights.max()
-        surface = torch.tensor(heights, dtype=torch.float32, device=device)
-        double = (torch.tensor(array, dtype=torch.float64, device=device) for array in (origins, cells_m))
-        single = (torch.tensor(array, dtype=torch.float32, device=device) for array in (last, bounds))
-        return cls(*double, *single, surface, -_window_maxima(-surface), _window_maxima(surface))
-
-
-def _window_maxima(heights: Tensor) -> Tensor:
-    """(W, F, U, V) greatest of heights (W, F, X, Y) in each window."""
-    if not heights.numel():
-        return heights.new_zeros(*heights.shape[:2], 1, 1)
-    return max_pool2d(heights, 2 * _CELLS + 1, stride=_CELLS, padding=_CELLS, ceil_mode=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +89,7 @@ def _grid_rays(
     t_out = torch.minimum(torch.maximum(one, other).amin(dim=0), ranges)
     here = (t_in < t_out) & (last[:, :1] > 0.0)
     number = torch.nonzero(here.view(-1)).squeeze(1)
-    stride = _CELLS / torch.hypot(d[0], d[1]).clamp(min=_TINY)
+    stride = WINDOW_CELLS / torch.hypot(d[0], d[1]).clamp(min=_TINY)
     field = (world * fields.heights.shape[1] + f)[:, None].expand_as(ranges)
     # (3, B, N) -> (3, B * N), (B, N) -> (B * N)
     every = torch.arange(ranges.numel(), device=ranges.device)
@@ -165,22 +106,12 @@ def _march(fields: Fields, rays: _GridRays, first: int, ranges: Tensor) -> None:
     # Both ends of a step are reckoned alike, so that it begins at the very point where the one before it ends.
     start, end = t_in + step * stride, torch.minimum(t_in + (step + 1) * stride, t_out)  # (n, steps)
     z_start, z_end = (rays.p[2, :, None] + rays.d[2, :, None] * t for t in (start, end))
-    low, high = _window_bounds(fields, rays, 0.5 * (start + end))
+    x, y = (rays.p[k, :, None] + rays.d[k, :, None] * 0.5 * (start + end) for k in range(2))
+    low, high = window_bounds(fields, rays.field[:, None], x, y)
     may_meet = (torch.maximum(z_start, z_end) >= low - _SLACK_M) & (torch.minimum(z_start, z_end) <= high + _SLACK_M)
     ray, step = torch.nonzero(may_meet & (start < t_out), as_tuple=True)
     met = _first_crossing(fields, rays.take(ray), start[ray, step], end[ray, step])
     ranges.scatter_reduce_(0, rays.number[ray], met, "amin")
-
-
-def _window_bounds(fields: Fields, rays: _GridRays, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Lowest and highest z (n, steps) in the windows nearest to the rays at ranges t (n, steps)."""
-    columns = fields.lowest.shape[-1]
-    limits = (fields.lowest.shape[-2] - 1, columns - 1)
-    u, v = (
-        ((rays.p[k, :, None] + rays.d[k, :, None] * t) / _CELLS + 0.5).long().clamp(0, limits[k]) for k in range(2)
-    )
-    index = (rays.field[:, None] * fields.lowest.shape[-2] + u) * columns + v
-    return fields.lowest.view(-1)[index], fields.highest.view(-1)[index]
 
 
 def _first_crossing(fields: Fields, rays: _GridRays, start: Tensor, end: Tensor) -> Tensor:
@@ -191,16 +122,16 @@ def _first_crossing(fields: Fields, rays: _GridRays, start: Tensor, end: Tensor)
     """
     t = torch.cat(
         [
-            _line_crossings(rays.p[0], rays.d[0], start, end, _CELLS),
-            _line_crossings(rays.p[1], rays.d[1], start, end, _CELLS),
-            # Along a piece as long as _CELLS cells x - y changes by no more than sqrt(2) times that.
-            _line_crossings(rays.p[0] - rays.p[1], rays.d[0] - rays.d[1], start, end, int(1.4143 * _CELLS) + 1),
+            _line_crossings(rays.p[0], rays.d[0], start, end, WINDOW_CELLS),
+            _line_crossings(rays.p[1], rays.d[1], start, end, WINDOW_CELLS),
+            # Along a piece as long as WINDOW_CELLS cells x - y changes by no more than sqrt(2) times that.
+            _line_crossings(rays.p[0] - rays.p[1], rays.d[0] - rays.d[1], start, end, int(1.4143 * WINDOW_CELLS) + 1),
         ],
         dim=1,
     )
     t = torch.cat([start[:, None], t.sort(dim=1).values, end[:, None]], dim=1)  # (K, all lines + 2)
     x, y, z = (rays.p[k, :, None] + rays.d[k, :, None] * t for k in range(3))
-    above = z - _surface_at(fields, rays.field[:, None], x, y)
+    above = z - surface_at(fields, rays.field[:, None], x, y)
     one, other = above[:, :-1], above[:, 1:]
     crosses = (one > 0.0) != (other > 0.0)
     share = one / torch.where(crosses, one - other, torch.ones_like(one))
@@ -216,19 +147,6 @@ def _line_crossings(p: Tensor, d: Tensor, start: Tensor, end: Tensor, count: int
     onward = torch.where(forward, 1.0, -1.0)[:, None] * torch.arange(count, device=p.device)
     t = (first[:, None] + onward - p[:, None]) / _nonzero(d)[:, None]
     return torch.minimum(torch.maximum(t, start[:, None]), end[:, None])
-
-
-def _surface_at(fields: Fields, field: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """z of the surface's triangles at grid positions x and y, which lie within the field."""
-    rows, columns = fields.heights.shape[-2:]
-    last = fields.last.view(-1, 2)[field]
-    i, j = (torch.minimum(a.clamp(min=0.0).floor(), last[..., k] - 1.0) for k, a in enumerate((x, y)))
-    u, v = x - i, y - j
-    here = (field * rows + i.long()) * columns + j.long()
-    heights = fields.heights.view(-1)
-    z00, z11 = heights[here], heights[here + columns + 1]
-    corner = heights[here + torch.where(u >= v, columns, 1)]
-    return z00 + torch.maximum(u, v) * (corner - z00) + torch.minimum(u, v) * (z11 - corner)
 
 
 def _nonzero(d: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.batched_height_field import Fields
+from lidarslam.simulation.batched_fields import Fields
 from lidarslam.simulation.world import Boxes, Cylinders, Mover, World
 
 
@@ -97,7 +97,7 @@ class BatchedWorld:
         return len(self.boxes.centres)
 
 
-def padded(arrays: Sequence[NDArray[np.generic]], fill: float | FloatArray) -> FloatArray:
+def _padded(arrays: Sequence[NDArray[np.generic]], fill: float | FloatArray) -> FloatArray:
     """(W, P, ...) float64 from W arrays (P_w, ...), the missing rows filled."""
     shape = (len(arrays), max(len(array) for array in arrays), *arrays[0].shape[1:])
     out = np.empty(shape)
@@ -107,7 +107,7 @@ def padded(arrays: Sequence[NDArray[np.generic]], fill: float | FloatArray) -> F
     return out
 
 
-def on_device(array: FloatArray, device: torch.device | str, dtype: torch.dtype = torch.float32) -> Tensor:
+def _on_device(array: FloatArray, device: torch.device | str, dtype: torch.dtype = torch.float32) -> Tensor:
     """A copy of an array as a tensor."""
     return torch.tensor(array, dtype=dtype, device=device)
 
@@ -128,10 +128,10 @@ def _solids(worlds: Sequence[Boxes], device: torch.device | str, round_section: 
         for b in worlds
     ]
     return Solids(
-        on_device(padded([b.centres for b in worlds], 0.0), device, torch.float64),
-        on_device(padded([b.R_world_box for b in worlds], np.eye(3)), device),
-        on_device(padded([b.half_sizes for b in worlds], -1.0), device),
-        on_device(padded(radii, -np.inf), device),
+        _on_device(_padded([b.centres for b in worlds], 0.0), device, torch.float64),
+        _on_device(_padded([b.R_world_box for b in worlds], np.eye(3)), device),
+        _on_device(_padded([b.half_sizes for b in worlds], -1.0), device),
+        _on_device(_padded(radii, -np.inf), device),
     )
 
 
@@ -143,19 +143,19 @@ def _movers(worlds: Sequence[Sequence[Mover]], device: torch.device | str) -> Mo
         longest = max([1, *(len(part) for world in parts for part in world)])
         filled = [[np.broadcast_to(fill, (longest, *row)), *world] for world in parts]
         # The first, which is only there to have the length, is dropped.
-        return padded([padded(world, fill)[1:] for world in filled], fill)
+        return _padded([_padded(world, fill)[1:] for world in filled], fill)
 
     def figures(of_world: list[list[float]], fill: float, dtype: torch.dtype) -> Tensor:
-        return on_device(padded([np.array(world) for world in of_world], fill), device, dtype)
+        return _on_device(_padded([np.array(world) for world in of_world], fill), device, dtype)
 
     return Movers(
-        on_device(rows([[b.R_world_box for b in world] for world in boxes], np.eye(3), (3, 3)), device),
-        on_device(rows([[b.centres for b in world] for world in boxes], 0.0, (3,)), device),
-        on_device(rows([[b.half_sizes for b in world] for world in boxes], -1.0, (3,)), device),
+        _on_device(rows([[b.R_world_box for b in world] for world in boxes], np.eye(3), (3, 3)), device),
+        _on_device(rows([[b.centres for b in world] for world in boxes], 0.0, (3,)), device),
+        _on_device(rows([[b.half_sizes for b in world] for world in boxes], -1.0, (3,)), device),
         figures([[_reach(b) for b in world] for world in boxes], -np.inf, torch.float32),
-        on_device(rows([[leg[:, :3] for leg in world] for world in legs], 0.0, (3,)), device, torch.float64),
-        on_device(rows([[leg[:, 3:6] for leg in world] for world in legs], 0.0, (3,)), device, torch.float64),
-        on_device(rows([[leg[:, 6] for leg in world] for world in legs], np.inf, ()), device, torch.float64),
+        _on_device(rows([[leg[:, :3] for leg in world] for world in legs], 0.0, (3,)), device, torch.float64),
+        _on_device(rows([[leg[:, 3:6] for leg in world] for world in legs], 0.0, (3,)), device, torch.float64),
+        _on_device(rows([[leg[:, 6] for leg in world] for world in legs], np.inf, ()), device, torch.float64),
         figures([[m.speed_mps for m in movers] for movers in worlds], 0.0, torch.float64),
         figures([[m.start_m for m in movers] for movers in worlds], 0.0, torch.float64),
     )

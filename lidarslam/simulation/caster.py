@@ -49,11 +49,19 @@ class Caster:
         self._movers = world.movers
         self._tensor = o3d.core.Tensor.from_numpy
         self._scene: Any = o3d.t.geometry.RaycastingScene()
-        if len(mesh.triangles):
+        self._is_filled = len(mesh.triangles) > 0
+        if self._is_filled:
             self._scene.add_triangles(
                 self._tensor((mesh.vertices - self._middle).astype(np.float32)),
                 self._tensor(np.ascontiguousarray(mesh.triangles, dtype=np.uint32)),
             )
+
+    def distances(self, points: FloatArray) -> FloatArray:
+        """Distances (N,) of points (N, 3) from the nearest surface that stands still, from either side of it."""
+        if not self._is_filled:
+            return np.full(len(points), np.inf)
+        found = self._scene.compute_distance(self._tensor((points - self._middle).astype(np.float32)))
+        return np.asarray(found.numpy(), dtype=np.float64)
 
     def cast(self, origins: FloatArray, directions: FloatArray, times: FloatArray, max_range_m: float) -> Hits:
         """Cast rays with origins (N, 3) and unit directions (N, 3) in the world, each at its own time (N,)."""
@@ -68,6 +76,8 @@ class Caster:
         ranges[missed], surfaces[missed], normals[missed] = _FAR, -1, 0.0
         moving = np.zeros(len(ranges), dtype=bool)
         for number, mover in enumerate(self._movers):
+            if _is_beyond(mover, origins, times, max_range_m):
+                continue
             nearer, t, n = _meet_mover(mover, origins, directions, times, ranges)
             ranges[nearer], normals[nearer], moving[nearer] = t, n, True
             surfaces[nearer] = -2 - number
@@ -92,14 +102,27 @@ def _meet_mover(
     return candidates[nearer], distances[nearer], normals
 
 
+def _is_beyond(mover: Mover, origins: FloatArray, times: FloatArray, max_range_m: float) -> bool:
+    """Whether a mover is so far away all the time that no ray need be looked at: a long street has many."""
+    if not len(mover.boxes) or not len(times):
+        return True
+    ends = np.array([times.min(), times.max()])
+    away = np.linalg.norm(mover.pose_at(ends)[:, :3, 3] - origins[0], axis=1).min()
+    travelled = abs(mover.speed_mps) * (ends[1] - ends[0]) + 2.0 * np.linalg.norm(origins[-1] - origins[0])
+    return bool(away > max_range_m + _reach(mover) + travelled)
+
+
+def _reach(mover: Mover) -> float:
+    return float((np.linalg.norm(mover.boxes.centres, axis=1) + np.linalg.norm(mover.boxes.half_sizes, axis=1)).max())
+
+
 def _near_mover(mover: Mover, origins: FloatArray, directions: FloatArray, times: FloatArray) -> NDArray[np.intp]:
     """Rays that pass the sphere that holds the mover during all of the times."""
     if not len(mover.boxes) or not len(times):
         return np.empty(0, dtype=np.intp)
     ends = np.array([times.min(), times.max()])
     seen = mover.pose_at(np.append(ends, ends.mean()))[:, :3, 3]
-    reach = np.linalg.norm(mover.boxes.centres, axis=1) + np.linalg.norm(mover.boxes.half_sizes, axis=1)
-    radius = reach.max() + 0.5 * abs(mover.speed_mps) * (ends[1] - ends[0])
+    radius = _reach(mover) + 0.5 * abs(mover.speed_mps) * (ends[1] - ends[0])
     away = seen[2] - origins
     along = np.maximum(np.einsum("ij,ij->i", away, directions), 0.0)
     return np.flatnonzero(np.einsum("ij,ij->i", away, away) - along**2 < radius**2)

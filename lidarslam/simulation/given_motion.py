@@ -1,7 +1,7 @@
 """Following a trajectory that is given, such as KITTI's ground truth."""
 
 import numpy as np
-from scipy.interpolate import make_smoothing_spline
+from scipy.interpolate import CubicSpline, make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
@@ -14,6 +14,7 @@ from lidarslam.simulation.world import World
 
 _STEEPEST_DEG = 80.0
 _FEWEST_TO_SMOOTH = 5
+_PATH_STEP_S = 0.05
 
 
 def motion_along(
@@ -21,8 +22,9 @@ def motion_along(
 ) -> Motion:
     """Follow a trajectory in its own time, on smooth splines.
 
-    The trajectory's world frame is the world's; nothing keeps the path clear of what stands there, so the world has
-    to be made around it. Time 0 is the first pose; after the last one the body stays where it is.
+    The trajectory's world frame is the world's; nothing keeps the path clear of what stands there: the world has to
+    be made around it (`worlds.street_along`), or the path be checked (`path_clearance`). Time 0 is the first pose;
+    after the last one the body stays where it is.
 
     Args:
         trajectory: poses of a frame with x forwards and z up (a KITTI pose file has to be converted before).
@@ -57,6 +59,14 @@ def motion_along(
         z, roll, pitch = _put_on_ground(world, np.stack([x, y], axis=-1), yaw, body.footprint_m)
     base = np.stack([x, y, z, roll, pitch, yaw, np.zeros(len(x))], axis=-1)
     return Motion("given", times, base, Sway(), height, repeats=False)
+
+
+def path_along(trajectory: Trajectory, smoothing_s: float = 0.0) -> FloatArray:
+    """Positions (N, 3) that `motion_along` passes, also between the poses, before they are put on the ground."""
+    times = trajectory.stamps - trajectory.stamps[0]
+    positions = np.stack([_smoothed(times, values, smoothing_s) for values in trajectory.positions.T], axis=-1)
+    moments = np.linspace(0.0, times[-1], max(2, int(np.ceil(times[-1] / _PATH_STEP_S)) + 1))
+    return np.asarray(CubicSpline(times, positions, bc_type="natural")(moments))
 
 
 def _smoothed(times: FloatArray, values: FloatArray, smoothing_s: float) -> FloatArray:

@@ -13,7 +13,8 @@ IntArray = NDArray[np.int64]
 
 # Pieces become as small as cells of 2^level voxels, one level after the other: with each, what is far is dropped
 # before the rest is cut further, so that the work is that of the surface nearby and not of the mesh.
-_LEVELS = (7, 3)
+_LEVELS = (8, 5, 3)
+PIECE_VOXELS = 2 ** _LEVELS[-1]
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
 _STRIDES = np.array([1, 1 << 20, 1 << 40])
 _BLOCK = 1 << 17

@@ -8,16 +8,20 @@ import numpy as np
 
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.simulation.carriers import find_carrier
 from lidarslam.simulation.mesh import world_mesh
 from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.path_clearance import check_clearance
 from lidarslam.simulation.recorder import Echoes, SimulatedScan, Simulation
 from lidarslam.simulation.recording_folder import GROUND_TRUTH, README, REFERENCE_MAP, new_folder
-from lidarslam.simulation.recording_motion import plan_motion
+from lidarslam.simulation.recording_motion import given_path, plan_motion
 from lidarslam.simulation.recording_request import RecordingSummary, RecordRequest
 from lidarslam.simulation.recording_text import format_readme
 from lidarslam.simulation.reference_map import ReferenceMap, SeenSurfaces, add_sweep, sample_seen
 from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.simulation.worlds.street_along import build_along
 from lidarslam.simulation.writers.clock import clock_s
 from lidarslam.simulation.writers.interface import Rig
 from lidarslam.simulation.writers.ply import write_ply
@@ -62,7 +66,8 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
     """Make the recording's folder; it appears when everything in it is complete.
 
     Raises:
-        InputError: no world, sensor, motion, mount or format has that name, or the trajectory cannot be followed.
+        InputError: no world, sensor, motion, mount or format has that name, or the trajectory cannot be followed
+            or leads through something solid.
         OutputError: the folder holds something already, or cannot be written.
     """
     chosen = find_format(request.format)
@@ -74,7 +79,7 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
         truth = recorder.ground_truth
         stamps = np.array([clock_s(stamp, chosen.clock_start_ns) for stamp in truth.stamps])
         write_tum(folder / GROUND_TRUTH, Trajectory(stamps, truth.T_world_lidar))
-        true_map = sample_seen(world_mesh(recorder.world), tally.seen)
+        true_map = sample_seen(world_mesh(recorder.world), tally.seen, recorder.world.map_spacing_m)
         _write_map(folder / REFERENCE_MAP, true_map)
         summary = RecordingSummary(
             source=chosen.source_in(request.out),
@@ -84,6 +89,7 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
             duration_s=truth.duration_s,
             length_m=truth.length_m,
             map_points=len(true_map.points),
+            map_spacing_m=recorder.world.map_spacing_m,
             size_mb=sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6,
         )
         (folder / README).write_text(format_readme(request, summary), encoding="utf-8")
@@ -92,10 +98,20 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
 
 def _recorder(request: RecordRequest) -> _Recorder:
     sensor = find_sensor(request.sensor)
-    world = build_world(request.world, request.seed)
+    world = _world(request)
     motion, scans = plan_motion(request, world, sensor)
     T_body_lidar = mount_pose(request.mount, motion.sensor_height_m)
-    return _Recorder(world, sensor, motion, T_body_lidar, scans, request.seed)
+    recorder = _Recorder(world, sensor, motion, T_body_lidar, scans, request.seed)
+    if request.trajectory is not None:
+        check_clearance(recorder, find_carrier(request.motion), str(request.trajectory))
+    return recorder
+
+
+def _world(request: RecordRequest) -> World:
+    """The world of that name; a street is built along the trajectory, if there is one."""
+    if request.world == "street" and request.trajectory is not None:
+        return build_along(given_path(request.trajectory, request.motion), request.seed)
+    return build_world(request.world, request.seed)
 
 
 def _write_map(path: Path, true_map: ReferenceMap) -> None:

@@ -102,6 +102,10 @@ class Simulation:
     def _caster(self) -> Caster:
         return Caster(self.world)
 
+    def distance_to_surfaces(self, points: FloatArray) -> FloatArray:
+        """Distances (N,) of points (N, 3) in the world from what stands still there."""
+        return self._caster.distances(points)
+
     def __len__(self) -> int:
         return self.scan_count
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import inverse, make_transform
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.simulation.carriers import find_carrier
-from lidarslam.simulation.given_motion import motion_along
+from lidarslam.simulation.given_motion import motion_along, path_along
 from lidarslam.simulation.motions import Motion
 from lidarslam.simulation.recording_request import RecordRequest
 from lidarslam.simulation.route_motion import motion_along_route
@@ -27,6 +27,9 @@ _T_CAM_BODY = make_transform([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[Motion, int]:
     """The motion and the number of scans: as many as asked for, else 300 or as long as the trajectory lasts.
 
+    A KITTI pose file is smoothed over a quarter of a second: its poses jump by centimetres, as the GPS behind them
+    did, and at 10 Hz that is more than a car's acceleration. A TUM file is followed through every pose.
+
     What leans with the ground follows a trajectory on the ground, everything else takes its poses as they are.
 
     Raises:
@@ -36,7 +39,7 @@ def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[M
         return motion_along_route(request.motion, world, request.seed), request.scans or _SCANS
     trajectory = read_trajectory(request.trajectory)
     carrier = find_carrier(request.motion)
-    smoothing_s = _KITTI_SMOOTHING_S if _is_kitti(request.trajectory) else 0.0
+    smoothing_s = _smoothing_s(request.trajectory)
     motion = motion_along(trajectory, world, carrier.leans_with_ground, carrier.name, smoothing_s)
     most = int(trajectory.duration_s * sensor.rate_hz + 1e-6)  # the last sweep has to end before the trajectory does
     if not 1 <= (request.scans or most) <= most:
@@ -45,6 +48,24 @@ def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[M
             f" got --scans {request.scans or 1}"
         )
     return motion, request.scans or most
+
+
+def given_path(path: Path, motion: str) -> FloatArray:
+    """Where a carrier goes along a trajectory: (N, 2), or for what does not follow the ground (N, 3).
+
+    The third column is the height of the ground that fits the trajectory: as far below it as the carrier holds or
+    flies the sensor.
+
+    Raises:
+        InputError: there is no such carrier, or the file is no trajectory of two poses or more.
+    """
+    trajectory, carrier = read_trajectory(path), find_carrier(motion)
+    if len(trajectory) < 2:
+        raise InputError(f"{path}: a motion needs two poses or more, the trajectory has {len(trajectory)}")
+    positions = path_along(trajectory, _smoothing_s(path))
+    if carrier.leans_with_ground:
+        return np.asarray(positions[:, :2])
+    return positions - [0.0, 0.0, carrier.sensor_height_m + carrier.flight_height_m]
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -58,6 +79,10 @@ def read_trajectory(path: Path) -> Trajectory:
     T_cam0_cam = read_kitti_poses(path)
     stamps = np.arange(len(T_cam0_cam)) / _KITTI_RATE_HZ
     return Trajectory(stamps, inverse(_T_CAM_BODY) @ T_cam0_cam @ _T_CAM_BODY)
+
+
+def _smoothing_s(path: Path) -> float:
+    return _KITTI_SMOOTHING_S if _is_kitti(path) else 0.0
 
 
 def _is_kitti(path: Path) -> bool:

@@ -38,7 +38,7 @@ class RecordingSummary:
         rate_hz: of the sensor, sweeps a second.
         scans, points_per_scan: how many; the points are the mean.
         duration_s, length_m: from the first stamp to the last.
-        map_points: points of the reference map.
+        map_points, map_spacing_m: points of the reference map, and how far apart they are.
         size_mb: of the whole folder.
     """
 
@@ -49,4 +49,5 @@ class RecordingSummary:
     duration_s: float
     length_m: float
     map_points: int
+    map_spacing_m: float
     size_mb: float

@@ -67,7 +67,7 @@ def _lines(request: RecordRequest, summary: RecordingSummary) -> Iterator[str]:
     )
     yield from _item(
         f"**{REFERENCE_MAP}**: {summary.map_points:,} points with normals, exact, on the surfaces that the sensor saw,"
-        " about 5 cm apart, in the same world frame; nothing that moves is in it."
+        f" about {100.0 * summary.map_spacing_m:.0f} cm apart, in the same world frame; nothing that moves is in it."
     )
     yield ""
     yield "## Frames and times"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.mesh import Mesh, world_mesh
-from lidarslam.simulation.mesh_pieces import Pieces, pieces_near
+from lidarslam.simulation.mesh_pieces import PIECE_VOXELS, Pieces, pieces_near
 from lidarslam.simulation.recorder import Simulation
 
 KeyArray = NDArray[np.int64]
@@ -53,11 +53,7 @@ class SeenSurfaces:
     def around(self) -> KeyArray:
         """Sorted keys of the seen voxels and all that touch them."""
         self._merge()
-        keys = self._keys
-        for axis in range(3):
-            step = np.int64(1) << (_BITS * axis + 4)
-            keys = _unique(np.concatenate([keys - step, keys, keys + step]))
-        return keys
+        return _spread(self._keys)
 
     def _merge(self) -> None:
         self._keys = _unique(np.concatenate([self._keys, *self._pending]))
@@ -65,13 +61,16 @@ class SeenSurfaces:
 
 
 def reference_map(
-    simulation: Simulation, spacing_m: float = 0.05, start: int = 0, stop: int | None = None, step: int = 1
+    simulation: Simulation, spacing_m: float | None = None, start: int = 0, stop: int | None = None, step: int = 1
 ) -> ReferenceMap:
-    """The map of what the chosen scans of a simulation saw of the world that stands still."""
+    """The map of what the chosen scans of a simulation saw of the world that stands still.
+
+    Its points are `spacing_m` apart, by default as the world says.
+    """
     seen = SeenSurfaces()
     for index in range(len(simulation))[start:stop:step]:
         add_sweep(seen, simulation, index)
-    return sample_seen(world_mesh(simulation.world), seen, spacing_m)
+    return sample_seen(world_mesh(simulation.world), seen, spacing_m or simulation.world.map_spacing_m)
 
 
 def add_sweep(seen: SeenSurfaces, simulation: Simulation, index: int) -> None:
@@ -92,7 +91,7 @@ def sample_seen(mesh: Mesh, seen: SeenSurfaces, spacing_m: float = 0.05) -> Refe
     Time and memory are those of what was seen, not of the mesh, which is gone through once.
     """
     around = seen.around()
-    pieces = pieces_near(mesh, _cells(around), seen.voxel_m)
+    pieces = _facing_seen(pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m), around, seen.voxel_m)
     facing = pieces.normals
     sectors = _sectors(facing)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
@@ -150,10 +149,27 @@ def _sectors(normals: FloatArray) -> KeyArray:
     return np.asarray((2 * axis + (leaning[np.arange(len(axis)), axis] > 0.0)) << 1)
 
 
-def _cells(sorted_keys: KeyArray) -> KeyArray:
-    """The voxels (N, 3) that the keys belong to, each once."""
-    voxels = _unique(sorted_keys >> 4)
-    return np.asarray((voxels[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF)
+def _cells(upper_bits: KeyArray) -> KeyArray:
+    """The voxels (N, 3) of keys (N,) without their lowest four bits."""
+    return np.asarray((upper_bits[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF)
+
+
+def _facing_seen(pieces: Pieces, around: KeyArray, voxel_m: float) -> Pieces:
+    """The pieces without those that face another way than everything seen nearby: the far sides of walls."""
+    coarse_m = PIECE_VOXELS * voxel_m
+    middles = np.asarray((_cells(around >> 4) + 0.5) * voxel_m, dtype=np.float64)
+    seen_keys = _spread(_unique(_voxels(middles, coarse_m) | (around & 0b1111)))
+    low, high = pieces.bounds
+    front, behind = _sides(seen_keys, _voxels(0.5 * (low + high), coarse_m) | _sectors(pieces.normals))
+    return pieces[front | behind]
+
+
+def _spread(keys: KeyArray) -> KeyArray:
+    """Sorted keys of the voxels and of all that touch them."""
+    for axis in range(3):
+        step = np.int64(1) << (_BITS * axis + 4)
+        keys = _unique(np.concatenate([keys - step, keys, keys + step]))
+    return keys
 
 
 def _sides(sorted_keys: KeyArray, keys: KeyArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -188,6 +188,8 @@ class World:
         boxes, cylinders, height_fields: what stands still.
         movers: what does not.
         route: the way through it.
+        map_spacing_m: distance between the points of its reference map: 5 cm indoors, 10 cm outdoors, where surfaces
+            are rougher and a map has millions of points.
     """
 
     name: str
@@ -197,6 +199,7 @@ class World:
     cylinders: Cylinders = field(default_factory=Cylinders.empty)
     height_fields: tuple[HeightField, ...] = ()
     movers: tuple[Mover, ...] = ()
+    map_spacing_m: float = 0.05
 
     def ground_at(self, xy: FloatArray) -> FloatArray:
         """z (N,) of the first height field, which is the ground; 0 where there is none."""

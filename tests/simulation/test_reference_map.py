@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from lidarslam.simulation.caster import Caster
 from lidarslam.simulation.mesh import Mesh, box_mesh
+from lidarslam.simulation.mesh_pieces import pieces_near
 from lidarslam.simulation.mounts import mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.reference_map import SeenSurfaces, reference_map, sample_seen
@@ -104,3 +105,16 @@ def test_movers_are_not_in_the_map(recording, yard_map):
 def test_the_map_is_the_same_every_time(recording, yard_map):
     again = reference_map(replace(recording), spacing_m=0.15, step=40)
     assert again.points.tobytes() == yard_map.points.tobytes()
+
+
+def test_cutting_keeps_area_orientation_and_all_that_is_near():
+    voxels = np.array([[0, 0, 0], [12, 3, 0]])
+    pieces = pieces_near(SQUARE, voxels, voxel_m=0.2)
+    area = pieces.ends - pieces.starts
+    a, b, c = np.moveaxis(pieces.corners, 1, 0)
+    np.testing.assert_allclose(0.5 * np.cross(b - a, c - a)[:, 2], area, atol=1e-12)
+    low, high = pieces.bounds
+    assert (high - low).max() <= 1.6
+    assert area.sum() < 30.0
+    assert high[:, 0].max() > 2.6
+    assert len(pieces_near(SQUARE, np.array([[0, 0, 50]]), 0.2)) == 0

@@ -28,7 +28,9 @@ def build(seed: int) -> World:
     _floor(part, rng, track, ground)
     route = Route(on_ground(resample_loop(track, 1.5), ground), 1.5, _FREE_SIDE_M, 2.6, 3.0)
     part = prune(part, route)
-    return World("forest", seed, route, boxes=part.boxes, cylinders=part.cylinders, height_fields=(ground,))
+    return World(
+        "forest", seed, route, boxes=part.boxes, cylinders=part.cylinders, height_fields=(ground,), map_spacing_m=0.1
+    )
 
 
 def _ground(rng: np.random.Generator, track: FloatArray) -> HeightField:

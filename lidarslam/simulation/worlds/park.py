@@ -37,6 +37,7 @@ def build(seed: int) -> World:
         cylinders=solid.cylinders,
         height_fields=(ground,),
         movers=tuple(_strollers(rng, path, ground)),
+        map_spacing_m=0.1,
     )
 
 

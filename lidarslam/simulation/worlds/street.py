@@ -47,6 +47,7 @@ def build(seed: int) -> World:
         cylinders=solid.cylinders,
         height_fields=(ground,),
         movers=(*_traffic(rng, plan, ground), *_people(rng, plan, ground)),
+        map_spacing_m=0.1,
     )
 
 
