@@ -1,6 +1,6 @@
 """Draw the exact map of every simulated world, as one lap of its route sees it.
 
-    python benchmarks/draw_worlds.py --out docs/pictures
+python benchmarks/draw_worlds.py --out docs/pictures
 """
 
 import argparse

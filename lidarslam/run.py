@@ -96,37 +96,29 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         viewer = _make_viewer(request, recording, directory)
         stack.callback(viewer.close)
         pipeline = Pipeline(odometry, ConsistencyCheck(request.config.odometry.consistency), request.config.global_map)
-        scans = InOrder(recording.scans(chosen.start, chosen.stop, chosen.step))
+        scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
         total_ms = _process(pipeline, scans, recording, log, viewer, lambda n, r: progress(n, len(chosen), r))
         if not len(log):
             raise InputError(f"{request.source}: no scan could be used")
         metrics = _write_trajectories(directory, recording, log)
         map_points = _write_map(directory, pipeline.global_map, request.config.global_map, request.pcd)
-    summary = summarise(log, total_ms, map_points, scans.skipped)
+    summary = summarise(log, total_ms, map_points, len(chosen) - len(log))
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics)
 
 
-class InOrder:
-    """Passes on scans whose stamps increase and counts the others, which no trajectory could hold."""
-
-    def __init__(self, scans: Iterable[Scan]) -> None:
-        self._scans = scans
-        self.skipped = 0
-
-    def __iter__(self) -> Iterator[Scan]:
-        latest = -np.inf
-        for scan in self._scans:
-            if scan.stamp > latest:
-                latest = scan.stamp
-                yield scan
-            else:
-                self.skipped += 1
+def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
+    """The scans whose stamps increase; no trajectory could hold the others."""
+    latest = -np.inf
+    for scan in scans:
+        if scan.stamp > latest:
+            latest = scan.stamp
+            yield scan
 
 
 def _process(
     pipeline: Pipeline,
-    scans: InOrder,
+    scans: Iterable[Scan],
     recording: Recording,
     log: ScanLog,
     viewer: Viewer,

@@ -84,7 +84,7 @@ def summarise(log: ScanLog, total_ms: list[float], map_points: int, skipped: int
         log: its scans.
         total_ms: wall time of each scan, from the one before finished to this one finished.
         map_points: points of the written map.
-        skipped: scans left out because their stamp was not after the one before.
+        skipped: scans that were asked for and did not come, or came with a stamp not after the one before.
     """
     trajectory = log.trajectory
     stages = {"total": total_ms} | dict(zip(STAGES, np.array(log.stage_ms).T, strict=True))
@@ -121,7 +121,7 @@ def _lost_stretches(log: ScanLog) -> tuple[LostStretch, ...]:
 def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
     warnings = list(log.warnings)
     if skipped:
-        warnings.append(f"{skipped} scans were left out: their stamps are not after the scan before")
+        warnings.append(f"{skipped} scans were left out: missing, or with stamps not after the scan before")
     if log.points_dropped:
         share = log.points_dropped / max(1, len(log))
         warnings.append(

@@ -4,6 +4,7 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
 from lidarslam.pipeline import ScanResult
-from lidarslam.run import InOrder, RunRequest, execute
+from lidarslam.run import RunRequest, execute, in_order
 
 INDOOR = ["odometry.kiss_icp.voxel_size_m=0.2", "odometry.kiss_icp.max_range_m=30", "global_map.voxel_size_m=0.1"]
 
@@ -125,11 +126,24 @@ def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -
     assert any("18000 invalid points" in warning for warning in summary["warnings"])
 
 
-def test_scans_that_go_back_in_time_are_left_out_and_counted() -> None:
+def test_scans_that_go_back_in_time_are_left_out() -> None:
     scans = [Scan(np.ones((1, 3)), stamp) for stamp in (0.0, 0.1, 0.1, 0.05, 0.2)]
-    kept = InOrder(scans)
-    assert [scan.stamp for scan in kept] == [0.0, 0.1, 0.2]
-    assert kept.skipped == 2
+    assert [scan.stamp for scan in in_order(scans)] == [0.0, 0.1, 0.2]
+
+
+def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lidarslam.datasets.scan_folder import ScanFolderRecording
+
+    read = ScanFolderRecording.scans
+
+    def stuttering(self: Any, *chosen: Any) -> Any:
+        for index, scan in enumerate(read(self, *chosen)):
+            yield replace(scan, stamp=scan.stamp - 0.2) if index in (4, 5) else scan
+
+    monkeypatch.setattr(ScanFolderRecording, "scans", stuttering)
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR), stop=9), quiet)
+    assert outcome.summary.scans == 7
+    assert any(warning.startswith("2 scans were left out") for warning in outcome.summary.warnings)
 
 
 def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> None:
