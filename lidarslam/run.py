@@ -102,7 +102,8 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
             raise InputError(f"{request.source}: no scan could be used")
         metrics = _write_trajectories(directory, recording, log)
         map_points = _write_map(directory, pipeline.global_map, request.config.global_map, request.pcd)
-    summary = summarise(log, total_ms, map_points, len(chosen) - len(log))
+    voxel_size_m = None if pipeline.global_map is None else pipeline.global_map.voxel_size_m
+    summary = summarise(log, total_ms, map_points, voxel_size_m, len(chosen) - len(log))
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics)
 

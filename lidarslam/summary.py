@@ -51,6 +51,7 @@ class RunSummary:
     degraded_scans: int
     loop_closures: int
     map_points: int
+    map_voxel_size_m: float | None
     warnings: tuple[str, ...]
 
     @property
@@ -73,17 +74,20 @@ class RunSummary:
             "degraded_scans": self.degraded_scans,
             "loop_closures": self.loop_closures,
             "map_points": self.map_points,
+            "map_voxel_size_m": self.map_voxel_size_m,
             "warnings": list(self.warnings),
         }
 
 
-def summarise(log: ScanLog, total_ms: list[float], map_points: int, skipped: int) -> RunSummary:
+def summarise(
+    log: ScanLog, total_ms: list[float], map_points: int, map_voxel_size_m: float | None, skipped: int
+) -> RunSummary:
     """Sum a run up.
 
     Args:
         log: its scans.
         total_ms: wall time of each scan, from the one before finished to this one finished.
-        map_points: points of the written map.
+        map_points, map_voxel_size_m: of the written map.
         skipped: scans that were asked for and did not come, or came with a stamp not after the one before.
     """
     trajectory = log.trajectory
@@ -104,6 +108,7 @@ def summarise(log: ScanLog, total_ms: list[float], map_points: int, skipped: int
         degraded_scans=log.statuses.count(Status.DEGRADED),
         loop_closures=0,
         map_points=map_points,
+        map_voxel_size_m=map_voxel_size_m,
         warnings=_warnings(log, skipped),
     )
 

@@ -22,7 +22,10 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
     total = summary.ms_per_scan["total"]
     yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
-    yield f"map of {summary.map_points:,} points"
+    if summary.map_voxel_size_m is None:
+        yield "no map: no scan could be believed"
+    else:
+        yield f"map of {summary.map_points:,} points, one in every voxel of {100.0 * summary.map_voxel_size_m:.0f} cm"
     if outcome.metrics is not None:
         yield from _accuracy(outcome)
     for warning in summary.warnings:

@@ -70,6 +70,7 @@ def test_a_run_writes_what_the_contract_names(
     assert summary["duration_s"] == pytest.approx(1.9)
     assert summary["length_m"] == pytest.approx(room_truth.length_m, rel=0.02)
     assert summary["map_points"] == len(cloud.points)
+    assert summary["map_voxel_size_m"] == 0.1
     assert set(summary["ms_per_scan"]) == {"total", "read", "odometry", "deskew", "check", "map"}
     assert summary["ms_per_scan"]["total"]["p95"] >= summary["ms_per_scan"]["total"]["median"] > 0.0
     assert summary["peak_rss_mb"] > 50.0
