@@ -185,6 +185,9 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     with show_progress(source.name) as progress:
         outcome = execute(RunRequest(source, out, config, **options), progress)
     click.echo(format_outcome(out, outcome))
+    if outcome.stopped is not None:
+        click.echo(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", err=True)
+        ctx.exit(EXIT_MENDABLE)
     if outcome.summary.lost_scans:
         ctx.exit(EXIT_LOST)
 

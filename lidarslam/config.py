@@ -13,11 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.run_directory import RUN_SECTION
 from mapping.config import GlobalMapConfig
 from odometry.config import OdometryConfig
-
-# A run's config.yaml holds this section too: what was run, not how. It is left alone when the file is loaded.
-RUN_SECTION = "run"
 
 
 class ViewerConfig(BaseModel):

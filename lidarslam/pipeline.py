@@ -62,15 +62,13 @@ class _Estimated:
     scan: Scan
     motion: Motion
     T_odom_lidar: FloatArray
-    interval_s: float  # since the scan before; 0 for the first
+    interval_s: float | None  # that the motion took; None when nothing was measured
     stage_ms: dict[str, float]
 
     @property
     def velocity(self) -> FloatArray | None:
         """(6,) between the previous stamp and this one; None when it was not measured."""
-        if self.interval_s <= 0.0 or self.motion.failure is not None:
-            return None
-        return body_velocity(self.motion.T_prev_curr, self.interval_s)
+        return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +106,17 @@ class Pipeline:
 
     def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Estimated]:
         """Read and estimate scan after scan."""
-        T_odom_lidar, previous_stamp = np.eye(4), None
+        T_odom_lidar = np.eye(4)
+        measured_stamp: float | None = None  # of the scan before, unless its motion was only predicted
         started = time.perf_counter()
         for scan in scans:
             read = time.perf_counter()
             motion = self._odometry.estimate(scan)
             stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
-            interval_s = 0.0 if previous_stamp is None else scan.stamp - previous_stamp
-            T_odom_lidar, previous_stamp = T_odom_lidar @ motion.T_prev_curr, scan.stamp
+            measured = motion.failure is None
+            interval_s = scan.stamp - measured_stamp if measured and measured_stamp is not None else None
+            measured_stamp = scan.stamp if measured else None
+            T_odom_lidar = T_odom_lidar @ motion.T_prev_curr
             yield _Estimated(scan, motion, T_odom_lidar, interval_s, stage_ms)
             started = time.perf_counter()
 
@@ -123,15 +124,16 @@ class Pipeline:
         """Everything that follows from a motion: compensate the sweep, check the motion, add to the map."""
         scan, motion = estimated.scan, estimated.motion
         started = time.perf_counter()
+        before, after = estimated.velocity, following.velocity if following else None
         thinned = self._thin(scan)
-        points = _compensate(thinned, estimated.velocity, following.velocity if following else None)
+        points = _compensate(thinned, before, after)
         compensated = time.perf_counter()
-        fit = self._check.check(points, motion.T_prev_curr)
+        fit = self._check.check(_compensate(self._check.sample(scan), before, after), motion.T_prev_curr)
         checked = time.perf_counter()
         status, message = _judge(motion, fit)
         self._add_waiting(status)
         if status is not Status.LOST:  # a pose that is not believed must not draw walls
-            self._waiting = _Compensated(thinned, estimated.velocity, points, estimated.T_odom_lidar)
+            self._waiting = _Compensated(thinned, before, points, estimated.T_odom_lidar)
         followed_ms = {
             "deskew": _ms(started, compensated),
             "check": _ms(compensated, checked),

@@ -1,5 +1,6 @@
 """Runs in Rerun; the only file that imports it."""
 
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.finished_run import FinishedRun
 from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
+
+_log = logging.getLogger(__name__)
 
 _SCAN_TIMELINE = "scan"
 _TIME_TIMELINE = "time"
@@ -94,9 +97,12 @@ class RerunViewer:
         self._recording.log("world/map", cloud)
 
     def close(self) -> None:
-        """Wait until everything is written."""
-        self._recording.flush()
-        self._recording.disconnect()
+        """Wait until everything is written; a window that went away does not fail the run."""
+        try:
+            self._recording.flush()
+            self._recording.disconnect()
+        except RuntimeError as error:
+            _log.warning("Rerun: %s", str(error).strip().splitlines()[0])
 
     def _log_static(self) -> None:
         self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

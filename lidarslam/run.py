@@ -2,8 +2,8 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -13,8 +13,8 @@ import numpy as np
 from evaluation.trajectory_metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam import run_directory as files
 from lidarslam.config import Config, dump_yaml
-from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.geometry import inverse
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, format_tum, read_tum
@@ -65,10 +65,17 @@ class RunRequest:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What a run came to; `metrics` when the recording came with ground truth for it."""
+    """What a run came to.
+
+    Attributes:
+        summary: the run in numbers.
+        metrics: its errors, when the recording came with ground truth for it.
+        stopped: why it ended before its last scan, None when it did not.
+    """
 
     summary: RunSummary
     metrics: TrajectoryMetrics | None
+    stopped: str | None = None
 
 
 Progress = Callable[[int, int, ScanResult], None]
@@ -78,9 +85,13 @@ Progress = Callable[[int, int, ScanResult], None]
 def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     """Run, and write the run directory.
 
+    A recording that turns out damaged on the way, or an interruption, ends the run with what there is.
+
     Raises:
         LidarSlamError: the source, the configuration or the output directory is not usable.
     """
+    if request.out.resolve() == request.source.resolve():
+        raise OutputError(f"{request.out}: is the recording itself; name another directory for the run")
     recording = open_recording(request.source, request.config.reader)
     chosen = range(len(recording))[request.start : request.stop : request.step]
     if not chosen:
@@ -90,22 +101,24 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     with ExitStack() as stack:
         odometry = _make_odometry(request)
         stack.callback(odometry.close)
-        directory = RunDirectory.create(request.out, request.overwrite)
-        directory.write_text(files.CONFIG, dump_yaml(request.config, _describe(request)))
+        directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
         log = stack.enter_context(ScanLog.open(directory))
-        viewer = _make_viewer(request, recording, directory)
-        stack.callback(viewer.close)
+        truth = _ground_truth(recording, log)
         pipeline = Pipeline(odometry, ConsistencyCheck(request.config.odometry.consistency), request.config.global_map)
         scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
-        total_ms = _process(pipeline, scans, recording, log, viewer, lambda n, r: progress(n, len(chosen), r))
+        with _viewing(request, recording, directory) as viewer:
+            watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
+            stopped = _process(pipeline, scans, watch)
         if not len(log):
-            raise InputError(f"{request.source}: no scan could be used")
-        metrics = _write_trajectories(directory, recording, log)
+            raise InputError(f"{request.source}: no scan could be used{f': {stopped}' if stopped else ''}")
+        directory.write_text(files.CONFIG, dump_yaml(request.config, _describe(request)))
+        metrics = _write_trajectories(directory, recording.T_cam_lidar, truth, log)
         map_points = _write_map(directory, pipeline.global_map, request.config.global_map, request.pcd)
-    voxel_size_m = None if pipeline.global_map is None else pipeline.global_map.voxel_size_m
-    summary = summarise(log, total_ms, map_points, voxel_size_m, len(chosen) - len(log))
-    directory.write_json(files.SUMMARY, summary.to_json())
-    return RunOutcome(summary, metrics)
+        voxel_size_m = None if pipeline.global_map is None else pipeline.global_map.voxel_size_m
+        skipped = 0 if stopped else len(chosen) - len(log)
+        summary = summarise(log, watch.total_ms, map_points, voxel_size_m, skipped)
+        directory.write_json(files.SUMMARY, summary.to_json())
+    return RunOutcome(summary, metrics, stopped)
 
 
 def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
@@ -117,28 +130,52 @@ def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
             yield scan
 
 
-def _process(
-    pipeline: Pipeline,
-    scans: Iterable[Scan],
-    recording: Recording,
-    log: ScanLog,
-    viewer: Viewer,
-    progress: Callable[[int, ScanResult], None],
-) -> list[float]:
-    """Take every scan through the pipeline; the wall time of each, milliseconds."""
-    total_ms = []
-    finished = time.perf_counter()
-    for index, result in enumerate(pipeline.run(prefetch(scans))):
+@dataclass
+class _Watch:
+    """Everyone who is told of each scan, and the wall time each took, milliseconds."""
+
+    log: ScanLog
+    viewer: Viewer
+    truth: Trajectory | None
+    progress: Callable[[int, ScanResult], None]
+    total_ms: list[float] = field(default_factory=list)
+
+    def see(self, result: ScanResult, global_map: GlobalMap | None) -> None:
+        """One more scan is done."""
+        index = len(self.log)
         if index == 0:
-            _show_reference(viewer, recording.ground_truth, result.stamp)
-        log.add(result)
-        viewer.show_scan(index, result)
-        if viewer.wants_map(index) and pipeline.global_map is not None:
-            viewer.show_map(pipeline.global_map.points())
-        progress(index + 1, result)
-        last, finished = finished, time.perf_counter()
-        total_ms.append(1e3 * (finished - last))
-    return total_ms
+            _show_reference(self.viewer, self.truth, result.stamp)
+        self.log.add(result)
+        self.viewer.show_scan(index, result)
+        if global_map is not None and self.viewer.wants_map(index):
+            self.viewer.show_map(global_map.points())
+        self.progress(index + 1, result)
+
+
+def _process(pipeline: Pipeline, scans: Iterable[Scan], watch: _Watch) -> str | None:
+    """Take every scan through the pipeline; why it ended early, None when it did not."""
+    finished = time.perf_counter()
+    try:
+        for result in pipeline.run(prefetch(scans)):
+            watch.see(result, pipeline.global_map)
+            last, finished = finished, time.perf_counter()
+            watch.total_ms.append(1e3 * (finished - last))
+    except (InputError, KeyboardInterrupt) as error:
+        reason = str(error) or "interrupted"
+        watch.log.warn(f"stopped after {len(watch.log)} scans: {reason}")
+        # A scan may have been logged whose time was not.
+        watch.total_ms.extend([0.0] * (len(watch.log) - len(watch.total_ms)))
+        return reason
+    return None
+
+
+def _ground_truth(recording: Recording, log: ScanLog) -> Trajectory | None:
+    """The recording's truth; a damaged one costs the metrics, not the run."""
+    try:
+        return recording.ground_truth
+    except InputError as error:
+        log.warn(f"no metrics: {error}")
+        return None
 
 
 def _make_odometry(request: RunRequest) -> Odometry:
@@ -148,15 +185,25 @@ def _make_odometry(request: RunRequest) -> Odometry:
             "constant-velocity only predicts; without scan-to-map refinement it would stand still."
             " Choose --odometry kiss-icp, or give a trajectory with --prior"
         )
+    if config.method == "external" and request.prior is None:
+        raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
     return make_odometry(config, None if request.prior is None else read_tum(request.prior))
 
 
-def _make_viewer(request: RunRequest, recording: Recording, directory: RunDirectory) -> Viewer:
+@contextmanager
+def _viewing(request: RunRequest, recording: Recording, directory: RunDirectory) -> Iterator[Viewer]:
+    """The viewer of the run; its recording takes its name in the run directory when all is shown."""
     if request.rerun == "off":
-        return NullViewer()
+        yield NullViewer()
+        return
     from lidarslam.rerun_viewer import RerunViewer
 
-    return RerunViewer(recording.name, request.config.viewer, directory[files.RERUN], request.rerun == "spawn")
+    with directory.replacing(files.RERUN) as path:
+        viewer = RerunViewer(recording.name, request.config.viewer, path, request.rerun == "spawn")
+        try:
+            yield viewer
+        finally:
+            viewer.close()
 
 
 def _describe(request: RunRequest) -> dict[str, Any]:
@@ -180,18 +227,20 @@ def _show_reference(viewer: Viewer, ground_truth: Trajectory | None, first_stamp
     viewer.show_reference(ground_truth.transformed(inverse(T_truth_first)))
 
 
-def _write_trajectories(directory: RunDirectory, recording: Recording, log: ScanLog) -> TrajectoryMetrics | None:
+def _write_trajectories(
+    directory: RunDirectory, T_cam_lidar: FloatArray | None, truth: Trajectory | None, log: ScanLog
+) -> TrajectoryMetrics | None:
     trajectory = log.trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
     poses = trajectory.T_world_lidar
-    if recording.T_cam_lidar is not None:  # the devkit compares camera poses
-        poses = recording.T_cam_lidar @ poses @ inverse(recording.T_cam_lidar)
+    if T_cam_lidar is not None:  # the devkit compares camera poses
+        poses = T_cam_lidar @ poses @ inverse(T_cam_lidar)
     directory.write_text(files.TRAJECTORY_KITTI, format_kitti(poses))
-    if recording.ground_truth is None:
+    if truth is None:
         return None
     try:
-        metrics = evaluate_trajectory(trajectory, recording.ground_truth)
+        metrics = evaluate_trajectory(trajectory, truth)
     except InputError as error:
         log.warn(f"no metrics: {error}")
         return None
@@ -200,10 +249,12 @@ def _write_trajectories(directory: RunDirectory, recording: Recording, log: Scan
 
 
 def _write_map(directory: RunDirectory, global_map: GlobalMap | None, config: GlobalMapConfig, pcd: bool) -> int:
-    """Write the map; how many points it has."""
+    """Write the map, unless it is empty; how many points it has."""
     if global_map is None:
         return 0
     cloud = global_map.cloud(config.normal_neighbours, config.min_hits)
+    if not len(cloud):
+        return 0
     for name in (files.MAP_PLY, files.MAP_PCD) if pcd else (files.MAP_PLY,):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)

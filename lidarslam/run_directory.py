@@ -3,11 +3,15 @@
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
 from lidarslam.core.errors import OutputError
+
+# The section of config.yaml that says what was run, not how; its first.
+RUN_SECTION = "run"
 
 CONFIG = "config.yaml"
 TRAJECTORY_TUM = "trajectory.tum"
@@ -37,39 +41,41 @@ FILES = (
 
 
 class RunDirectory:
-    """The directory of one run; only files named above are ever replaced or removed."""
+    """The directory of one run; only an earlier run's files named above are ever replaced or removed."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, earlier: Iterable[str] = ()) -> None:
         self.path = path
+        self._stale = set(earlier)
 
     @classmethod
-    def create(cls, path: Path, overwrite: bool = False) -> "RunDirectory":
-        """Make the directory, or take over an existing one.
+    @contextlib.contextmanager
+    def create(cls, path: Path, overwrite: bool = False) -> Iterator["RunDirectory"]:
+        """Make the directory, or take over an existing one, for the time of a run.
 
-        An earlier run's files are removed when `overwrite` is given; whatever else lies there stays.
+        An earlier run stays as it is until the new one's files take their places; what they leave over is removed when
+        the block ends well. A directory made here is removed again when nothing was written to it.
 
         Raises:
-            OutputError: the directory holds a run already, or cannot be written.
+            OutputError: the directory holds a run and `overwrite` is not given, holds files with a run's names that
+                are no run's, or cannot be written.
         """
+        is_new = not path.exists()
+        directory = cls(path, _earlier_run(path, overwrite))
         try:
             path.mkdir(parents=True, exist_ok=True)
-            earlier = [name for name in FILES if (path / name).exists()]
-            if earlier and not overwrite:
-                raise OutputError(
-                    f"{path}: holds a run already ({', '.join(earlier[:3])}{', ...' if len(earlier) > 3 else ''});"
-                    " name another directory, or replace it with --overwrite"
-                )
-            for name in earlier:
-                (path / name).unlink()
-            directory = cls(path)
-            with directory.replacing(SUMMARY) as probe:
-                probe.touch()
-            (path / SUMMARY).unlink()
+            with tempfile.NamedTemporaryFile(dir=path, prefix=".partial-"):
+                pass
         except (FileExistsError, NotADirectoryError) as error:
             raise OutputError(f"{path}: a file is in the way; name another directory") from error
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-        return directory
+        try:
+            yield directory
+            for name in directory._stale:
+                (path / name).unlink(missing_ok=True)
+        finally:
+            if is_new and not any(path.iterdir()):
+                path.rmdir()
 
     def __getitem__(self, name: str) -> Path:
         return self.path / name
@@ -81,9 +87,11 @@ class RunDirectory:
         partial = final.with_name(f".partial-{os.getpid()}-{name}")
         try:
             yield partial
-            partial.replace(final)
-        except OSError as error:
-            raise OutputError(f"{final}: cannot be written ({error.strerror or error})") from error
+            try:
+                partial.replace(final)
+            except OSError as error:
+                raise OutputError(f"{final}: cannot be written ({error.strerror or error})") from error
+            self._stale.discard(name)
         finally:
             partial.unlink(missing_ok=True)
 
@@ -101,3 +109,26 @@ class RunDirectory:
     def write_json(self, name: str, value: dict[str, Any]) -> None:
         """Write one JSON file; a number that is not finite is a mistake of ours and refused."""
         self.write_text(name, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def _earlier_run(path: Path, overwrite: bool) -> list[str]:
+    """The files of a run that lies in the directory already, if it may be replaced."""
+    present = [name for name in FILES if (path / name).exists()]
+    if not present:
+        return []
+    listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
+    if not _is_run(path):
+        raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
+    if not overwrite:
+        raise OutputError(
+            f"{path}: holds a run already ({listed}); name another directory, or replace it with --overwrite"
+        )
+    return present
+
+
+def _is_run(path: Path) -> bool:
+    """Whether a run's own description lies there: its first section says what was run."""
+    try:
+        return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{RUN_SECTION}:")
+    except (OSError, UnicodeDecodeError):
+        return False

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from odometry.config import ConsistencyConfig
@@ -48,6 +49,11 @@ class ConsistencyCheck:
         self._config = config
         self._held: FloatArray | None = None
         self._T_held_prev = np.eye(4)
+
+    @staticmethod
+    def sample(scan: Scan) -> Scan:
+        """The points of a scan that `check` looks at; only they need to be motion compensated."""
+        return scan.select(np.arange(0, len(scan), max(1, len(scan) // _MAX_POINTS)))
 
     def check(self, points: FloatArray, T_prev_curr: FloatArray) -> Consistency:
         """Hold a scan's motion-compensated points (N, 3) against the previous call's.
@@ -109,7 +115,6 @@ def _worst_share(inlier: NDArray[np.bool_], facing: NDArray[np.intp]) -> float:
 
 def _thin_evenly(points: FloatArray) -> FloatArray:
     """One point a cell, the cells sized by the scene."""
-    points = _every_nth(points, _MAX_POINTS)
     if not len(points):
         return points
     cell = _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1)))

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from io import FileIO
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -54,6 +55,7 @@ class _Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             bufsize=0,
+            cwd=Path(__file__).resolve().parents[1],  # a folder called odometry where the user stands must not win
         )
         _widen(cast(FileIO, self._process.stdin))
         if cast(FileIO, self._process.stdout).read(1) != READY:

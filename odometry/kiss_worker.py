@@ -9,6 +9,7 @@ stamps (N,) float64. Reply: pose (16,) float64, row by row, and the number of po
 
 import json
 import os
+import signal
 import struct
 import sys
 from io import BufferedReader
@@ -69,6 +70,7 @@ def serve(odometry: Any, requests: BufferedReader, replies: BinaryIO) -> None:
 
 def main() -> None:
     """Serve on the standard streams; whatever the library prints goes to standard error."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever is interrupted is the parent, and ends this one
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     odometry = build(json.loads(sys.argv[1]))

@@ -13,6 +13,7 @@ import open3d as o3d
 import pytest
 
 from lidarslam.config import load_config
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
@@ -145,6 +146,58 @@ def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch
     outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR), stop=9), quiet)
     assert outcome.summary.scans == 7
     assert any(warning.startswith("2 scans were left out") for warning in outcome.summary.warnings)
+
+
+def test_a_damaged_scan_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:
+    (recording / "000012.npy").write_bytes(b"not an array")
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR)), quiet)
+    assert outcome.stopped is not None
+    assert "000012.npy" in outcome.stopped
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    # The two scans before the damaged one were still at work.
+    assert summary["scans"] >= 10
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
+    assert (tmp_path / "run" / "map.ply").exists()
+    assert any("stopped after" in warning for warning in summary["warnings"])
+
+
+def test_an_interruption_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:
+    def interrupt(number: int, total: int, result: ScanResult) -> None:
+        if number == 7:
+            raise KeyboardInterrupt
+
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR)), interrupt)
+    assert outcome.stopped == "interrupted"
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 7
+
+
+def test_a_damaged_truth_costs_the_metrics_not_the_run(recording: Path, tmp_path: Path) -> None:
+    (recording / "ground_truth.tum").write_text("1 2 3\n")
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR), stop=4), quiet)
+    assert outcome.metrics is None
+    assert any("ground_truth.tum:1" in warning for warning in outcome.summary.warnings)
+    assert not (tmp_path / "run" / "metrics.json").exists()
+
+
+def test_a_recording_is_not_written_into(recording: Path) -> None:
+    before = sorted(recording.iterdir())
+    with pytest.raises(OutputError, match="is the recording itself"):
+        execute(RunRequest(recording, recording, load_config(None, INDOOR), overwrite=True), quiet)
+    assert sorted(recording.iterdir()) == before
+
+
+def test_a_run_that_cannot_start_leaves_nothing_behind(recording: Path, tmp_path: Path) -> None:
+    for scan in recording.glob("*.npy"):
+        scan.write_bytes(b"not an array")
+    with pytest.raises(InputError, match=r"\.npy"):
+        execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR)), quiet)
+    assert not (tmp_path / "run").exists()
+
+
+def test_points_beyond_the_maps_range_still_tell_whether_it_is_lost(recording: Path, tmp_path: Path) -> None:
+    config = load_config(None, [*INDOOR, "global_map.max_range_m=1.0"])
+    outcome = execute(RunRequest(recording, tmp_path / "run", config), quiet)
+    assert outcome.summary.lost_scans == 0
 
 
 def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> None:

@@ -6,57 +6,91 @@ from pathlib import Path
 import pytest
 
 from lidarslam.core.errors import OutputError
-from lidarslam.run_directory import CONFIG, METRICS, SUMMARY, RunDirectory
+from lidarslam.run_directory import CONFIG, MAP_PLY, METRICS, SUMMARY, RunDirectory
 
 
-def test_a_new_directory_is_made_with_its_parents_and_is_empty(tmp_path: Path) -> None:
-    directory = RunDirectory.create(tmp_path / "lauf für morgen" / "1")
-    assert list(directory.path.iterdir()) == []
+def names(path: Path) -> list[str]:
+    return sorted(entry.name for entry in path.iterdir())
 
 
-def test_an_earlier_run_is_not_touched_unless_asked(tmp_path: Path) -> None:
-    RunDirectory.create(tmp_path).write_text(CONFIG, "old")
-    with pytest.raises(OutputError, match="--overwrite"):
-        RunDirectory.create(tmp_path)
-    assert (tmp_path / CONFIG).read_text() == "old"
+@pytest.fixture
+def earlier(tmp_path: Path) -> Path:
+    """A directory with an earlier run and a file of the user's."""
+    with RunDirectory.create(tmp_path / "run") as directory:
+        directory.write_text(CONFIG, "run:\n  version: 0\n")
+        directory.write_json(METRICS, {"ate": 1.0})
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    return tmp_path / "run"
 
 
-def test_overwriting_removes_the_earlier_run_and_nothing_else(tmp_path: Path) -> None:
-    earlier = RunDirectory.create(tmp_path)
-    earlier.write_text(CONFIG, "old")
-    earlier.write_json(METRICS, {"ate": 1.0})
-    (tmp_path / "notes.txt").write_text("mine")
-    (tmp_path / "sub").mkdir()
-    RunDirectory.create(tmp_path, overwrite=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "sub"]
+def test_a_new_directory_is_made_with_its_parents(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "lauf für morgen" / "1") as directory:
+        assert names(directory.path) == []
+        directory.write_text(CONFIG, "run:\n")
+    assert names(tmp_path / "lauf für morgen" / "1") == [CONFIG]
+
+
+def test_a_new_directory_is_gone_when_nothing_came_of_the_run(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), RunDirectory.create(tmp_path / "run"):
+        raise RuntimeError
+    assert names(tmp_path) == []
+
+
+def test_an_earlier_run_is_not_touched_unless_asked(earlier: Path) -> None:
+    with pytest.raises(OutputError, match="--overwrite"), RunDirectory.create(earlier):
+        pass
+    assert names(earlier) == [CONFIG, METRICS, "notes.txt"]
+
+
+def test_overwriting_replaces_the_earlier_run_and_nothing_else(earlier: Path) -> None:
+    with RunDirectory.create(earlier, overwrite=True) as directory:
+        assert names(earlier) == [CONFIG, METRICS, "notes.txt"], "it stays until the new files are there"
+        directory.write_text(CONFIG, "run:\n  version: 1\n")
+    assert names(earlier) == [CONFIG, "notes.txt"], "no metrics of the run before"
+    assert "version: 1" in (earlier / CONFIG).read_text()
+
+
+def test_an_earlier_run_survives_a_failed_attempt_to_replace_it(earlier: Path) -> None:
+    with pytest.raises(RuntimeError), RunDirectory.create(earlier, overwrite=True):
+        raise RuntimeError
+    assert names(earlier) == [CONFIG, METRICS, "notes.txt"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_files_of_a_runs_names_that_are_no_runs_are_never_touched(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / MAP_PLY).write_text("somebody's map")
+    (tmp_path / CONFIG).write_text("somebody: config\n")
+    with pytest.raises(OutputError, match="not those of a run"), RunDirectory.create(tmp_path, overwrite):
+        pass
+    assert (tmp_path / MAP_PLY).read_text() == "somebody's map"
 
 
 def test_a_directory_with_foreign_files_only_is_used_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    RunDirectory.create(tmp_path).write_text(CONFIG, "new")
+    with RunDirectory.create(tmp_path) as directory:
+        directory.write_text(CONFIG, "run:\n")
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 def test_a_file_in_the_way_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="a file is in the way"):
-        RunDirectory.create(tmp_path / "file")
+    with pytest.raises(OutputError, match="a file is in the way"), RunDirectory.create(tmp_path / "file"):
+        pass
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path: Path) -> None:
-    directory = RunDirectory.create(tmp_path)
-    directory.write_text(CONFIG, "old")
+def test_a_write_that_fails_leaves_the_old_file_and_no_rest(earlier: Path) -> None:
+    directory = RunDirectory(earlier)
     with pytest.raises(RuntimeError), directory.open_text(CONFIG) as out:
         out.write("half")
         raise RuntimeError
-    assert [path.name for path in tmp_path.iterdir()] == [CONFIG]
-    assert (tmp_path / CONFIG).read_text() == "old"
+    assert names(earlier) == [CONFIG, METRICS, "notes.txt"]
+    assert (earlier / CONFIG).read_text() == "run:\n  version: 0\n"
 
 
 def test_numbers_that_are_none_are_refused(tmp_path: Path) -> None:
-    directory = RunDirectory.create(tmp_path)
+    directory = RunDirectory(tmp_path)
     with pytest.raises(ValueError, match="JSON compliant"):
         directory.write_json(SUMMARY, {"x": float("nan")})
-    assert list(tmp_path.iterdir()) == []
+    assert names(tmp_path) == []
     directory.write_json(SUMMARY, {"x": None})
     assert json.loads((tmp_path / SUMMARY).read_text()) == {"x": None}

@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -125,3 +126,14 @@ def test_closing_ends_the_process(room_scans: list[Scan]) -> None:
     process = odometry._worker._process
     odometry.close()
     assert process.returncode == 0
+
+
+def test_a_folder_that_looks_like_ours_does_not_get_in_the_way(
+    room_scans: list[Scan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "odometry").mkdir()
+    (tmp_path / "odometry" / "__init__.py").write_text("raise SystemExit(9)")
+    monkeypatch.chdir(tmp_path)
+    odometry = KissOdometry(INDOOR)
+    assert odometry.estimate(room_scans[0]).failure is None
+    odometry.close()
