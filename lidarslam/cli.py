@@ -1,6 +1,8 @@
 """The command line: every command parses, imports what it needs, calls one function, and says what came of it."""
 
+import errno
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterable
@@ -11,6 +13,8 @@ import click
 from click.shell_completion import CompletionItem
 
 from lidarslam.core.errors import LidarSlamError
+
+logger = logging.getLogger(__name__)
 
 EXIT_MENDABLE = 1
 EXIT_LOST = 3
@@ -38,6 +42,22 @@ class _Group(click.Group):
         except LidarSlamError as error:
             click.echo(f"lidarslam: {error}", err=True)
             ctx.exit(EXIT_MENDABLE)
+        except OSError as error:
+            if error.errno == errno.EPIPE:  # a reader that has had enough, such as head; click ends quietly
+                raise
+            _drop_unwritable_output()
+            place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+            click.echo(f"lidarslam: {place}{error.strerror or error}", err=True)
+            logger.info("where it came from", exc_info=True)
+            ctx.exit(EXIT_MENDABLE)
+
+
+def _drop_unwritable_output() -> None:
+    """Spare Python from trying, and complaining, once more at its end when standard output is a full disk."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
 
 
 @click.group(
@@ -51,7 +71,16 @@ def main(verbose: bool) -> None:
     logging.basicConfig(level=level, format="lidarslam: %(message)s", stream=sys.stderr)
 
 
-_PATH = click.Path(path_type=Path)
+class _Path(click.Path):
+    """A path that is not empty, which would mean the folder one stands in."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("the path is empty; name a file or a folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+_PATH = _Path(path_type=Path)
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 _SOURCE = click.argument("source", type=_PATH)
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -69,11 +98,6 @@ def _options(*decorators: _Decorator) -> _Decorator:
 _config_options = _options(
     click.option("--config", "config_file", type=_FILE, help="YAML file with whatever differs from the defaults."),
     click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One value; may be repeated."),
-)
-_reader_options = _options(
-    click.option("--reader", metavar="NAME", help="Reader to use instead of the one that recognises the source."),
-    click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag that holds several."),
-    click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
 )
 
 
@@ -95,12 +119,38 @@ class _Registered(click.ParamType):  # type: ignore[type-arg]  # not generic bef
         return click.Choice(list(self._names())).shell_complete(ctx, param, incomplete)
 
 
+def _readers() -> Iterable[str]:
+    from lidarslam.datasets.registry import READERS
+
+    return READERS
+
+
+_reader_options = _options(
+    click.option(
+        "--reader", type=_Registered(_readers), help="Reader to use instead of the one that recognises the source."
+    ),
+    click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag that holds several."),
+    click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
+)
+
+
 def _resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
     """The configuration, with the options that have a name of their own applied last."""
     from lidarslam.config import load_config
 
     named = [f"reader.{key}={_quoted(value)}" for key, value in reader.items() if value is not None]
     return load_config(config_file, [*settings, *named])
+
+
+def _warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
+    """Say which of the reader's options the source has no use for."""
+    from lidarslam.datasets.registry import choose_reader
+
+    chosen = choose_reader(source, reader)
+    if topic is not None and chosen != "rosbag":
+        click.echo(f"lidarslam: --topic {topic} is ignored; {source} is no bag ({chosen})", err=True)
+    if sequence is not None and chosen != "kitti-odometry":
+        click.echo(f"lidarslam: --sequence {sequence} is ignored; {source} is no KITTI odometry ({chosen})", err=True)
 
 
 def _quoted(value: str) -> str:
@@ -131,11 +181,11 @@ def info(
     settings: tuple[str, ...],
 ) -> None:
     """Say what a recording holds, and what was inferred about it."""
-    from lidarslam.datasets.registry import open_recording
-    from lidarslam.info import format_info
+    from lidarslam.info import describe_source
 
     config = _resolve(config_file, settings, name=reader, topic=topic, sequence=sequence)
-    click.echo(format_info(source, open_recording(source, config.reader).describe()))
+    _warn_of_ignored(source, config.reader.name, topic, sequence)
+    click.echo(describe_source(source, config.reader))
 
 
 @main.command(
@@ -182,6 +232,7 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     _refuse_missing_parts(options.pop("mapping"), options.pop("pose_graph"))
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     config = _resolve(options.pop("config_file"), settings, **reader)
+    _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
     with show_progress(source.name) as progress:
         outcome = execute(RunRequest(source, out, config, **options), progress)
     click.echo(format_outcome(out, outcome))
@@ -303,6 +354,8 @@ def view(
     """Look at finished runs in Rerun: trajectories, maps, and where tracking was lost."""
     from lidarslam.finished_run import load_run
 
+    if sum([web, save is not None, picture is not None]) > 1:
+        raise click.UsageError("--web, --save and --picture exclude one another; choose one")
     if picture is not None:
         _draw_map(runs, picture)
         return
@@ -310,10 +363,11 @@ def view(
     finished = [load_run(path) for path in runs]
     from lidarslam.rerun_viewer import show_runs
 
-    show_runs(finished, config.viewer, save, web)
+    address = show_runs(finished, config.viewer, save, web)
     if save is not None:
         click.echo(f"written to {save}")
     elif web:
+        click.echo(address)
         click.echo("serving until you press Ctrl-C")
         signal.pause()
 

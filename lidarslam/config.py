@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
@@ -17,11 +18,14 @@ from lidarslam.run_directory import RUN_SECTION
 from mapping.config import GlobalMapConfig
 from odometry.config import OdometryConfig
 
+# PyYAML lets Python's own errors through for what has the form or the tag of a date or a number: 2021-13-45.
+_UNREADABLE_VALUE = (ValueError, AttributeError)
+
 
 class ViewerConfig(BaseModel):
     """What the Rerun recording holds."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scan_points: int = Field(20_000, ge=1, description="points of each scan that are shown")
     map_points: int = Field(200_000, ge=1, description="points of the map around the sensor that are shown")
@@ -53,7 +57,7 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(_explain(error, path)) from None
+        raise ConfigError(_explain(error, _origin(path, settings))) from None
 
 
 def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:
@@ -70,6 +74,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: not YAML: {reason}") from error
+    except _UNREADABLE_VALUE as error:
+        raise ConfigError(f"{path}: a value looks like a date or a number but is none: {error}") from error
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -87,6 +93,8 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         value = text
+    except _UNREADABLE_VALUE as error:
+        raise ConfigError(f"--set {setting!r}: the value looks like a date or a number but is none: {error}") from error
     for key in keys[:-1]:
         branch = tree.setdefault(key, {})
         if not isinstance(branch, dict):
@@ -95,17 +103,27 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
     tree[keys[-1]] = value
 
 
-def _explain(error: ValidationError, path: Path | None) -> str:
-    """One line a fault: the key, what is wrong, and for a misspelt key the likely one."""
-    origin = f"{path} or --set" if path else "--set"
-    faults = []
-    for fault in error.errors():
-        location = [str(part) for part in fault["loc"]]
-        if fault["type"] == "extra_forbidden":
-            faults.append(f"there is no {'.'.join(location)}{_suggest(location)}")
-        else:
-            faults.append(f"{'.'.join(location)}={fault['input']!r}: {fault['msg'].lower()}")
-    return f"configuration ({origin}): " + "; ".join(faults)
+def _origin(path: Path | None, settings: Sequence[str]) -> str:
+    """Where a fault can have come from: the file, the settings, or either."""
+    return " or ".join(([str(path)] if path else []) + (["--set"] if settings else []))
+
+
+def _explain(error: ValidationError, origin: str) -> str:
+    """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
+    return f"configuration ({origin}): " + "; ".join(_explain_fault(fault) for fault in error.errors())
+
+
+def _explain_fault(fault: ErrorDetails) -> str:
+    location = [str(part) for part in fault["loc"]]
+    key = ".".join(location)
+    if fault["type"] == "extra_forbidden":
+        return f"there is no {key}{_suggest(location)}"
+    if fault["type"] == "model_type":
+        return f"{key}={fault['input']!r}: expected a section"
+    if fault["type"] == "value_error":
+        # Keys that contradict each other: the input would be their whole section, the validator names the two.
+        return f"{key}: {fault['ctx']['error']}"
+    return f"{key}={fault['input']!r}: {fault['msg'].lower()}"
 
 
 def _suggest(location: Sequence[str]) -> str:

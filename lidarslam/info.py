@@ -1,23 +1,43 @@
 """What `lidarslam info` prints."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
-from lidarslam.datasets.recording import RecordingInfo
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.recording import RecordingInfo, SeveralTopicsError, Topic
+from lidarslam.datasets.registry import open_recording
 
 # Later than this a stamp is a date; below it counts from some start.
 _EPOCH_FROM_S = 5e8
 
 
+def describe_source(source: Path, config: ReaderConfig) -> str:
+    """What a recording holds; of a bag whose topic is still to be chosen, the topics alone.
+
+    Raises:
+        InputError: the source cannot be read.
+    """
+    try:
+        return format_info(source, open_recording(source, config).describe())
+    except SeveralTopicsError as error:
+        names = ", ".join(topic.name for topic in error.clouds)
+        rows = [
+            ("source", str(source)),
+            ("point clouds", names),
+            ("note", f"Choose one of them with --topic, such as --topic {error.clouds[0].name}"),
+        ]
+        return "\n".join([*_aligned(rows), *_topic_lines(error.topics, chosen=None)])
+
+
 def format_info(source: Path, info: RecordingInfo) -> str:
     """A recording's description as aligned lines of text."""
-    rows = list(_rows(source, info))
+    return "\n".join([*_aligned(list(_rows(source, info))), *_topic_lines(info.topics, info.topic)])
+
+
+def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
     width = max(len(name) for name, _ in rows) + 2
-    lines = [f"{name:<{width}}{text}" for name, text in rows]
-    if info.topics:
-        lines += ["", "topics", *_topic_lines(info)]
-    return "\n".join(lines)
+    return [f"{name:<{width}}{text}" for name, text in rows]
 
 
 def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
@@ -54,9 +74,12 @@ def _point_time(info: RecordingInfo) -> str:
     return f"{time.source} in {time.unit}, {time.reference}; {span}"
 
 
-def _topic_lines(info: RecordingInfo) -> Iterator[str]:
-    width = max(len(topic.name) for topic in info.topics)
-    types = max(len(topic.message_type) for topic in info.topics)
-    for topic in info.topics:
-        mark = "*" if topic.name == info.topic else " "
+def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:
+    if not topics:
+        return
+    yield from ("", "topics")
+    width = max(len(topic.name) for topic in topics)
+    types = max(len(topic.message_type) for topic in topics)
+    for topic in topics:
+        mark = "*" if topic.name == chosen else " "
         yield f"  {mark} {topic.name:<{width}}  {topic.message_type:<{types}}  {topic.messages:>8,}"

@@ -19,6 +19,7 @@ _FRAMED_PERCENT = (0.2, 99.8)
 _FILLED = 0.92
 # Eye-dome lighting (Boucheny, 2009): how strongly a pixel behind its neighbours is darkened.
 _EDGE_STRENGTH = 12.0
+_PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -79,18 +80,20 @@ def draw(
 
 
 def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture (height, width, 3) as .png or .jpg.
+    """Write a picture (height, width, 3) as .png, .jpg or .jpeg.
 
     Raises:
         OutputError: it could not be written.
     """
     import open3d as o3d
 
+    if path.suffix.lower() not in _PICTURE_SUFFIXES:
+        raise OutputError(f"{path}: the picture could not be written; it must end in .png or .jpg")
     image = o3d.geometry.Image(np.ascontiguousarray(picture).data)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         written = o3d.io.write_image(path, image)
     if not written:
-        raise OutputError(f"{path}: the picture could not be written; it must end in .png or .jpg")
+        raise OutputError(f"{path}: cannot be written; does the folder exist?")
 
 
 def _to_camera(points: FloatArray, camera: Camera) -> FloatArray:

@@ -6,12 +6,14 @@ one scan later, when the motion after the scan is known as well.
 """
 
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
@@ -21,6 +23,9 @@ from mapping.deskew import body_velocity, deskew
 from mapping.global_map import GlobalMap, voxel_size_for
 from odometry.consistency import Consistency, ConsistencyCheck
 from odometry.interface import Motion, Odometry
+
+# How many scans the second thread may lag behind: the map now and then takes as long as several scans to tidy up.
+_MAX_BEHIND = 8
 
 STAGES = ("read", "odometry", "deskew", "check", "map")
 
@@ -93,16 +98,30 @@ class Pipeline:
         self.global_map: GlobalMap | None = None
 
     def run(self, scans: Iterable[Scan]) -> Iterator[ScanResult]:
-        """Process the scans in order; each result comes while a later scan's odometry is at work."""
-        job: Future[ScanResult] | None = None
+        """Process the scans in order; each result comes while later scans' odometry is at work.
+
+        An error of the scans' reader is raised after the results of the scans before it.
+        """
+        jobs: deque[Future[ScanResult]] = deque()
+        error: Exception | None = None
         with ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
-            for estimated, following in _with_next(self._estimate(scans)):
-                if job is not None:
-                    yield job.result()
-                job = pool.submit(self._follow, estimated, following)
-            if job is not None:
-                yield job.result()
+            estimates = _with_next(self._estimate(scans))
+            while error is None:
+                try:
+                    estimated, following = next(estimates)
+                except StopIteration:
+                    break
+                except LidarSlamError as reason:
+                    error = reason
+                    continue
+                jobs.append(pool.submit(self._follow, estimated, following))
+                if len(jobs) > _MAX_BEHIND:
+                    yield jobs.popleft().result()
+            while jobs:
+                yield jobs.popleft().result()
         self._add_waiting(Status.OK)
+        if error is not None:
+            raise error
 
     def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Estimated]:
         """Read and estimate scan after scan."""
@@ -180,12 +199,18 @@ class Pipeline:
 def _with_next(items: Iterable[_Estimated]) -> Iterator[tuple[_Estimated, _Estimated | None]]:
     """Each item with the one after it, None after the last."""
     held: _Estimated | None = None
-    for item in items:
-        if held is not None:
-            yield held, item
-        held = item
+    error: LidarSlamError | None = None
+    try:
+        for item in items:
+            if held is not None:
+                yield held, item
+            held = item
+    except LidarSlamError as reason:  # the last item before it still has its turn
+        error = reason
     if held is not None:
         yield held, None
+    if error is not None:
+        raise error
 
 
 def _compensate(scan: Scan, before: FloatArray | None, after: FloatArray | None) -> FloatArray:

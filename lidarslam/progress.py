@@ -26,7 +26,7 @@ class _RateColumn(ProgressColumn):
 def _bar(*more: ProgressColumn) -> Progress:
     """A bar on standard error; silent where no terminal is attached."""
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(),

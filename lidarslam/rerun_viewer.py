@@ -1,9 +1,12 @@
 """Runs in Rerun; the only file that imports it."""
 
 import logging
+import os
+import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import rerun as rr
@@ -22,6 +25,9 @@ _log = logging.getLogger(__name__)
 
 _SCAN_TIMELINE = "scan"
 _TIME_TIMELINE = "time"
+# Where Rerun listens unless told otherwise, and what says that Linux has a display.
+_GRPC_PORT, _WEB_PORT = 9876, 9090
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 # Okabe and Ito's palette, distinguishable under every common colour blindness.
 _STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
@@ -160,7 +166,7 @@ def _every_nth(points: FloatArray, count: int) -> FloatArray:
     return points[:: max(1, -(-len(points) // count))]
 
 
-def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | None, web: bool) -> None:
+def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | None, web: bool) -> str | None:
     """Finished runs in one view: trajectories, maps, and where tracking was lost.
 
     Args:
@@ -168,27 +174,70 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
         config: how much is shown.
         save: the .rrd file to write, instead of a window.
         web: serve a browser, instead of a window; it serves as long as the process lives.
+
+    Returns:
+        The address that a browser is served at, if one is.
+
+    Raises:
+        OutputError: the file cannot be written, the window cannot be opened or the browser cannot be served.
     """
     recording = rr.RecordingStream("lidarslam")
+    try:
+        address = _connect(recording, save, web)
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for number, run in enumerate(runs):
+            _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
+        recording.flush()
+    except (RuntimeError, OSError) as error:
+        reason = " ".join(str(error).split())
+        if save is not None:
+            message = f"{save}: cannot be written ({reason}); name a file in a folder that exists and can be written to"
+        elif web:
+            message = f"the browser cannot be served ({reason}); write a file with --save FILE.rrd instead"
+        else:
+            message = f"the Rerun window cannot be reached ({reason}); write a file with --save FILE.rrd, or use --web"
+        raise OutputError(message) from error
+    return address
+
+
+def _connect(recording: rr.RecordingStream, save: Path | None, web: bool) -> str | None:
+    """Send the recording where it is wanted; the address that a browser is served at, if one is."""
     if save is not None:
         recording.save(save)
     elif web:
-        rr.serve_web_viewer(connect_to=recording.serve_grpc())
+        for port in (_GRPC_PORT, _WEB_PORT):
+            if _is_taken(port):
+                raise OutputError(
+                    f"port {port} is in use; close the Rerun viewer or the lidarslam view --web that has it,"
+                    " or write a file with --save FILE.rrd"
+                )
+        server = recording.serve_grpc(grpc_port=_GRPC_PORT)
+        rr.serve_web_viewer(web_port=_WEB_PORT, connect_to=server)
+        return f"http://localhost:{_WEB_PORT}/?url={quote(server, safe='')}"
     else:
+        # A viewer that runs already, perhaps at the other end of a tunnel, needs no display here.
+        if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not _is_taken(_GRPC_PORT):
+            raise OutputError("no display to open a window on; write a file with --save FILE.rrd, or use --web")
         _open_window(recording)
         recording.connect_grpc()
-    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for number, run in enumerate(runs):
-        _log_run(recording, f"world/{number}_{run.name}", run, number, config)
-    recording.flush()
+    return None
 
 
-def _log_run(recording: rr.RecordingStream, entity: str, run: FinishedRun, number: int, config: ViewerConfig) -> None:
+def _is_taken(port: int) -> bool:
+    """Whether somebody listens on a port of this machine."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _log_run(
+    recording: rr.RecordingStream, entity: list[object], run: FinishedRun, number: int, config: ViewerConfig
+) -> None:
     colour = _RUN_COLOURS[number % len(_RUN_COLOURS)]
     positions = run.trajectory.positions
     path = rr.LineStrips3D([positions], colors=[colour], radii=_PATH_RADIUS, labels=[run.name])
-    recording.log(f"{entity}/trajectory", path, static=True)
+    recording.log([*entity, "trajectory"], path, static=True)
     lost = rr.Points3D(positions[run.lost], colors=[_STATUS_COLOURS[Status.LOST]], radii=2.0 * _PATH_RADIUS)
-    recording.log(f"{entity}/lost", lost, static=True)
+    recording.log([*entity, "lost"], lost, static=True)
     points = _every_nth(run.map_points, config.map_points)
-    recording.log(f"{entity}/map", rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS), static=True)
+    cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
+    recording.log([*entity, "map"], cloud, static=True)

@@ -18,14 +18,15 @@ def format_outcome(out: Path, outcome: RunOutcome) -> str:
 
 def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
-    yield f"{summary.scans:,} scans, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
+    yield f"{_count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
     total = summary.ms_per_scan["total"]
     yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
     if summary.map_voxel_size_m is None:
         yield "no map: no scan could be believed"
     else:
-        yield f"map of {summary.map_points:,} points, one in every voxel of {100.0 * summary.map_voxel_size_m:.0f} cm"
+        points, voxel_cm = _count(summary.map_points, "point"), 100.0 * summary.map_voxel_size_m
+        yield f"map of {points}, one in every voxel of {voxel_cm:.0f} cm"
     if outcome.metrics is not None:
         yield from _accuracy(outcome)
     for warning in summary.warnings:
@@ -34,14 +35,20 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     yield f"written to {out}"
 
 
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def _lost(summary: RunSummary) -> Iterator[str]:
     for stretch in summary.lost[:_STRETCHES]:
         scans = f"scan {stretch.first}" if stretch.first == stretch.last else f"scans {stretch.first} to {stretch.last}"
         yield f"LOST on {scans}: {stretch.reason}"
     if len(summary.lost) > _STRETCHES:
-        yield f"LOST on {len(summary.lost) - _STRETCHES} more stretches"
+        more = len(summary.lost) - _STRETCHES
+        yield f"LOST on {more} more {'stretch' if more == 1 else 'stretches'}"
     if summary.lost_scans:
-        yield f"tracking was lost on {summary.lost_scans} of {summary.scans} scans; {SUMMARY} and {SCANS_CSV} say where"
+        scans = _count(summary.scans, "scan")
+        yield f"tracking was lost on {summary.lost_scans:,} of {scans}; {SUMMARY} and {SCANS_CSV} say where"
 
 
 def _accuracy(outcome: RunOutcome) -> Iterator[str]:

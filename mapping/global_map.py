@@ -1,5 +1,6 @@
 """The merged map: one averaged point a voxel, so that memory follows the mapped area, not the number of scans."""
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +71,7 @@ class GlobalMap:
         self._merged = _Voxels.empty()
         self._pending: list[_Voxels] = []
         self._pending_size = 0
+        self._lock = threading.Lock()  # a viewer may look while a scan is added
 
     def add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp."""
@@ -82,10 +84,11 @@ class GlobalMap:
         towards_sensor = T_world_lidar[:3, 3] - world
         sums[:, _VIEW] = towards_sensor / np.linalg.norm(towards_sensor, axis=1, keepdims=True)
         sums[:, _COUNT] = 1.0
-        self._pending.append(_Voxels(_pack(cells), sums))
-        self._pending_size += len(points)
-        if self._pending_size > max(_MIN_PENDING, len(self._merged.keys) // 2):
-            self._merge()
+        with self._lock:
+            self._pending.append(_Voxels(_pack(cells), sums))
+            self._pending_size += len(points)
+            if self._pending_size > max(_MIN_PENDING, len(self._merged.keys) // 2):
+                self._merge()
 
     def points(self, min_hits: int = 1) -> FloatArray:
         """The mean point (M, 3) of every voxel that holds at least `min_hits` points, in the world."""
@@ -102,11 +105,13 @@ class GlobalMap:
         return PointCloud(points, normals)
 
     def _well_seen(self, min_hits: int) -> _Voxels:
-        self._merge()
+        with self._lock:
+            self._merge()
+            merged = self._merged
         if min_hits <= 1:
-            return self._merged
-        chosen = self._merged.sums[:, _COUNT] >= min_hits
-        return _Voxels(self._merged.keys[chosen], self._merged.sums[chosen])
+            return merged
+        chosen = merged.sums[:, _COUNT] >= min_hits
+        return _Voxels(merged.keys[chosen], merged.sums[chosen])
 
     def _means(self, voxels: _Voxels) -> FloatArray:
         within = voxels.sums[:, _POSITION] / voxels.sums[:, _COUNT, None]

@@ -12,8 +12,10 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
     """Write a binary .ply or .pcd file with float32 points and normals.
 
     Raises:
-        OutputError: the file could not be written.
+        OutputError: the file could not be written, or the cloud is empty.
     """
+    if not len(cloud):
+        raise OutputError(f"{path.parent}: a map without points cannot be written")
     import open3d as o3d
 
     out = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(cloud.points.astype(np.float32)))
@@ -21,4 +23,6 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         written = o3d.t.io.write_point_cloud(path, out, write_ascii=False)
     if not written:
-        raise OutputError(f"{path}: the map could not be written; is the disk full or the folder read-only?")
+        raise OutputError(
+            f"{path.parent}: the {path.suffix} map cannot be written there; is the disk full or the folder read-only?"
+        )

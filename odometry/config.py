@@ -1,8 +1,8 @@
 """Settings of the odometry methods; light, so that reading a configuration imports no method."""
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 OdometryName = Literal["kiss-icp", "constant-velocity", "external"]
 
@@ -10,7 +10,7 @@ OdometryName = Literal["kiss-icp", "constant-velocity", "external"]
 class KissConfig(BaseModel):
     """KISS-ICP's own parameters; the defaults are its defaults."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     max_range_m: float = Field(100.0, gt=0.0)
     min_range_m: float = Field(0.0, ge=0.0)
@@ -24,11 +24,20 @@ class KissConfig(BaseModel):
     min_motion_m: float = Field(0.1, gt=0.0)
     fixed_threshold_m: float | None = Field(None, gt=0.0, description="switches the adaptive threshold off")
 
+    @model_validator(mode="after")
+    def _ranges_leave_something(self) -> Self:
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(
+                f"min_range_m={self.min_range_m:g} must be less than max_range_m={self.max_range_m:g},"
+                " or no point is left"
+            )
+        return self
+
 
 class ConsistencyConfig(BaseModel):
     """When two consecutive scans are said to fit each other; see `odometry.consistency`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     queries: int = Field(1000, ge=100, description="points of the new scan that are looked up in the previous one")
     gate_ratio: float = Field(0.02, gt=0.0, description="largest residual of an inlier, as a fraction of its range")
@@ -36,11 +45,20 @@ class ConsistencyConfig(BaseModel):
     degraded_below: float = Field(0.70, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
     lost_below: float = Field(0.40, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
 
+    @model_validator(mode="after")
+    def _lost_is_worse_than_degraded(self) -> Self:
+        if self.lost_below > self.degraded_below:
+            raise ValueError(
+                f"lost_below={self.lost_below:g} must not exceed degraded_below={self.degraded_below:g},"
+                " as a lost scan is worse than a degraded one"
+            )
+        return self
+
 
 class OdometryConfig(BaseModel):
     """Which method gives the motion between scans, and how it is set."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     method: OdometryName = "kiss-icp"
     kiss_icp: KissConfig = KissConfig()

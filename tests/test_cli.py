@@ -1,6 +1,8 @@
 """The command line as a stranger meets it: help, exit statuses, one-line errors."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +36,7 @@ def test_every_command_has_help_with_an_example() -> None:
     for name in main.commands:
         result = lidarslam(name, "--help")
         assert result.exit_code == 0
+        assert "Example:" in result.output, name
         assert f"lidarslam {name}" in result.output.split("Example:")[-1], name
 
 
@@ -79,7 +82,13 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
     ("arguments", "status", "message"),
     [
         (["info", "no/such/place"], 1, "no such file or folder"),
-        (["info", "{recording}", "--reader", "ros"], 1, "no reader is called 'ros'; there are: kitti-odometry"),
+        (["info", "{recording}", "--reader", "ros"], 2, "'ros' is not one of 'kitti-odometry'"),
+        (["info", "{recording}", "--set", "reader.name=ros"], 1, "no reader is called 'ros'; there are: kitti"),
+        (["info", ""], 2, "the path is empty"),
+        (["run", "{recording}", "--out", ""], 2, "the path is empty"),
+        (["view", "{recording}", "--web", "--save", "{out}.rrd"], 2, "exclude one another"),
+        (["view", "{recording}", "--web", "--picture", "{out}.png"], 2, "exclude one another"),
+        (["view", "{recording}", "--save", "{out}.rrd", "--picture", "{out}.png"], 2, "exclude one another"),
         (["run", "{recording}"], 2, "Missing option '--out'"),
         (["run", "{recording}", "--out", "{out}", "--odometry", "loam"], 2, "'loam' is not one of"),
         (["run", "{recording}", "--out", "{out}", "--step", "0"], 2, "0 is not in the range x>=1"),
@@ -134,3 +143,43 @@ def test_view_writes_a_recording_and_a_picture(recording: Path, tmp_path: Path) 
     assert (tmp_path / "map.png").stat().st_size > 1_000
     assert lidarslam("view", recording).exit_code == 1
     assert lidarslam("view", recording, "--picture", tmp_path / "none.png").exit_code == 1
+
+
+def test_options_that_the_source_has_no_use_for_are_named(recording: Path) -> None:
+    result = lidarslam("info", recording, "--topic", "/points", "--sequence", "04")
+    assert result.exit_code == 0
+    assert "--topic /points is ignored" in result.stderr
+    assert "--sequence 04 is ignored" in result.stderr
+    assert result.stderr.count("\n") == 2
+    assert lidarslam("info", recording).stderr == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a full disk at hand")
+def test_a_full_disk_gets_one_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "lidarslam.cli", "config"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ended.stderr == "lidarslam: No space left on device\n"
+    assert ended.returncode == 1
+
+
+def test_a_file_that_may_not_be_read_gets_one_line(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(recording / "000000.npy"))
+
+    monkeypatch.setattr("lidarslam.info.describe_source", refuse)
+    result = lidarslam("info", recording)
+    assert (result.exit_code, result.stderr) == (1, f"lidarslam: {recording}/000000.npy: Permission denied\n")
+
+
+def test_view_says_where_the_browser_is_served(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert lidarslam("run", recording, "--out", tmp_path / "run", "--stop", 2).exit_code == 0
+    monkeypatch.setattr("rerun.serve_web_viewer", lambda **_: None)
+    monkeypatch.setattr("rerun.RecordingStream.serve_grpc", lambda *_, **__: "rerun+http://127.0.0.1:9876/proxy")
+    monkeypatch.setattr("lidarslam.rerun_viewer._is_taken", lambda _: False)
+    monkeypatch.setattr("signal.pause", lambda: None)
+    lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
+    assert lines[0].startswith("http://localhost:9090")
+    assert lines[1] == "serving until you press Ctrl-C"

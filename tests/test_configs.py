@@ -43,6 +43,19 @@ def test_what_is_dumped_loads_again_with_the_section_on_the_run(tmp_path: Path) 
         (["odometry.method=loam"], r"odometry\.method='loam': input should be 'kiss-icp'"),
         (["global_map"], r"expected key\.path=value"),
         (["global_map.voxel_size_m=2", "global_map.voxel_size_m.x=1"], "voxel_size_m is a value, not a section"),
+        (["a=2021-13-45"], r"^--set 'a=2021-13-45': the value looks like a date .*month must be in 1\.\.12$"),
+        (["global_map.voxel_size_m=!!float abc"], "could not convert string to float"),
+        (["odometry=1"], r"^configuration \(--set\): odometry=1: expected a section$"),
+        (["odometry.kiss_icp=[3]"], r"odometry\.kiss_icp=\[3\]: expected a section$"),
+        (
+            ["global_map.min_range_m=80"],
+            r"^configuration \(--set\): global_map: min_range_m=80 must be less than max_range_m=80, or .* left$",
+        ),
+        (
+            ["odometry.kiss_icp.max_range_m=5", "odometry.kiss_icp.min_range_m=6"],
+            r"kiss_icp: min_range_m=6 must be less",
+        ),
+        (["odometry.consistency.lost_below=0.8"], r"consistency: lost_below=0\.8 must not exceed degraded_below=0\.7,"),
     ],
 )
 def test_mistakes_are_named(settings: list[str], message: str) -> None:
@@ -64,6 +77,45 @@ def test_broken_files_are_named(tmp_path: Path, text: str | bytes, message: str)
     with pytest.raises(ConfigError, match=message) as error:
         load_config(file)
     assert "broken.yaml" in str(error.value)
+
+
+def test_a_value_that_is_no_date_is_named_with_its_file(tmp_path: Path) -> None:
+    file = tmp_path / "dated.yaml"
+    file.write_text("reader: {name: 2021-13-45}\n")
+    with pytest.raises(ConfigError, match=r"dated\.yaml: a value looks like a date .*month must be in 1\.\.12"):
+        load_config(file)
+
+
+def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
+    file = tmp_path / "wrong.yaml"
+    file.write_text("global_map: {voxel_size_m: -1}\n")
+    with pytest.raises(ConfigError) as error:
+        load_config(file)
+    assert str(error.value).startswith(f"configuration ({file}): ")
+    with pytest.raises(ConfigError) as error:
+        load_config(file, ["viewer.map_every=3"])
+    assert str(error.value).startswith(f"configuration ({file} or --set): ")
+
+
+def test_equal_thresholds_are_no_contradiction() -> None:
+    assert load_config(None, ["odometry.consistency.lost_below=0.7"]).odometry.consistency.lost_below == 0.7
+
+
+@pytest.mark.parametrize("value", [".inf", "-.inf", ".nan"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        "reader.rate_hz",
+        "reader.kitti_elevation_correction_deg",
+        "odometry.kiss_icp.max_range_m",
+        "odometry.consistency.gate_min_m",
+        "global_map.voxel_size_m",
+        "viewer.map_radius_m",
+    ],
+)
+def test_every_number_is_finite(key: str, value: str) -> None:
+    with pytest.raises(ConfigError, match="finite number"):
+        load_config(None, [f"{key}={value}"])
 
 
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:

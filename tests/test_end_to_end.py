@@ -122,7 +122,8 @@ def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -
     (stretch,) = outcome.summary.lost
     assert (stretch.first, stretch.last) == (9, 10)
     assert "too few" in stretch.reason
-    assert seen[8:12] == [Status.OK, Status.LOST, Status.LOST, Status.DEGRADED] or seen[11] is Status.OK
+    assert seen[8:11] == [Status.OK, Status.LOST, Status.LOST]
+    assert seen[11] in (Status.OK, Status.DEGRADED)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["lost_scans"] == 2
     assert any("18000 invalid points" in warning for warning in summary["warnings"])
@@ -154,8 +155,7 @@ def test_a_damaged_scan_ends_the_run_with_what_there_is(recording: Path, tmp_pat
     assert outcome.stopped is not None
     assert "000012.npy" in outcome.stopped
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    # The two scans before the damaged one were still at work.
-    assert summary["scans"] >= 10
+    assert summary["scans"] == 12
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
     assert (tmp_path / "run" / "map.ply").exists()
     assert any("stopped after" in warning for warning in summary["warnings"])
@@ -212,7 +212,8 @@ def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> Non
         rows[chunk.entity_path] += 0 if chunk.is_static else chunk.num_rows
     assert rows["/world/lidar"] == rows["/world/lidar/scan"] == rows["/plots/ms"] == 11
     assert rows["/plots/inliers"] == rows["/world/trajectory"] == 10
-    assert rows["/world/map"] == 2, "after scans 5 and 10; there is none yet after the first"
+    # After scans 5 and 10; after the first only if the second has been added meanwhile.
+    assert rows["/world/map"] in (2, 3)
     assert "/world/ground_truth" in rows
     assert len(reader.blueprints()) == 1
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.bag_file import CLOUD_TYPES
-from lidarslam.datasets.recording import Topic
+from lidarslam.datasets.recording import SeveralTopicsError, Topic
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
@@ -15,7 +15,8 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
     """The wanted point cloud topic, or the only one with messages.
 
     Raises:
-        InputError: there is no such topic, or no or more than one to choose from; the message lists them.
+        SeveralTopicsError: there is more than one to choose from.
+        InputError: there is no such topic, or none to choose from; the message lists them.
     """
     clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES and topic.messages]
     if wanted is not None:
@@ -27,7 +28,8 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
     if len(clouds) == 1:
         return clouds[0]
     if clouds:
-        raise InputError(f"{source}: several point cloud topics, choose one with --topic: {_listing(clouds)}")
+        message = f"{source}: several point cloud topics, choose one with --topic: {_listing(clouds)}"
+        raise SeveralTopicsError(message, clouds, topics)
     if not any(topic.messages for topic in topics):
         raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
     raise InputError(

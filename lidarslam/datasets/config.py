@@ -11,7 +11,7 @@ TimeReference = Literal["auto", "relative", "absolute", "none"]
 class ReaderConfig(BaseModel):
     """Options of the readers; every reader takes the ones that concern it and leaves the others alone."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str | None = Field(None, description="reader to use; null: the one that recognises the source")
     topic: str | None = Field(None, description="point cloud topic of a bag; null: the only one there is")

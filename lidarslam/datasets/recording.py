@@ -1,9 +1,11 @@
 """What the readers hand out: a sequence of scans that can also describe itself."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import ScanSequence
 
@@ -33,6 +35,15 @@ class Topic:
     name: str
     message_type: str
     messages: int
+
+
+class SeveralTopicsError(InputError):
+    """A bag has several point cloud topics, `clouds` among all its `topics`, and none was chosen."""
+
+    def __init__(self, message: str, clouds: Sequence[Topic], topics: Sequence[Topic]) -> None:
+        super().__init__(message)
+        self.clouds = tuple(clouds)
+        self.topics = tuple(topics)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import PointField, PointTime, Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.truth_files import find_truth_file
+from lidarslam.info import describe_source
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -238,6 +239,16 @@ def test_several_cloud_topics_are_listed(bag_kit, make_sweep):
     assert "/front (sensor_msgs/msg/PointCloud2, 2 messages)" in str(caught.value)
     assert "/rear (sensor_msgs/msg/PointCloud2, 1 messages)" in str(caught.value)
     assert "/empty" not in str(caught.value)
+
+
+def test_info_lists_the_topics_to_choose_from(bag_kit, make_sweep):
+    clouds = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(2)])
+    text = describe_source(
+        bag_kit.write({"/front": clouds, "/rear": clouds[:1], "/imu": "sensor_msgs/msg/Imu"}), ReaderConfig()
+    )
+    assert "such as --topic /front" in text
+    for topic in ("/front", "/rear", "/imu"):
+        assert topic in text.split("topics\n")[-1]
 
 
 @pytest.mark.parametrize("topic", ["/rear", "rear"])

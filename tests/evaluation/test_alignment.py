@@ -40,6 +40,22 @@ def test_a_straight_noisy_path_does_not_roll(step_m, sigma_m, straight_drive, rn
     assert np.rad2deg(rotation_angle(found)) < 0.1
 
 
+def test_a_nearly_straight_path_takes_the_rotation_about_it_from_the_orientations(straight_drive):
+    """Thirty metres that bend by 3 % of them, the reference's heights off by half a metre as GNSS puts them."""
+    drive = straight_drive(31, (0.0, 0.0, 0.008, 1.0, 0.0, 0.0))
+    poses = drive.T_world_lidar.copy()
+    poses[:, 2, 3] += 0.5 * np.linspace(-1.0, 1.0, 31) ** 2
+    T_reference_estimate = exp(MOTIONS[1])
+    found = align(drive, Trajectory(drive.stamps, poses).transformed(T_reference_estimate))
+    assert np.rad2deg(rotation_angle(inverse(T_reference_estimate) @ found)) < 1.0
+
+
+def test_a_path_that_spreads_sideways_is_fitted_by_its_positions_alone(straight_drive):
+    drive = straight_drive(120, (0.0, 0.0, 0.01, 1.0, 0.0, 0.0))
+    poses = drive.T_world_lidar @ exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert_same(align(drive, Trajectory(drive.stamps, poses)), np.eye(4))
+
+
 def test_a_mirrored_estimate_is_not_answered_with_a_reflection(random_drive):
     reference = random_drive(2)
     poses = reference.T_world_lidar.copy()

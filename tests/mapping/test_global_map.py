@@ -92,5 +92,5 @@ def test_other_programs_read_the_file(tmp_path: Path, rng: np.random.Generator, 
 
 
 def test_a_map_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"map\.ply"):
+    with pytest.raises(OutputError, match="cannot be written there"):
         write_cloud(tmp_path / "absent" / "map.ply", PointCloud(np.ones((1, 3)), np.ones((1, 3))))

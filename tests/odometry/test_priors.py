@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarslam.core.errors import ConfigError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
@@ -60,6 +60,58 @@ def test_a_gap_in_the_cover_is_made_up_by_the_next_covered_scan() -> None:
     assert odometry.estimate(scan_at(0.1)).failure is not None
     assert odometry.estimate(scan_at(0.6)).failure is None
     np.testing.assert_allclose(odometry.estimate(scan_at(0.7)).T_prev_curr, exp(0.1 * VELOCITY), atol=1e-9)
+
+
+def with_a_hole(step_s: float, hole_s: float, largest_interval_s: float | None = None) -> ExternalOdometry:
+    """Ten poses up to second 0, ten from the end of the hole on."""
+    before = step_s * np.arange(-9, 1)
+    stamps = np.concatenate([before, hole_s - before[::-1]])
+    trajectory = Trajectory(stamps, exp(np.multiply.outer(stamps, VELOCITY)))
+    return ExternalOdometry(trajectory, largest_interval_s=largest_interval_s)
+
+
+@pytest.mark.parametrize("stamp", [0.0015, 0.7, 1.3985])
+def test_a_scan_in_a_hole_of_the_external_trajectory_is_not_covered(stamp: float) -> None:
+    odometry = with_a_hole(step_s=0.1, hole_s=1.4)
+    odometry.estimate(scan_at(-0.1))
+    failed = odometry.estimate(scan_at(stamp))
+    assert failed.points_used == 0
+    assert failed.failure is not None
+    assert "does not cover this scan: it has no pose from 0.000000 to 1.400000" in failed.failure
+    caught_up = odometry.estimate(scan_at(1.45))
+    assert caught_up.failure is None
+    np.testing.assert_allclose(caught_up.T_prev_curr, exp(1.55 * VELOCITY), atol=1e-9)
+
+
+@pytest.mark.parametrize("stamp", [-0.0008, 0.0, 0.0008, 1.3992, 1.4, 1.4008])
+def test_a_scan_at_the_edge_of_a_hole_is_covered(stamp: float) -> None:
+    odometry = with_a_hole(step_s=0.1, hole_s=1.4)
+    odometry.estimate(scan_at(-0.1))
+    motion = odometry.estimate(scan_at(stamp))
+    assert motion.failure is None
+    np.testing.assert_allclose(motion.T_prev_curr, exp((stamp + 0.1) * VELOCITY), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("step_s", "hole_s", "largest_interval_s", "covered"),
+    [
+        (0.1, 0.99, None, True),
+        (0.1, 1.01, None, False),
+        (0.5, 2.4, None, True),
+        (0.5, 2.6, None, False),
+        (0.1, 0.3, 0.2, False),
+        (0.1, 1.4, 2.0, True),
+    ],
+)
+def test_how_long_a_hole_may_be(step_s: float, hole_s: float, largest_interval_s: float | None, covered: bool) -> None:
+    motion = with_a_hole(step_s, hole_s, largest_interval_s).estimate(scan_at(0.5 * hole_s))
+    assert (motion.failure is None) is covered
+
+
+@pytest.mark.parametrize("poses", [0, 1])
+def test_a_prior_of_fewer_than_two_poses_is_refused(poses: int) -> None:
+    with pytest.raises(InputError, match=f"needs two poses or more .* has {poses}"):
+        ExternalOdometry(Trajectory(np.arange(float(poses)), np.tile(np.eye(4), (poses, 1, 1))))
 
 
 def test_external_needs_a_prior_and_only_external_takes_one() -> None:

@@ -1,0 +1,54 @@
+"""Runs read back: what is damaged is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.finished_run import load_map, load_run
+from mapping.global_map import PointCloud
+from mapping.map_io import write_cloud
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> Path:
+    write_tum(tmp_path / "trajectory.tum", Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1))))
+    (tmp_path / "scans.csv").write_text("index,status\n0,ok\n1,lost\n2,ok\n")
+    write_cloud(tmp_path / "map.ply", PointCloud(np.eye(3), np.eye(3)))
+    return tmp_path
+
+
+def test_a_run_is_read_back(finished: Path) -> None:
+    run = load_run(finished)
+    np.testing.assert_array_equal(run.lost, [False, True, False])
+    np.testing.assert_array_equal(run.map_points, np.eye(3))
+
+
+def test_a_run_may_have_no_map(finished: Path) -> None:
+    (finished / "map.ply").unlink()
+    assert len(load_run(finished).map_points) == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(b"index,state\n0,ok\n", "no column 'status'"), (b"index,status\n0,\xff\n", "UTF-8")]
+)
+def test_a_damaged_table_is_named(finished: Path, content: bytes, message: str) -> None:
+    (finished / "scans.csv").write_bytes(content)
+    with pytest.raises(InputError, match=rf"scans\.csv: .*{message}"):
+        load_run(finished)
+
+
+def test_a_map_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.ply: no such file"):
+        load_map(tmp_path / "none.ply")
+
+
+@pytest.mark.parametrize("name", ["map.ply", "map.pcd", "map.txt"])
+def test_a_file_that_is_no_cloud(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / name).write_bytes(b"no cloud at all" * 10)
+    with pytest.raises(InputError, match=f"{name}: not a readable point cloud"):
+        load_map(tmp_path / name)
+    assert capfd.readouterr().err == ""
