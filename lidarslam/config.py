@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run_directory import RUN_SECTION
-from mapping.config import GlobalMapConfig
+from mapping.config import GlobalMapConfig, MappingConfig
 from odometry.config import OdometryConfig
 
 # PyYAML lets Python's own errors through for what has the form or the tag of a date or a number: 2021-13-45.
@@ -40,6 +40,7 @@ class Config(BaseModel):
 
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()
+    mapping: MappingConfig = MappingConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
 

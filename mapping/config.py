@@ -26,3 +26,11 @@ class GlobalMapConfig(BaseModel):
                 " or no point is left"
             )
         return self
+
+
+class MappingConfig(BaseModel):
+    """Scan-to-map refinement."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    enabled: bool = Field(False, description="correct the odometry against the local map")
