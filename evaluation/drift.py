@@ -58,9 +58,10 @@ class KittiDrift:
     by_speed: Mapping[int, Drift | None]
 
     def to_json(self) -> dict[str, object]:
-        """The overall figures and those by length, as metrics.json names them."""
+        """The overall figures, those by length and those by speed, as metrics.json names them."""
         by_length = {str(m): drift and drift.to_json(100) for m, drift in self.by_length.items()}
-        return {**self.overall.to_json(100), "by_length": by_length}
+        by_speed = {str(mps): drift and drift.to_json(100) for mps, drift in self.by_speed.items()}
+        return {**self.overall.to_json(100), "by_length": by_length, "by_speed": by_speed}
 
 
 @dataclass(frozen=True, eq=False)

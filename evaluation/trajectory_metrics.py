@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evaluation.alignment import align
+from evaluation.alignment import AlignmentMethod, align
 from evaluation.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
 from evaluation.drift import Drift, KittiDrift, kitti_drift, short_drift
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
@@ -52,10 +52,11 @@ class TrajectoryMetrics:
 
     Attributes:
         association: the pairs of poses the figures are of.
-        T_reference_estimate: (4, 4) the SE(3) alignment the ATE was computed with.
+        T_reference_estimate: (4, 4) the alignment the ATE was computed with.
         errors: absolute and relative errors.
         kitti: KITTI's drift; None under 100 m.
         segments: metres -> drift over short segments; None where the reference is too short.
+        alignment: how the alignment was found.
     """
 
     association: Association
@@ -63,6 +64,7 @@ class TrajectoryMetrics:
     errors: TrajectoryErrors
     kitti: KittiDrift | None
     segments: Mapping[int, Drift | None]
+    alignment: AlignmentMethod = "se3"
 
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json, with no map compared."""
@@ -80,23 +82,37 @@ def evaluate_trajectory(
     reference: Trajectory,
     tolerance_s: float = DEFAULT_TOLERANCE_S,
     max_gap_s: float = DEFAULT_MAX_GAP_S,
+    alignment: AlignmentMethod = "se3",
 ) -> TrajectoryMetrics:
     """Compare an estimate with a reference, both poses of the LiDAR; the worlds may differ, the scale may not.
 
-    The two are matched in time by `associate`, which explains `tolerance_s` and `max_gap_s`.
+    The two are matched in time by `associate`, which explains `tolerance_s` and `max_gap_s`. The `alignment`, which
+    `align` explains, concerns the absolute errors only.
 
     Raises:
         InputError: fewer than three poses are of the same instant.
     """
     association = associate(estimate, reference, tolerance_s, max_gap_s)
-    T_reference_estimate = align(association.estimate, association.reference, "se3")
+    T_reference_estimate = align(association.estimate, association.reference, alignment)
     return TrajectoryMetrics(
         association=association,
         T_reference_estimate=T_reference_estimate,
         errors=trajectory_errors(association, T_reference_estimate),
         kitti=kitti_drift(association),
         segments=short_drift(association),
+        alignment=alignment,
     )
+
+
+def metrics_json(
+    trajectory: TrajectoryMetrics | None, map_metrics: Mapping[str, object] | None = None
+) -> dict[str, object]:
+    """The content of metrics.json: a trajectory's errors and a map's, None where there is no reference for it."""
+    parts = dict.fromkeys(("association", "trajectory", "kitti", "segments"))
+    return {
+        **(parts if trajectory is None else trajectory.to_json()),
+        "map": None if map_metrics is None else dict(map_metrics),
+    }
 
 
 def trajectory_errors(association: Association, T_reference_estimate: FloatArray) -> TrajectoryErrors:

@@ -386,6 +386,59 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
     click.echo(f"written to {picture}")
 
 
+@main.command(
+    epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods kiss-icp,kiss-icp@0.5
+    lidarslam compare office.mcap --out compared --methods kiss-icp,prior --prior wheel_odometry.tum
+    lidarslam compare --benchmark configs/benchmarks/kitti.yaml --data KITTI --out compared"""
+)
+@click.argument("sources", type=_PATH, nargs=-1, metavar="[SOURCE]...")
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Folder that everything is written to.")
+@click.option(
+    "--methods",
+    metavar="NAME,...",
+    help="BASE[@VOXEL][+map][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  [default: kiss-icp,"
+    "kiss-icp@0.5, or the benchmark's]",
+)
+@click.option("--benchmark", type=_FILE, metavar="FILE", help="Recordings, methods and tables as the file has them.")
+@click.option("--data", type=_PATH, metavar="DIR", help="Folder that the benchmark's paths are relative to.")
+@click.option("--prior", type=_FILE, metavar="TUM_FILE", help="Trajectory that the methods prior and prior+map take.")
+@click.option("--reference", metavar="METHOD|FILE", help="What to hold against.  [default: the ground truth]")
+@click.option("--reference-map", type=_FILE, metavar="FILE", help="Point cloud to hold the maps against.")
+@click.option("--memory-limit-mb", type=click.FloatRange(min=0, min_open=True), help="End a method that takes more.")
+@click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="End a method that takes longer.")
+@click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan.")
+@click.option("--stop", type=click.IntRange(min=0), help="Scan to stop before.")
+@click.option("--step", type=click.IntRange(min=1), default=1, show_default=True, help="Take every n-th scan.")
+@click.option("--reuse", is_flag=True, help="Keep the runs in DIR that finished with the same settings.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier comparison in DIR.")
+@_reader_options
+@_config_options
+@click.pass_context
+def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, **options: Any) -> None:
+    """Run several methods on one or more recordings: one table, one report.
+
+    Each method runs in a process of its own, one after another. A method that crashes or gets lost is a row of the
+    table, and the exit status is 0 all the same; it is 1 when no method came to a result, or on Ctrl-C, which writes
+    the report of what there is.
+    """
+    from lidarslam.compare_command import CompareOptions, run_compare
+
+    if (benchmark is None) == (not sources):
+        raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
+    if benchmark is None and options["data"] is not None:
+        raise click.UsageError("--data goes with --benchmark")
+    for name in ("prior", "reference_map", "sequence"):
+        if options[name] is not None and len(sources) != 1:
+            flag = f"--{name.replace('_', '-')}"
+            raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each")
+    if not run_compare(CompareOptions(sources, benchmark, **options), click.echo, _tell):
+        ctx.exit(EXIT_MENDABLE)
+
+
+def _tell(line: str) -> None:
+    click.echo(f"lidarslam: {line}", err=True)
+
+
 @main.command(epilog="lidarslam config --set odometry.kiss_icp.voxel_size_m=0.5")
 @_config_options
 def config(config_file: Path | None, settings: tuple[str, ...]) -> None:

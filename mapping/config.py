@@ -4,6 +4,8 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from mapping.feature_config import FeatureConfig
+
 
 class GlobalMapConfig(BaseModel):
     """The merged map that a run leaves behind."""
@@ -28,9 +30,53 @@ class GlobalMapConfig(BaseModel):
         return self
 
 
+class RefinementConfig(BaseModel):
+    """How a scan is laid on the map; see `mapping.refinement`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    max_iterations: int = Field(12, ge=1, description="steps, the surfaces looked up anew before each")
+    coarse_iterations: int = Field(3, ge=0, description="of them on coarser cells, when the prediction may be far off")
+    converged_rotation_deg: float = Field(0.02, gt=0.0, description="smaller steps end the iteration")
+    converged_translation_m: float = Field(0.001, gt=0.0, description="likewise")
+    min_matches: int = Field(60, ge=12, description="fewer points on surfaces do not make a pose")
+
+
+class TrackingConfig(BaseModel):
+    """When a scan laid on the map is believed; see `mapping.tracking_state`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    gate_cells: float = Field(0.5, gt=0.0, description="largest distance of an inlier from its surface, in cells")
+    gate_ratio: float = Field(0.02, gt=0.0, description="likewise, as a fraction of its range")
+    gate_min_m: float = Field(0.05, gt=0.0, description="likewise, the least it can be")
+    degraded_below: float = Field(0.65, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
+    lost_below: float = Field(0.4, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
+    search_yaw_step_deg: float = Field(15.0, gt=0.0, description="start rotations around gravity when lost")
+    give_up_after: int = Field(20, ge=1, description="lost scans in a row after which a new map is begun")
+
+
 class MappingConfig(BaseModel):
     """Scan-to-map refinement."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     enabled: bool = Field(False, description="correct the odometry against the local map")
+    cell_m: float | None = Field(
+        None, gt=0.0, description="edge of the map's finest cells; null: follows the median range of the scene"
+    )
+    cells_per_range: float = Field(25.0, gt=0.0, description="how many cells make the median range")
+    radius_m: float = Field(100.0, gt=0.0, description="the map is forgotten beyond")
+    min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
+    max_range_m: float = Field(100.0, gt=0.0, description="farther points are left out")
+    keypoints: int = Field(2500, ge=100, description="points of a scan that are registered, about")
+    edges: bool = Field(False, description="register LOAM's edges to lines, beside planes")
+    continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
+    second_deskew: bool = Field(
+        True, description="without continuous time: compensate again with the refined motion where it differs"
+    )
+    prior_rotation_deg: float = Field(5.0, gt=0.0, description="standard deviation of the predicted rotation")
+    prior_translation_m: float = Field(0.2, gt=0.0, description="standard deviation of the predicted translation")
+    features: FeatureConfig = FeatureConfig()
+    refinement: RefinementConfig = RefinementConfig()
+    tracking: TrackingConfig = TrackingConfig()

@@ -26,18 +26,18 @@ def deskew(
     if not len(points):
         return points
     if time_offsets.min() >= 0.0 or np.array_equal(velocity_before, velocity_after):
-        return _move(points, time_offsets, velocity_after)
+        return move(points, time_offsets, velocity_after)
     if time_offsets.max() <= 0.0:
-        return _move(points, time_offsets, velocity_before)
+        return move(points, time_offsets, velocity_before)
     before = time_offsets < 0.0
     moved = np.empty_like(points)
-    moved[before] = _move(points[before], time_offsets[before], velocity_before)
-    moved[~before] = _move(points[~before], time_offsets[~before], velocity_after)
+    moved[before] = move(points[before], time_offsets[before], velocity_before)
+    moved[~before] = move(points[~before], time_offsets[~before], velocity_after)
     return moved
 
 
-def _move(points: FloatArray, t: FloatArray, velocity: FloatArray) -> FloatArray:
-    """exp(t * velocity) applied point by point, without a matrix a point.
+def move(points: FloatArray, t: FloatArray, velocity: FloatArray) -> FloatArray:
+    """`exp(t * velocity)` applied to points (N, 3), each at its own time (N,), without a matrix a point.
 
     The rotation is Rodrigues' formula about a common axis, so its coefficients are all that differs.
     """

@@ -1,10 +1,20 @@
-"""Trajectories of known shape."""
+"""Trajectories of known shape, and a comparison of methods with everything a report has to cope with."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from evaluation.comparison import (
+    Comparison,
+    MapErrors,
+    MethodResult,
+    MissingRecording,
+    PublishedRow,
+    SequenceComparison,
+)
+from evaluation.summary_table import SummaryTable, TableCell, TableColumn, TableRow
+from evaluation.trajectory_metrics import evaluate_trajectory
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain
 
@@ -44,3 +54,86 @@ def noisy() -> Callable[..., Trajectory]:
         return Trajectory(trajectory.stamps, chain(trajectory.T_world_lidar[0], motions))
 
     return disturb
+
+
+@pytest.fixture
+def finished(noisy) -> Callable[..., MethodResult]:
+    """A method's result beside the reference it was disturbed from."""
+
+    def result(name: str, reference: Trajectory, seed: int, sigma: float = 0.01, **others: object) -> MethodResult:
+        estimate = noisy(reference, seed, sigma).transformed(exp([0.1, -0.2, 1.0, 5.0, 6.0, 7.0]))
+        given = {
+            "status": "ok",
+            "scans": len(estimate),
+            "trajectory": estimate,
+            "lost": np.zeros(len(estimate), dtype=bool),
+            "metrics": evaluate_trajectory(estimate, reference),
+            "ms_per_scan_median": 10.0 + seed,
+            "ms_per_scan_p95": 14.0 + seed,
+            "stage_ms": {"odometry": 8.0, "refinement": 2.5},
+            "peak_rss_mb": 500.0 + seed,
+            "wall_s": 12.0,
+            "settings": f"method: {name}\n",
+        }
+        return MethodResult(name, **{**given, **others})
+
+    return result
+
+
+HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \x00"
+
+
+@pytest.fixture
+def comparison(random_drive, straight_drive, finished, rng) -> Comparison:
+    """Two recordings; methods that are good, lost, stopped, failed and without metrics; hostile names and messages."""
+    street, corridor = random_drive(1, scans=900), random_drive(2, scans=300, step_m=0.2)
+    lost = np.zeros(len(street), dtype=bool)
+    lost[100:120] = lost[500] = True
+    walls = MapErrors(rng.uniform(-5.0, 5.0, (2000, 3)), np.abs(rng.normal(0.0, 0.1, 2000)))
+    map_metrics = {
+        "accuracy_mean_m": 0.0312,
+        "completeness_mean_m": 0.0456,
+        "chamfer_m": 0.0384,
+        "f_score_percent": {"0.1": 81.2, "0.2": 93.4, "0.5": None},
+        "coverage_percent": {"1.0": 99.5},
+        "deviation_percent": {"1.0": 0.4},
+    }
+    first = [
+        finished("learned", street, 3, 0.02, status="lost", lost=lost, message=f"no overlap {HOSTILE}"),
+        finished("kiss-icp", street, 4, 0.004, map_errors=walls, map_metrics=map_metrics),
+        MethodResult(HOSTILE, "failed", f"ended with signal 11 {HOSTILE}"),
+    ]
+    second = [
+        finished("kiss-icp", corridor, 5, 0.003),
+        finished("learned", corridor, 6, 0.01, status="stopped", message="interrupted"),
+        finished("unmeasured", corridor, 7, metrics=None),
+    ]
+    columns = [
+        TableColumn("09", "t_rel", "%", 2, True, ("09",)),
+        TableColumn("00-08", "t_rel", "%", 2, True, ("00", "01")),
+    ]
+    rows = [
+        TableRow("learned", [TableCell(1.234, 1), TableCell(0.111, 1)]),
+        TableRow("kiss-icp", [TableCell(0.567, 1), TableCell(0.333, 2)]),
+        TableRow("DeLORA", [TableCell(6.05, 1), TableCell("NA", 2)], source="Nubert et al., ICRA 2021"),
+    ]
+    return Comparison(
+        title=f"Title {HOSTILE}",
+        command=f"lidarslam compare 'a b' --methods {HOSTILE}",
+        sequences=[
+            SequenceComparison(
+                f"street {HOSTILE}", "/data/street", street, "ground truth", first, (f"note {HOSTILE}",)
+            ),
+            SequenceComparison("corridor", "/data/corridor", corridor, "ground truth", second),
+        ],
+        versions={"lidarslam": "0.1.0", "commit": "0123abc"},
+        machine={"processor": f"some {HOSTILE}", "cores": "8"},
+        published=[
+            PublishedRow(
+                "LOAM", {"09 translation_percent": 1.2, "10 translation_percent": "NA", "ATE": 0.345}, "Zhang, 2014"
+            )
+        ],
+        tables=[SummaryTable(f"Means {HOSTILE}", columns, rows, "a note")],
+        missing=[MissingRecording("03", "/data/03", "holds no scans")],
+        notes=["interrupted"],
+    )

@@ -125,9 +125,11 @@ def test_json_has_the_promised_keys_and_no_nan(random_drive, noisy, straight_dri
         "rpe_rotation_rmse_deg",
         "end_error_m",
     }
-    assert set(written["kitti"]) == drift | {"by_length"}
+    assert set(written["kitti"]) == drift | {"by_length", "by_speed"}
     assert set(written["kitti"]["by_length"]) == lengths
     assert all(set(part) == drift for part in written["kitti"]["by_length"].values())
+    assert set(written["kitti"]["by_speed"]) == {str(mps) for mps in range(2, 26, 2)}
+    assert [mps for mps, part in written["kitti"]["by_speed"].items() if part] == ["8", "10", "12"]
     assert set(written["segments"]) == {"5", "10", "25", "40", "60", "100"}
     assert all(set(p) == {"translation_percent", "rotation_deg_per_10m"} for p in written["segments"].values())
     assert written["map"] is None

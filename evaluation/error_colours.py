@@ -1,0 +1,24 @@
+"""Colours that tell distances apart, under every colour blindness."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+
+DEFAULT_CLIP_M = 0.5
+
+# Viridis at nine even stops (van der Walt, Smith, 2015): even in lightness, from dark for none to bright for far.
+_VIRIDIS = np.array(
+    [
+        [68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142],
+        [31, 158, 137], [53, 183, 121], [109, 205, 89], [253, 231, 37],
+    ],
+    dtype=np.float64,
+)  # fmt: skip
+
+
+def error_colours(distances_m: FloatArray, clip_m: float = DEFAULT_CLIP_M) -> NDArray[np.uint8]:
+    """Colours (N, 3) of distances (N,): dark violet at 0, over blue and green to yellow at `clip_m` and beyond."""
+    level = np.clip(np.nan_to_num(distances_m, nan=clip_m, posinf=clip_m) / clip_m, 0.0, 1.0)
+    stops = np.linspace(0.0, 1.0, len(_VIRIDIS))
+    return np.stack([np.interp(level, stops, column) for column in _VIRIDIS.T], axis=1).round().astype(np.uint8)

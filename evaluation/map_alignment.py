@@ -1,0 +1,220 @@
+"""Bringing a map to the frame of a reference map; the pose is returned, nothing is moved."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from evaluation.global_registration import candidate_poses, is_same
+from evaluation.voxel_thinning import thin
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, rotation_angle, transform_points
+
+GLOBAL = "global"
+
+# A wrong pose in a building puts a quarter of a map on some wall or floor, a right one most of it.
+TRUSTED_FITNESS = 0.5
+_DISTINCT_SHARE = 0.9
+_DISTINCT_M = 1.0
+
+_FINEST_CELL_M = 0.1
+_MOST_POINTS = 150_000
+_LEAST_INLIER_M = 0.2
+# ICP looks for partners this far away, coarse to fine.
+_ICP_STAGES_M = (2.0, 1.0, 0.5)
+_ICP_ITERATIONS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class MapAlignment:
+    """The pose of a map in the frame of its reference, and what speaks for it.
+
+    Attributes:
+        T_reference_map: (4, 4).
+        method: the guess that it goes back to: "trajectory", "file", "none" or "global".
+        refined: whether ICP had its say.
+        fitness: share of the map's points that have a point of the reference within `inlier_m`, 0 to 1.
+        inlier_rmse_m: root mean square distance of those; None when there are none.
+        inlier_m: how near is near.
+        moved_m: how far ICP moved the map's middle; this much misplacement no longer shows in the map's errors.
+        moved_deg: how far ICP turned it.
+        runner_up: fitness of the next best, different pose of a global search.
+    """
+
+    T_reference_map: FloatArray
+    method: str
+    refined: bool
+    fitness: float
+    inlier_rmse_m: float | None
+    inlier_m: float
+    moved_m: float = 0.0
+    moved_deg: float = 0.0
+    runner_up: float | None = None
+
+    @property
+    def is_trustworthy(self) -> bool:
+        """Whether half of the map lies on the reference, and in no other way nearly as well."""
+        distinct = self.runner_up is None or self.runner_up < _DISTINCT_SHARE * self.fitness
+        return self.fitness >= TRUSTED_FITNESS and distinct
+
+    def to_json(self) -> dict[str, object]:
+        """All of it, for metrics.json."""
+        return {
+            "method": self.method,
+            "refined": self.refined,
+            "T_reference_map": self.T_reference_map.tolist(),
+            "fitness": self.fitness,
+            "inlier_rmse_m": self.inlier_rmse_m,
+            "inlier_m": self.inlier_m,
+            "moved_m": self.moved_m,
+            "moved_deg": self.moved_deg,
+            "trustworthy": self.is_trustworthy,
+        }
+
+
+def align_map(
+    map_points: FloatArray,
+    reference_points: FloatArray,
+    guesses: Mapping[str, FloatArray],
+    search: bool = False,
+    refine: bool = True,
+) -> MapAlignment:
+    """The pose of a map (N, 3) in the frame of a reference (M, 3).
+
+    With `search`, the guesses are tried in their order and the first trustworthy one is taken, else a global search
+    decides. Without, there is one guess, which is taken whatever its fitness. ICP from point to plane, coarse to
+    fine, improves on each, unless `refine` is off.
+
+    Args:
+        map_points: in the map's own frame.
+        reference_points: in the reference's frame.
+        guesses: name -> `T_reference_map` (4, 4).
+        search: whether to go on when no guess is trustworthy.
+        refine: whether ICP follows; a global search always needs it.
+
+    Raises:
+        InputError: no pose was found that can be trusted.
+        ValueError: there is nothing to start from, or several guesses and no search among them.
+    """
+    if not search and len(guesses) != 1:
+        raise ValueError(f"expected one guess, or a search, got {len(guesses)} guesses")
+    clouds = _Clouds.prepare(map_points, reference_points)
+    tried = []
+    for name, T_reference_map in guesses.items():
+        alignment = clouds.judge(T_reference_map, name, refine)
+        if alignment.is_trustworthy or not search:
+            return alignment
+        tried.append(alignment)
+    found = _search(clouds)
+    if found is None or not found.is_trustworthy:
+        raise InputError(_explain([*tried, *([] if found is None else [found])]))
+    return found
+
+
+def _search(clouds: "_Clouds") -> MapAlignment | None:
+    """The best pose that a global search finds, with the fitness of the next best."""
+    poses = candidate_poses(clouds.mapped, clouds.reference)
+    refined = sorted(
+        (clouds.judge(clouds.to_given(T), GLOBAL, refine=True) for T in poses), key=lambda found: -found.fitness
+    )
+    if not refined:
+        return None
+    best = refined[0]
+    T_best = clouds.to_local(best.T_reference_map)
+    others = [o.fitness for o in refined[1:] if not is_same(T_best, clouds.to_local(o.T_reference_map), _DISTINCT_M)]
+    # How far ICP moved it from a rough candidate tells nobody anything.
+    return MapAlignment(
+        best.T_reference_map, GLOBAL, True, best.fitness, best.inlier_rmse_m, best.inlier_m,
+        runner_up=max(others, default=0.0),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Clouds:
+    """Both clouds, thinned, each about its own middle, where ICP keeps its digits whatever the survey's origin."""
+
+    mapped: FloatArray
+    reference: FloatArray
+    tree: cKDTree
+    inlier_m: float
+    middle_map: FloatArray
+    middle_reference: FloatArray
+
+    @classmethod
+    def prepare(cls, map_points: FloatArray, reference_points: FloatArray) -> "_Clouds":
+        if not len(map_points) or not len(reference_points):
+            raise InputError("the map or its reference holds no point; nothing can be aligned")
+        cell_m = _FINEST_CELL_M
+        mapped, reference = thin(map_points, cell_m), thin(reference_points, cell_m)
+        while max(len(mapped), len(reference)) > _MOST_POINTS:
+            cell_m *= 1.3
+            mapped, reference = thin(mapped, cell_m), thin(reference, cell_m)
+        middle_map, middle_reference = np.median(mapped, axis=0), np.median(reference, axis=0)
+        mapped, reference = mapped - middle_map, reference - middle_reference
+        inlier_m = max(_LEAST_INLIER_M, 2.0 * cell_m)
+        return cls(mapped, reference, cKDTree(reference), inlier_m, middle_map, middle_reference)
+
+    def to_local(self, T_reference_map: FloatArray) -> FloatArray:
+        """From the frames given to those about the middles."""
+        R = T_reference_map[:3, :3]
+        return make_transform(R, R @ self.middle_map + T_reference_map[:3, 3] - self.middle_reference)
+
+    def to_given(self, T_local: FloatArray) -> FloatArray:
+        """The way back."""
+        R = T_local[:3, :3]
+        return make_transform(R, T_local[:3, 3] + self.middle_reference - R @ self.middle_map)
+
+    def judge(self, T_reference_map: FloatArray, method: str, refine: bool) -> MapAlignment:
+        """The guess, refined where that brings more of the map onto the reference, with its fitness."""
+        T_guess = self.to_local(T_reference_map)
+        T_local, (fitness, rmse_m) = T_guess, self._fitness(T_guess)
+        if refine:
+            T_icp = _icp(self.mapped, self.reference, T_guess)
+            after = self._fitness(T_icp)
+            if after[0] >= fitness:
+                T_local, (fitness, rmse_m) = T_icp, after
+        moved = inverse(T_guess) @ T_local
+        return MapAlignment(
+            T_reference_map=self.to_given(T_local),
+            method=method,
+            refined=refine,
+            fitness=fitness,
+            inlier_rmse_m=rmse_m,
+            inlier_m=self.inlier_m,
+            moved_m=float(np.linalg.norm(moved[:3, 3])),
+            moved_deg=float(np.rad2deg(rotation_angle(moved))),
+        )
+
+    def _fitness(self, T_local: FloatArray) -> tuple[float, float | None]:
+        moved = transform_points(T_local, self.mapped)
+        distances, _ = self.tree.query(moved, distance_upper_bound=self.inlier_m, workers=-1)
+        near = distances[np.isfinite(distances)]
+        return len(near) / len(distances), float(np.sqrt(np.mean(near**2))) if len(near) else None
+
+
+def _icp(source: FloatArray, target: FloatArray, T_target_source: FloatArray) -> FloatArray:
+    """The pose (4, 4) improved by point-to-plane ICP (Chen, Medioni, 1992), partners nearer and nearer."""
+    import open3d as o3d
+
+    moving = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(source))
+    still = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(target))
+    still.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
+    registration = o3d.pipelines.registration
+    to_plane = registration.TransformationEstimationPointToPlane()
+    stop = registration.ICPConvergenceCriteria(max_iteration=_ICP_ITERATIONS)
+    for distance_m in _ICP_STAGES_M:
+        found = registration.registration_icp(moving, still, distance_m, T_target_source, to_plane, stop)
+        T_target_source = np.array(found.transformation, dtype=np.float64)
+    return T_target_source
+
+
+def _explain(tried: list[MapAlignment]) -> str:
+    """What was tried, how badly each fits, and what to do."""
+    fits = "; ".join(f"{a.method}: {100.0 * a.fitness:.0f} % of the map within {a.inlier_m:g} m" for a in tried)
+    last = tried[-1] if tried else None
+    if last is not None and last.fitness >= TRUSTED_FITNESS:
+        why = f"lies on its reference in more than one way ({100.0 * (last.runner_up or 0.0):.0f} % in another)"
+    else:
+        why = "cannot be laid on its reference so that half of it fits"
+    return f"the map {why} ({fits or 'no pose was found'}); give the pose as a 4x4 text file with --map-alignment FILE"

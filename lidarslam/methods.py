@@ -1,0 +1,88 @@
+"""Methods as the command line of a comparison names them: BASE[@VOXEL][+map][+graph]."""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import get_args
+
+from lidarslam.config import Config
+from lidarslam.core.errors import ConfigError
+from odometry.config import OdometryName
+
+# A name that says what it is to a user -> the odometry's name in the configuration.
+_BASES = {"learned": "learned", "kiss-icp": "kiss-icp", "constant-velocity": "constant-velocity", "prior": "external"}
+_NAME = re.compile(r"(?P<base>[a-z][a-z-]*)(@(?P<voxel>[^+@]+))?(?P<map>\+map)?(?P<graph>\+graph)?")
+_GRAMMAR = f"{', '.join(_BASES)}; each with +map, +graph or +map+graph; and kiss-icp@0.5 for a voxel size of 0.5 m"
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method of a comparison.
+
+    Attributes:
+        name: as the user named it, such as `kiss-icp@0.5` or `learned+map`.
+        settings: what it sets in the configuration, `key.path=value`.
+    """
+
+    name: str
+    settings: tuple[str, ...]
+
+    @property
+    def needs_prior(self) -> bool:
+        """Whether it takes its motions from a given trajectory."""
+        return "odometry.method=external" in self.settings
+
+
+def parse_method(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        ConfigError: no method is called so, or a part of it is not in this version.
+    """
+    match = _NAME.fullmatch(name)
+    if match is None or match["base"] not in _BASES:
+        raise ConfigError(f"no method is called {name!r}; there are: {_GRAMMAR}")
+    odometry = _BASES[match["base"]]
+    if odometry not in get_args(OdometryName):
+        raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
+    if odometry == "constant-velocity" and not match["map"]:
+        raise ConfigError(f"{name}: only predicts; compare constant-velocity+map, which corrects it against the map")
+    return Method(name, tuple(_settings(name, odometry, match)))
+
+
+def _settings(name: str, odometry: str, match: re.Match[str]) -> Iterator[str]:
+    yield f"odometry.method={odometry}"
+    if match["voxel"] is not None:
+        yield f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, odometry, match['voxel'])!r}"
+    yield f"mapping.enabled={str(match['map'] is not None).lower()}"
+    if "pose_graph" in Config.model_fields:
+        yield f"pose_graph.enabled={str(match['graph'] is not None).lower()}"
+    elif match["graph"]:
+        raise ConfigError(f"{name}: the pose graph is not part of this version")
+
+
+def _voxel_size_m(name: str, odometry: str, text: str) -> float:
+    if odometry != "kiss-icp":
+        raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
+    try:
+        size_m = float(text)
+    except ValueError:
+        size_m = math.nan
+    if not 0.0 < size_m < math.inf:
+        raise ConfigError(f"{name}: expected a voxel size in metres, as in kiss-icp@0.5, got {text!r}")
+    return size_m
+
+
+def parse_methods(names: str) -> tuple[Method, ...]:
+    """The methods of a list with commas.
+
+    Raises:
+        ConfigError: one of them does not exist, one is named twice, or there is none.
+    """
+    chosen = [name.strip() for name in names.split(",") if name.strip()]
+    if not chosen:
+        raise ConfigError(f"no method is named; there are: {_GRAMMAR}")
+    if len(set(chosen)) < len(chosen):
+        raise ConfigError(f"a method is named twice in {names!r}; name each once")
+    return tuple(parse_method(name) for name in chosen)

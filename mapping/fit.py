@@ -1,0 +1,78 @@
+"""How well a scan lies on the map, and whether its pose is to be believed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.tracking import Status
+from mapping.config import TrackingConfig
+from mapping.local_map import LocalMap, Matches
+
+# Fewer surfaces facing one way are not counted apart.
+_FEWEST_FACING = 30
+# A scan that meets the map with less of its points has come to a new place, or is lost.
+_LEAST_OVERLAP = 0.1
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a scan lies on the map.
+
+    Attributes:
+        matched: points that met a surface.
+        overlap: their share of all.
+        residual_m: median distance of the matched points from their surfaces; None when there are none.
+        inlier_ratio: share of the matched points that lie on their surface, the worst of those facing each axis of the
+            world: nearly everything fits the ground. None when there are none.
+    """
+
+    matched: int
+    overlap: float
+    residual_m: float | None
+    inlier_ratio: float | None
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of all points that lie on the map, by the worst axis."""
+        return self.overlap * (self.inlier_ratio or 0.0)
+
+    def status(self, config: TrackingConfig) -> Status:
+        """What that means."""
+        if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP or self.inlier_ratio < config.lost_below:
+            return Status.LOST
+        return Status.DEGRADED if self.inlier_ratio < config.degraded_below else Status.OK
+
+    def explain(self, config: TrackingConfig) -> str:
+        """Why the status is not ok; empty when it is."""
+        if self.status(config) is Status.OK:
+            return ""
+        if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP:
+            return f"only {100.0 * self.overlap:.0f} % of the scan meets the map"
+        return f"only {100.0 * self.inlier_ratio:.0f} % of the scan lies on the map"
+
+
+def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, config: TrackingConfig) -> Fit:
+    """Hold compensated points (N, 3) of the LiDAR frame at a pose against the map."""
+    world = transform_points(T_world_lidar, points)
+    matches = local_map.match_planes(world, T_world_lidar[:3, 3])
+    if not len(matches):
+        return Fit(0, 0.0, None, None)
+    distances = plane_distances(world, matches)
+    ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
+    nearest = max(config.gate_min_m, config.gate_cells * local_map.cell_m)
+    inlier = distances < np.maximum(nearest, config.gate_ratio * ranges)
+    facing = np.abs(matches.normals).argmax(axis=1)
+    shares = [float(inlier[facing == axis].mean()) for axis in range(3) if (facing == axis).sum() >= _FEWEST_FACING]
+    return Fit(
+        matched=len(matches),
+        overlap=len(matches) / len(points),
+        residual_m=float(np.median(distances)),
+        inlier_ratio=min(shares, default=float(inlier.mean())),
+    )
+
+
+def plane_distances(world: FloatArray, matches: Matches) -> FloatArray:
+    """How far (M,) the matched points of the world are from their surfaces."""
+    offsets = world.take(matches.index, axis=0) - matches.points
+    return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))

@@ -1,0 +1,165 @@
+"""The map around the sensor that scans are registered to: planes at several sizes of cells, and lines."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from mapping.patches import PatchTable
+from mapping.surfel_grid import SurfelGrid
+from mapping.voxel_table import ABSENT
+
+# Sizes of the grids, in cells: the finest that shows a plane decides, the coarser reach farther.
+LEVELS = (1, 2, 4)
+# A single ring bent around a corner spans a plane too, the one of its own rays. A plane that holds the rays it was seen
+# by, being seen at a flatter angle than asin of the first, counts only when the rays differ in height by the second.
+_LEAST_SINE = 0.17
+_LEAST_HEIGHT_M = 0.05
+# Memory is bounded by forgetting what is far away, now and then rather than at every scan.
+_FORGET_AFTER = 0.1
+# A sensor is tilted by less than this from the vertical, as a cosine, when it first looks.
+_LEAST_COSINE_UP = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """M pulls, each of one point towards a surface along one direction; a line pulls its point along two.
+
+    Attributes:
+        index: (M,) which point.
+        points: (M, 3) on the surface, in the world.
+        normals: (M, 3) unit, the direction.
+        thickness_m: (M,) standard deviation of the surface along it.
+        tilt: (M,) standard deviation of the direction itself, radians.
+    """
+
+    index: NDArray[np.intp]
+    points: FloatArray
+    normals: FloatArray
+    thickness_m: FloatArray
+    tilt: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @classmethod
+    def join(cls, parts: Sequence["Matches"]) -> "Matches":
+        """All of them after one another."""
+        return cls(
+            np.concatenate([part.index for part in parts]),
+            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.normals for part in parts]),
+            np.concatenate([part.thickness_m for part in parts]),
+            np.concatenate([part.tilt for part in parts]),
+        )
+
+
+class LocalMap:
+    """Planes and lines within a radius of the sensor."""
+
+    def __init__(self, cell_m: float, radius_m: float) -> None:
+        self.cell_m = cell_m
+        self._radius_m = radius_m
+        self._planes = [SurfelGrid(cell_m * level) for level in LEVELS]
+        self._lines = SurfelGrid(cell_m * LEVELS[1])
+        self._centre: FloatArray | None = None
+
+    def __len__(self) -> int:
+        """How many cells are held, all grids together."""
+        return sum(len(grid) for grid in (*self._planes, self._lines))
+
+    def add(self, planes: FloatArray, elevations: FloatArray, edges: FloatArray, sensor: FloatArray) -> None:
+        """Add a scan.
+
+        Args:
+            planes: (N, 3) points, in the world.
+            elevations: (N,) the angles above the sensor's equator that they were seen at, radians.
+            edges: (E, 3) points on edges, in the world.
+            sensor: (3,) where they were seen from.
+        """
+        for grid in self._planes:
+            grid.add(planes, elevations)
+        self._lines.add(edges, np.zeros(len(edges)))
+        if self._centre is None:
+            self._centre = sensor
+        if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
+            self._centre = sensor
+            for grid in (*self._planes, self._lines):
+                grid.forget_beyond(sensor, self._radius_m)
+
+    def match_planes(self, points: FloatArray, sensor: FloatArray, first_level: int = 0) -> Matches:
+        """For points (N, 3) of the world, seen from `sensor` (3,), the plane in the finest grid that shows one.
+
+        Grids finer than `first_level` are left out, for points that are not yet where they belong.
+        """
+        waiting = np.arange(len(points))
+        parts = []
+        for grid in self._planes[first_level:]:
+            there = points.take(waiting, axis=0)
+            rows = grid.look_up(there)
+            occupied = np.flatnonzero(rows != ABSENT)
+            patches = grid.patches(rows[occupied])
+            views = there.take(occupied, axis=0) - sensor
+            chosen = np.flatnonzero(patches.is_plane & _are_resolved(patches, views))
+            parts.append(_pull_to_planes(waiting[occupied[chosen]], patches.select(chosen)))
+            still = np.ones(len(waiting), dtype=np.bool_)
+            still[occupied[chosen]] = False
+            waiting = waiting[still]
+        return Matches.join(parts)
+
+    def match_lines(self, points: FloatArray) -> Matches:
+        """For edge points (N, 3) of the world the lines they lie on."""
+        rows = self._lines.look_up(points)
+        occupied = np.flatnonzero(rows != ABSENT)
+        patches = self._lines.patches(rows[occupied])
+        chosen = np.flatnonzero(patches.is_line)
+        return _pull_to_lines(occupied[chosen], patches.select(chosen))
+
+    def vertical(self) -> FloatArray:
+        """The direction (3,) that floors and ceilings near the sensor face; the world's z axis when there are none."""
+        grid = self._planes[-1]
+        patches = grid.patches(np.arange(len(grid), dtype=np.int32))
+        normals = patches.normals[patches.is_plane & (np.abs(patches.normals[:, 2]) > _LEAST_COSINE_UP)]
+        mean = (normals * np.sign(normals[:, 2:])).sum(axis=0)
+        length = float(np.linalg.norm(mean))
+        return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
+
+    def resized(self, cell_m: float) -> "LocalMap":
+        """The same map in cells of another size, from the mean points of these."""
+        other = LocalMap(cell_m, self._radius_m)
+        other._centre = self._centre
+        for grid, source in zip(other._planes, self._planes, strict=True):
+            means = source.means()
+            grid.add(means, np.zeros(len(means)))
+        means = self._lines.means()
+        other._lines.add(means, np.zeros(len(means)))
+        return other
+
+
+def _are_resolved(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
+    """Which patches (N,), seen along `views` (N, 3), are surfaces rather than the trace of a single ring."""
+    ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
+    facing = np.abs(np.einsum("ij,ij->i", views, patches.normals))
+    return (facing > _LEAST_SINE * ranges) | (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
+
+
+def _pull_to_planes(index: NDArray[np.intp], patches: PatchTable) -> Matches:
+    spreads = patches.spreads_m
+    tilt = spreads[:, 0] / (np.maximum(spreads[:, 1], 1e-9) * np.sqrt(patches.counts))
+    return Matches(index, patches.points, patches.normals, spreads[:, 0], tilt)
+
+
+def _pull_to_lines(index: NDArray[np.intp], patches: PatchTable) -> Matches:
+    """Two directions across each line: the one it is thinnest in, and the other."""
+    spreads = patches.spreads_m
+    tilt = spreads[:, 1] / (np.maximum(spreads[:, 2], 1e-9) * np.sqrt(patches.counts))
+    across = np.cross(patches.directions, patches.normals)
+    return Matches(
+        np.concatenate([index, index]),
+        np.concatenate([patches.points, patches.points]),
+        np.concatenate([patches.normals, across]),
+        np.concatenate([spreads[:, 0], spreads[:, 1]]),
+        np.concatenate([tilt, tilt]),
+    )

@@ -1,0 +1,40 @@
+"""Finding the way back: a scan that fits nowhere near its prediction is tried all around."""
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp, transform_points
+from mapping.local_map import LocalMap
+
+# Points of the scan that each start is judged by, and how many starts are worth refining.
+_SCORED_POINTS = 600
+_BEST = 3
+_COARSEST = 2
+# Distance, in finest cells, at which a point counts half.
+_HALF_CELLS = 2.0
+
+
+def start_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float) -> FloatArray:
+    """Poses (K, 4, 4) at one place, turned around `up` (3,), the vertical of the world, in even steps; the given first."""
+    count = max(1, round(360.0 / yaw_step_deg))
+    steps = np.arange(count)
+    signed = np.where(steps % 2 == 1, (steps + 1) // 2, -(steps // 2))
+    turns = np.zeros((count, 6))
+    turns[:, :3] = np.deg2rad(360.0 / count) * signed[:, None] * up
+    turned: FloatArray = np.tile(T_world_lidar, (count, 1, 1))
+    turned[:, :3, :3] = exp(turns)[:, :3, :3] @ T_world_lidar[:3, :3]
+    return turned
+
+
+def best_starts(points: FloatArray, starts: FloatArray, local_map: LocalMap) -> FloatArray:
+    """The few of the poses (K, 4, 4) at which compensated points (N, 3) of the LiDAR frame lie nearest to the map."""
+    few = points[:: max(1, len(points) // _SCORED_POINTS)]
+    scores = [_score(few, start, local_map) for start in starts]
+    return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
+
+
+def _score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> float:
+    world = transform_points(T_world_lidar, points)
+    matches = local_map.match_planes(world, T_world_lidar[:3, 3], first_level=_COARSEST)
+    offsets = world.take(matches.index, axis=0) - matches.points
+    distances = np.einsum("ij,ij->i", offsets, matches.normals)
+    return float((1.0 / (1.0 + (distances / (_HALF_CELLS * local_map.cell_m)) ** 2)).sum())

@@ -1,0 +1,269 @@
+"""Scan-to-map registration: the pose, and the velocity during the sweep, that lay a scan on the map.
+
+Each point is pulled towards a plane of the map, each edge point towards a line. The pulls are linearised and solved
+(Gauss-Newton on the manifold), the surfaces looked up again, until nothing moves: LOAM's scan matching (Zhang and
+Singh, RSS 2014) with robust weights. A sweep is no snapshot, so the sensor's velocity during it is estimated together
+with the pose at its stamp, as begin and end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, orthonormalize, transform_points
+from mapping.config import RefinementConfig
+from mapping.degeneracy import Degeneracy, find_degeneracy
+from mapping.deskew import move
+from mapping.local_map import LocalMap, Matches
+
+# Standard deviation of a range measurement: no surface is known better than that.
+_RANGE_NOISE_M = 0.02
+# The kernel's scale follows the residuals: this many times their median, within bounds in cells.
+_SCALE_PER_MEDIAN = 1.5
+_LEAST_SCALE = 0.03
+_COARSE_SCALE = 0.6
+# Farther from its surface than this, in cells, a point belongs to something else.
+_GATE = 6.0
+# How firmly the prior is kept along directions that the matches leave open: as if measured to a tenth of a millimetre.
+_HELD = 1e8
+# Weights take residuals for independent; neighbouring points err together. Compared with true errors on simulated
+# recordings (tests/mapping/test_refinement.py), variances are too small by this factor.
+_CORRELATION = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The points of a scan that are registered, as measured: each in the LiDAR frame of its own instant.
+
+    Attributes:
+        planes, edges: (N, 3) and (E, 3).
+        plane_times, edge_times: (N,) and (E,) seconds from the stamp; None when the scan is compensated already.
+    """
+
+    planes: FloatArray
+    edges: FloatArray
+    plane_times: FloatArray | None = None
+    edge_times: FloatArray | None = None
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether the points were measured at different times."""
+        return self.plane_times is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where a scan is expected before it is held against the map.
+
+    Attributes:
+        T_world_lidar: (4, 4) at the stamp.
+        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
+        pose_sigmas: (6,) standard deviations, rotation first, in the LiDAR frame.
+        velocity_sigmas: (6,).
+    """
+
+    T_world_lidar: FloatArray
+    velocity: FloatArray
+    pose_sigmas: FloatArray
+    velocity_sigmas: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A registered scan.
+
+    Attributes:
+        T_world_lidar: (4, 4) at the stamp.
+        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
+        covariance: (6, 6) of the pose, of the error `xi` in `T_true = T_world_lidar @ exp(xi)`: rotation first, in the
+            LiDAR frame, as GTSAM has it.
+        degeneracy: the directions along which the prediction was kept.
+        iterations: how many it took.
+    """
+
+    T_world_lidar: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    degeneracy: Degeneracy
+    iterations: int
+
+
+def refine(
+    sweep: Sweep,
+    prediction: Prediction,
+    local_map: LocalMap,
+    config: RefinementConfig,
+    coarse_first: bool,
+    with_velocity: bool,
+) -> Refined | None:
+    """Register a sweep to the map, from a prediction.
+
+    Args:
+        sweep: the points.
+        prediction: where to start, and what is kept where the map does not tell.
+        local_map: what is registered to.
+        config: limits of the iteration.
+        coarse_first: whether the prediction may be off by more than a cell.
+        with_velocity: whether the velocity during the sweep is estimated too.
+
+    Returns:
+        None when too few points meet a surface.
+    """
+    T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
+    solution: _Solution | None = None
+    for iteration in range(config.max_iterations):
+        coarse = coarse_first and iteration < config.coarse_iterations
+        points, matches = _match(sweep, T_world_lidar, velocity, local_map, coarse)
+        if len(matches) < config.min_matches:
+            return None
+        solution = _solve(
+            _Linearised.at(T_world_lidar, points, matches, local_map.cell_m, coarse),
+            _times(sweep, matches) if with_velocity and sweep.is_rolling else None,
+            prediction,
+            T_world_lidar,
+            velocity,
+        )
+        T_world_lidar = T_world_lidar @ exp(solution.pose_step)
+        velocity = velocity + solution.velocity_step
+        if not coarse and _has_converged(solution.pose_step, config):
+            break
+    assert solution is not None
+    return Refined(
+        orthonormalize(T_world_lidar), velocity, solution.covariance, solution.degeneracy, iteration + 1
+    )
+
+
+def compensated(points: FloatArray, times: FloatArray | None, velocity: FloatArray) -> FloatArray:
+    """Points (N, 3) as they would have been seen at the stamp."""
+    return points if times is None or not len(points) else move(points, times, velocity)
+
+
+def _match(
+    sweep: Sweep, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap, coarse: bool
+) -> tuple[FloatArray, Matches]:
+    """The compensated points (N + E, 3), planes first, and what they are pulled to."""
+    planes = compensated(sweep.planes, sweep.plane_times, velocity)
+    matches = local_map.match_planes(
+        transform_points(T_world_lidar, planes), T_world_lidar[:3, 3], first_level=1 if coarse else 0
+    )
+    if not len(sweep.edges):
+        return planes, matches
+    edges = compensated(sweep.edges, sweep.edge_times, velocity)
+    lines = local_map.match_lines(transform_points(T_world_lidar, edges))
+    shifted = Matches(lines.index + len(planes), lines.points, lines.normals, lines.thickness_m, lines.tilt)
+    return np.concatenate([planes, edges]), Matches.join([matches, shifted])
+
+
+def _times(sweep: Sweep, matches: Matches) -> FloatArray:
+    assert sweep.plane_times is not None
+    times = sweep.plane_times
+    if sweep.edge_times is not None and len(sweep.edge_times):
+        times = np.concatenate([times, sweep.edge_times])
+    return times.take(matches.index)
+
+
+def _has_converged(step: FloatArray, config: RefinementConfig) -> bool:
+    return bool(
+        np.linalg.norm(step[:3]) < np.deg2rad(config.converged_rotation_deg)
+        and np.linalg.norm(step[3:]) < config.converged_translation_m
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Residuals (M,) of the matches at a pose, and their change (M, 6) with a motion in the LiDAR frame."""
+
+    residuals: FloatArray
+    jacobian: FloatArray
+    weights: FloatArray
+    tilt: FloatArray
+    lever_m: float
+
+    @classmethod
+    def at(
+        cls, T_world_lidar: FloatArray, points: FloatArray, matches: Matches, cell_m: float, coarse: bool
+    ) -> "_Linearised":
+        p = points.take(matches.index, axis=0)
+        offsets = transform_points(T_world_lidar, p) - matches.points
+        residuals = np.einsum("ij,ij->i", offsets, matches.normals)
+        normals = matches.normals @ T_world_lidar[:3, :3]
+        lever_m = float(np.sqrt(np.einsum("ij,ij->", p, p) / max(len(p), 1)))
+        return cls(
+            residuals,
+            np.concatenate([_cross(p, normals), normals], axis=1),
+            _weights(residuals, matches.thickness_m, cell_m, coarse),
+            matches.tilt,
+            lever_m,
+        )
+
+
+def _weights(residuals: FloatArray, thickness_m: FloatArray, cell_m: float, coarse: bool) -> FloatArray:
+    """Information of each residual, under the kernel of Geman and McClure with a scale that follows the residuals."""
+    size = np.abs(residuals)
+    least = _COARSE_SCALE if coarse else _LEAST_SCALE
+    scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), least * cell_m)
+    weights = 1.0 / ((1.0 + (size / scale) ** 2) ** 2 * (thickness_m**2 + _RANGE_NOISE_M**2))
+    weights[size > _GATE * cell_m * (2.0 if coarse else 1.0)] = 0.0
+    return np.asarray(weights, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    pose_step: FloatArray
+    velocity_step: FloatArray
+    covariance: FloatArray
+    degeneracy: Degeneracy
+
+
+def _solve(
+    system: _Linearised,
+    times: FloatArray | None,
+    prediction: Prediction,
+    T_world_lidar: FloatArray,
+    velocity: FloatArray,
+) -> _Solution:
+    """One Gauss-Newton step of pose and, where `times` (M,) are given, velocity.
+
+    A point seen at time t moves with the velocity's change as with t times the pose's, to first order.
+    """
+    J, r = system.jacobian, system.residuals
+    degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
+    held = _HELD * degeneracy.projector()
+    JW = J * system.weights[:, None]
+    H = np.zeros((12, 12))
+    b = np.zeros(12)
+    H[:6, :6] = JW.T @ J + np.diag(prediction.pose_sigmas**-2) + held
+    error = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
+    b[:6] = -(JW.T @ r) - (np.diag(prediction.pose_sigmas**-2) + held) @ error
+    if times is None:
+        covariance = np.linalg.inv(H[:6, :6])
+        step = covariance @ b[:6]
+        return _Solution(step, np.zeros(6), _honest(covariance, prediction, degeneracy), degeneracy)
+    JWt = JW * times[:, None]
+    about_velocity = np.diag(prediction.velocity_sigmas**-2) + held * float(np.mean(times**2))
+    H[:6, 6:] = JW.T @ (J * times[:, None])
+    H[6:, :6] = H[:6, 6:].T
+    H[6:, 6:] = JWt.T @ (J * times[:, None]) + about_velocity
+    b[6:] = -(JWt.T @ r) - about_velocity @ (velocity - prediction.velocity)
+    covariance = np.linalg.inv(H)
+    step = covariance @ b
+    return _Solution(step[:6], step[6:], _honest(covariance[:6, :6], prediction, degeneracy), degeneracy)
+
+
+def _honest(covariance: FloatArray, prediction: Prediction, degeneracy: Degeneracy) -> FloatArray:
+    """The covariance with the residuals' correlation made up for, and the prediction's where that was kept."""
+    inflated = _CORRELATION * covariance
+    scale = np.array([degeneracy.lever_m] * 3 + [1.0] * 3)
+    for direction in degeneracy.directions:
+        motion = direction / scale
+        inflated = inflated + float(direction**2 @ (prediction.pose_sigmas * scale) ** 2) * np.outer(motion, motion)
+    return np.asarray(inflated, dtype=np.float64)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (N, 3), several times as fast as NumPy's."""
+    out = np.empty_like(a)
+    out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return out

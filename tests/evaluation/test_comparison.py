@@ -1,0 +1,125 @@
+"""What comparison.json holds, and means over recordings."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation.comparison import Comparison, MethodResult, MethodStatus, MissingRecording, SequenceComparison
+from evaluation.mean_table import TablePlan, mean_table
+from evaluation.quantities import QUANTITIES, find_quantity
+from evaluation.summary_table import TableCell, TableRow
+from evaluation.trajectory_metrics import evaluate_trajectory
+from lidarslam.core.errors import ConfigError
+from lidarslam.core.geometry import exp
+from lidarslam.core.trajectory import Trajectory
+
+
+@pytest.fixture
+def truth() -> Trajectory:
+    """150 m, straight on, a metre every tenth of a second."""
+    steps = np.zeros((151, 6))
+    steps[:, 3] = np.arange(151)
+    return Trajectory(0.1 * np.arange(151), exp(steps))
+
+
+@pytest.fixture
+def result(truth: Trajectory) -> MethodResult:
+    """A method whose metres are one per cent too long."""
+    poses = truth.T_world_lidar.copy()
+    poses[:, :3, 3] *= 1.01
+    estimate = Trajectory(truth.stamps, poses)
+    return MethodResult(
+        "kiss-icp",
+        "ok",
+        trajectory=estimate,
+        lost=np.arange(151) < 2,
+        metrics=evaluate_trajectory(estimate, truth),
+        ms_per_scan_median=20.0,
+        stage_ms={"odometry": 15.0},
+    )
+
+
+def _sequence(name: str, *results: MethodResult) -> SequenceComparison:
+    return SequenceComparison(name, f"data/{name}", None, "ground truth", results)
+
+
+def test_a_method_without_anything_is_null_and_never_0() -> None:
+    content = MethodResult("kiss-icp", "failed", "aborted (signal 6)").to_json()
+    assert content["status"] == "failed"
+    assert content["message"] == "aborted (signal 6)"
+    absent = ("metrics", "ms_per_scan_median", "ms_per_scan_p95", "lost_scans", "peak_rss_mb", "wall_s", "run")
+    assert [content[key] for key in absent] == [None] * len(absent)
+
+
+def test_metrics_are_those_of_metrics_json_with_the_map_in_place(result: MethodResult) -> None:
+    assert result.metrics is not None
+    assert result.to_json()["metrics"] == result.metrics.to_json()
+    mapped = replace(result, map_metrics={"chamfer_m": 0.1}).to_json()["metrics"]
+    assert mapped == {**result.metrics.to_json(), "map": {"chamfer_m": 0.1}}
+    only_map: Any = MethodResult("m", "ok", map_metrics={"chamfer_m": 0.1}).to_json()["metrics"]
+    assert only_map["map"] == {"chamfer_m": 0.1}
+    assert only_map["trajectory"] is None
+
+
+def test_one_recording_has_its_own_keys_and_several_a_list(result: MethodResult) -> None:
+    one = Comparison("t", "c", [_sequence("04", result)], notes=["n"]).to_json()
+    assert one["sequence"] == "04"
+    assert set(one["methods"]) == {"kiss-icp"}  # type: ignore[call-overload]
+    assert one["notes"] == ["n"]
+    missing = [MissingRecording("06", "data/06", "not there")]
+    several = Comparison("t", "c", [_sequence("04", result), _sequence("05", result)], missing=missing)
+    content = json.loads(json.dumps(several.to_json(), allow_nan=False))
+    assert [sequence["sequence"] for sequence in content["sequences"]] == ["04", "05"]
+    assert content["missing"] == [{"sequence": "06", "source": "data/06", "reason": "not there"}]
+    assert "methods" not in content
+
+
+def test_quantities_are_read_off_the_entry(result: MethodResult) -> None:
+    assert find_quantity("kitti_translation_percent").of(result) == pytest.approx(1.0, abs=0.02)
+    assert find_quantity("segment_10_translation_percent").of(result) == pytest.approx(1.0, abs=1e-6)
+    assert find_quantity("odometry_ms_median").of(result) == 15.0
+    assert find_quantity("lost_scans").of(result) == 2.0
+    assert find_quantity("map_chamfer_m").of(result) is None
+    mapped = replace(result, map_metrics={"f_score_percent": {"0.2": 80.0}, "coverage_percent": {"1.0": 90.0}})
+    assert find_quantity("map_f_score_percent_0.2").of(mapped) == 80.0
+    assert find_quantity("map_coverage_percent_1.0").of(mapped) == 90.0
+    assert all(quantity.of(MethodResult("m", "failed")) is None for quantity in QUANTITIES.values())
+
+
+def test_an_unknown_quantity_lists_the_choices() -> None:
+    with pytest.raises(ConfigError, match="no quantity is called 'ate'; there are: ate_rmse_m"):
+        find_quantity("ate")
+
+
+def _timed(name: str, ms: float | None, status: MethodStatus = "ok") -> MethodResult:
+    return MethodResult(name, status, ms_per_scan_median=ms)
+
+
+def test_means_count_the_recordings_that_have_a_value() -> None:
+    sequences = [
+        _sequence("00", _timed("a", 10.0), _timed("b", 30.0)),
+        _sequence("01", _timed("a", 20.0), _timed("b", None, "failed")),
+        _sequence("02", _timed("a", 60.0, "lost"), _timed("b", 99.0, "stopped")),
+    ]
+    published = TableRow("p", [TableCell(1.0, 4), TableCell(None, 1)], "a paper")
+    groups = {"all": ("00", "01", "02", "03"), "01": ("01",)}
+    plan = TablePlan("Time", groups, [find_quantity("ms_per_scan_median")], [published], "note")
+    table = mean_table(plan, sequences)
+    assert [column.heading for column in table.columns] == ["all", "01"]
+    assert list(table.columns[0].sequences) == ["00", "01", "02", "03"]
+    assert [row.method for row in table.rows] == ["a", "b", "p"]
+    assert list(table.rows[0].cells) == [TableCell(30.0, 3), TableCell(20.0, 1)]
+    assert list(table.rows[1].cells) == [TableCell(30.0, 1), TableCell(None, 0)]
+    assert table.rows[2].source == "a paper"
+    content = json.loads(json.dumps(table.to_json()))
+    assert content["rows"][0]["cells"][0] == {"value": 30.0, "averaged": 3}
+    assert content["columns"][0]["sequences"] == ["00", "01", "02", "03"]
+
+
+def test_columns_stand_quantity_by_quantity_under_each_heading() -> None:
+    quantities = [find_quantity("ms_per_scan_median"), find_quantity("lost_scans")]
+    table = mean_table(TablePlan("T", {"x": ("00",), "y": ("00",)}, quantities), [_sequence("00", _timed("a", 1.0))])
+    assert [(c.heading, c.unit) for c in table.columns] == [("x", "ms/scan"), ("x", ""), ("y", "ms/scan"), ("y", "")]

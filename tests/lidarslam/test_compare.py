@@ -1,0 +1,345 @@
+"""Several methods on a recording: what each comes to, be it a crash, and what is written of it."""
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.compare import CompareOutcome, Counter, Narrator, compare
+from lidarslam.compare_request import CompareRequest, RecordingEntry
+from lidarslam.compare_text import format_comparison
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.methods import parse_methods
+from lidarslam.supervised import Limits
+
+METRICS = {"association", "trajectory", "kitti", "segments", "map"}
+
+# Started in the place of a method: what it does depends on the voxel size that stands in the method's name.
+FAULTS = """
+import json, os, sys, time
+from pathlib import Path
+name = Path(json.loads(sys.argv[-1])["out"]).name
+print("1 5", flush=True)
+if name == "kiss-icp@1": os.abort()
+if name == "kiss-icp@2":
+    held = []
+    while True: held.append(b"x" * 10_000_000); time.sleep(0.01)
+if name == "kiss-icp@3": time.sleep(60)
+if name == "kiss-icp@4": raise RuntimeError("no such thing")
+if name == "kiss-icp@5": raise MemoryError
+if name == "kiss-icp@6": os.kill(os.getpid(), 9)
+if name == "kiss-icp@7": print("lidarslam: the recording is damaged", file=sys.stderr); sys.exit(1)
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.method_process", sys.argv[-1]])
+"""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """Five scans with ground truth."""
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans[:5]):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def faults(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    file = tmp_path_factory.mktemp("faults") / "faults.py"
+    file.write_text(FAULTS)
+    return sys.executable, str(file)
+
+
+def _request(recording: Path, out: Path, methods: str, **changes: Any) -> CompareRequest:
+    entry = RecordingEntry(recording, prior=recording / "ground_truth.tum")
+    return replace(CompareRequest(out, (entry,), parse_methods(methods)), **changes)
+
+
+class Told:
+    """Keeps what is told."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.counts: list[tuple[str, int, int]] = []
+
+    @contextmanager
+    def counting(self, name: str) -> Iterator[Counter]:
+        yield lambda number, total: self.counts.append((name, number, total))
+
+    @property
+    def narrator(self) -> Narrator:
+        return Narrator(self.counting, self.lines.append)
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
+
+
+@pytest.fixture(scope="module")
+def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CompareOutcome, Told]:
+    """Two methods, compared for real."""
+    out, told = tmp_path_factory.mktemp("compared"), Told()
+    return out, compare(_request(recording, out, "kiss-icp@0.5,prior"), told.narrator), told
+
+
+def test_comparison_json_holds_what_the_contract_names(finished: tuple[Path, CompareOutcome, Told]) -> None:
+    content = json.loads((finished[0] / "comparison.json").read_text())
+    assert content["sequence"] == "room"
+    assert list(content["methods"]) == ["kiss-icp@0.5", "prior"]
+    for method in content["methods"].values():
+        assert {"metrics", "ms_per_scan_median", "status"} <= set(method)
+        assert set(method["metrics"]) == METRICS
+        assert method["status"] == "ok"
+        assert method["ms_per_scan_median"] > 0.0
+        assert method["peak_rss_mb"] > 50.0
+        assert method["wall_s"] > 0.1
+        assert method["lost_scans"] == 0
+    assert content["methods"]["prior"]["metrics"]["trajectory"]["ate_rmse_m"] < 1e-6
+    assert content["methods"]["prior"]["metrics"]["map"] is None
+
+
+def test_every_method_leaves_a_run_directory_and_both_reports(finished: tuple[Path, CompareOutcome, Told]) -> None:
+    out = finished[0]
+    for method in ("kiss-icp@0.5", "prior"):
+        assert {"trajectory.tum", "map.ply", "config.yaml", "summary.json", "process.log"} <= {
+            path.name for path in (out / "room" / method).iterdir()
+        }
+    assert "voxel_size_m: 0.5" in (out / "room" / "kiss-icp@0.5" / "config.yaml").read_text()
+    assert "kiss-icp@0.5" in (out / "report.html").read_text()
+    assert "kiss-icp@0.5" in (out / "report.md").read_text()
+
+
+def test_progress_and_results_are_told(finished: tuple[Path, CompareOutcome, Told]) -> None:
+    told = finished[2]
+    assert told.counts[-1] == ("room prior", 5, 5)
+    assert [line.split(" in ")[0] for line in told.lines] == ["room kiss-icp@0.5: ok", "room prior: ok"]
+
+
+def test_the_table_marks_the_best(finished: tuple[Path, CompareOutcome, Told]) -> None:
+    lines = format_comparison(finished[1].comparison, finished[0]).splitlines()
+    prior = next(line for line in lines if line.startswith("prior"))
+    assert lines[0] == "room, against ground truth"
+    assert prior.split()[:3] == ["prior", "ok", "0.000*"]
+    assert any(line.startswith("look      lidarslam view ") for line in lines)
+
+
+def test_what_is_finished_is_reused_and_keeps_its_time(
+    finished: tuple[Path, CompareOutcome, Told], recording: Path, told: Told
+) -> None:
+    out, before, _ = finished
+    none = (sys.executable, "-c", "raise SystemExit('was run again')")
+    again = compare(_request(recording, out, "kiss-icp@0.5,prior", reuse=True), told.narrator, none)
+    first, second = before.comparison.sequences[0], again.comparison.sequences[0]
+    assert [method.wall_s for method in second.methods] == [method.wall_s for method in first.methods]
+    assert [method.to_json() for method in second.methods] == [method.to_json() for method in first.methods]
+    assert all("in an earlier comparison" in line for line in told.lines)
+
+
+def test_an_earlier_comparison_is_not_replaced_unasked(
+    finished: tuple[Path, CompareOutcome, Told], recording: Path, told: Told
+) -> None:
+    with pytest.raises(
+        OutputError, match=r"holds a comparison already \(comparison.json\); .* --reuse, .* --overwrite"
+    ):
+        compare(_request(recording, finished[0], "prior"), told.narrator)
+
+
+def test_other_settings_are_run_again_and_leave_nothing_of_the_earlier(
+    recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
+) -> None:
+    compare(_request(recording, tmp_path, "prior"), told.narrator)
+    broken = (sys.executable, "-c", "import sys; sys.exit('broken')")
+    changed = _request(recording, tmp_path, "prior", reuse=True, settings=("global_map.voxel_size_m=0.3",))
+    outcome = compare(changed, told.narrator, broken)
+    (result,) = outcome.comparison.sequences[0].methods
+    assert (result.status, result.message, result.trajectory) == ("failed", "broken", None)
+    assert outcome.is_empty
+    assert {path.name for path in (tmp_path / "room" / "prior").iterdir()} == {"process.json", "process.log"}
+
+
+def test_whatever_a_method_dies_of_is_its_row(
+    recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
+) -> None:
+    names = ",".join(f"kiss-icp@{number}" for number in (1, 2, 4, 5, 6, 7))
+    limits = Limits(memory_mb=1000.0)
+    outcome = compare(_request(recording, tmp_path, f"{names},prior", limits=limits), told.narrator, faults)
+    rows = [(row.status, row.message) for row in outcome.comparison.sequences[0].methods]
+    assert rows == [
+        ("failed", "aborted (signal 6)"),
+        ("out of memory", "took more than 1,000 MB"),
+        ("failed", "RuntimeError: no such thing"),
+        ("out of memory", "MemoryError"),
+        ("out of memory", "killed by the system (signal 9), as it does when memory runs out"),
+        ("failed", "the recording is damaged"),
+        ("ok", ""),
+    ]
+    assert not outcome.is_empty
+    content = json.loads((tmp_path / "comparison.json").read_text())
+    assert content["methods"]["kiss-icp@1"]["metrics"] is None
+    assert "aborted (signal 6)" in (tmp_path / "report.html").read_text()
+    assert "kiss-icp@1: aborted (signal 6)" in format_comparison(outcome.comparison, tmp_path)
+
+
+def test_one_that_hangs_is_timed_out(recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]) -> None:
+    request = _request(recording, tmp_path, "kiss-icp@3", limits=Limits(timeout_s=1.0))
+    (row,) = compare(request, told.narrator, faults).comparison.sequences[0].methods
+    assert (row.status, row.message) == ("timed out", "took more than 1 s")
+
+
+def test_ctrl_c_ends_the_method_at_work_and_writes_what_there_is(
+    recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
+) -> None:
+    def interrupt() -> None:
+        while not any(name == "room kiss-icp@3" for name, _, _ in told.counts):
+            threading.Event().wait(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    outcome = compare(_request(recording, tmp_path, "prior,kiss-icp@3,kiss-icp"), told.narrator, faults)
+    assert outcome.interrupted
+    assert [row.status for row in outcome.comparison.sequences[0].methods] == ["ok", "not run", "not run"]
+    content = json.loads((tmp_path / "comparison.json").read_text())
+    assert content["notes"][0].startswith("interrupted")
+    assert content["methods"]["prior"]["metrics"]["trajectory"]["ate_rmse_m"] < 1e-6
+
+
+def test_a_method_can_be_the_reference_and_has_no_errors_itself(
+    finished: tuple[Path, CompareOutcome, Told], recording: Path, told: Told
+) -> None:
+    out = finished[0]
+    entry = RecordingEntry(recording, prior=recording / "ground_truth.tum", reference="prior")
+    request = _request(recording, out, "kiss-icp@0.5,prior", recordings=(entry,), reuse=True)
+    sequence = compare(request, told.narrator).comparison.sequences[0]
+    assert sequence.reference_name == "prior"
+    kiss, prior = sequence.methods
+    assert prior.metrics is None
+    assert kiss.metrics is not None
+    assert 0.0 < kiss.metrics.errors.ate_rmse_m < 0.1
+    assert any("no truth" in note for note in sequence.notes)
+
+
+def test_a_file_can_be_the_reference(
+    finished: tuple[Path, CompareOutcome, Told], recording: Path, told: Told, tmp_path: Path, room_truth: Trajectory
+) -> None:
+    late = tmp_path / "late.tum"
+    write_tum(late, Trajectory(room_truth.stamps + 100.0, room_truth.T_world_lidar))
+    for file, has_errors in ((recording / "ground_truth.tum", True), (late, False)):
+        entry = RecordingEntry(recording, prior=recording / "ground_truth.tum", reference=str(file))
+        request = _request(recording, finished[0], "prior", recordings=(entry,), reuse=True)
+        (prior,) = compare(request, told.narrator).comparison.sequences[0].methods
+        assert (prior.metrics is not None) == has_errors
+    assert "the times do not overlap" in prior.message
+
+
+def test_without_any_reference_there_is_still_a_table(
+    recording: Path, tmp_path: Path, told: Told, room_scans: list[Scan]
+) -> None:
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for index, scan in enumerate(room_scans[:3]):
+        np.save(bare / f"{index:06d}.npy", scan.points)
+    np.savetxt(bare / "timestamps.txt", [0.1, 0.2, 0.3], fmt="%.9f")
+    entry = RecordingEntry(bare, prior=recording / "ground_truth.tum")
+    outcome = compare(_request(bare, tmp_path / "out", "prior", recordings=(entry,)), told.narrator)
+    content = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert content["reference"] is None
+    assert content["methods"]["prior"]["metrics"] is None
+    assert content["methods"]["prior"]["ms_per_scan_median"] > 0.0
+    assert "no ground truth" in " ".join(content["notes"]) or "without ground truth" in " ".join(content["notes"])
+    assert not outcome.is_empty
+
+
+def test_several_recordings_have_a_file_each_and_one_for_all(recording: Path, tmp_path: Path, told: Told) -> None:
+    prior = recording / "ground_truth.tum"
+    entries = (
+        RecordingEntry(recording, prior=prior),
+        RecordingEntry(recording, prior=prior, start=1),
+        RecordingEntry(tmp_path / "nowhere", name="gone", prior=prior),
+    )
+    request = _request(recording, tmp_path / "out", "prior", recordings=entries, skip_missing=True)
+    compare(request, told.narrator)
+    content = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert [sequence["sequence"] for sequence in content["sequences"]] == ["room", "room-2"]
+    assert [sequence["methods"]["prior"]["scans"] for sequence in content["sequences"]] == [5, 4]
+    assert content["missing"][0]["sequence"] == "gone"
+    assert "no such file or folder" in content["missing"][0]["reason"]
+    for sequence in content["sequences"]:
+        own = json.loads((tmp_path / "out" / sequence["sequence"] / "comparison.json").read_text())
+        assert own == sequence
+
+
+def test_mistakes_are_found_before_anything_is_run(recording: Path, tmp_path: Path, told: Told) -> None:
+    out = tmp_path / "out"
+    bare, lost = RecordingEntry(recording), RecordingEntry(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="give one with --prior FILE"):
+        compare(_request(recording, out, "kiss-icp,prior", recordings=(bare,)), told.narrator)
+    with pytest.raises(ConfigError, match="neither a file nor one of the methods kiss-icp"):
+        compare(_request(recording, out, "kiss-icp", recordings=(replace(bare, reference="loam"),)), told.narrator)
+    with pytest.raises(InputError, match="no such file or folder"):
+        compare(_request(recording, out, "kiss-icp", recordings=(bare, lost)), told.narrator)
+    with pytest.raises(InputError, match="none of the 1 recordings can be read"):
+        compare(_request(recording, out, "kiss-icp", recordings=(lost,), skip_missing=True), told.narrator)
+    assert not out.exists()
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def test_the_command_prints_the_table(recording: Path, tmp_path: Path) -> None:
+    prior = recording / "ground_truth.tum"
+    result = lidarslam("compare", recording, "--out", tmp_path / "out", "--methods", "prior", "--prior", prior)
+    assert result.exit_code == 0
+    assert "room, against ground truth" in result.stdout
+    assert "lidarslam: room prior: ok in " in result.stderr
+
+
+def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, tmp_path: Path) -> None:
+    prior = tmp_path / "short.tum"
+    prior.write_text("0.1 0 0 0 0 0 0 1\n0.2 0 0 0 0 0 0 1\n")
+    arguments = ["compare", recording, "--methods", "prior", "--prior", prior]
+    lost = lidarslam(*arguments, "--out", tmp_path / "lost")
+    assert lost.exit_code == 0
+    assert "lost on " in lost.stdout
+    none = lidarslam(*arguments, "--out", tmp_path / "none", "--memory-limit-mb", 1)
+    assert none.exit_code == 1
+    assert "out of memory" in none.stdout
+    assert "no method came to a result" in none.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        ([], 2, "name a SOURCE"),
+        (["{recording}", "--data", "x"], 2, "--data goes with --benchmark"),
+        (["{recording}", "{recording}", "--prior", "{recording}/ground_truth.tum"], 2, "--prior belongs to one SOURCE"),
+        (["{recording}", "--methods", "loam"], 1, "no method is called 'loam'"),
+        (["{recording}", "--reuse", "--overwrite"], 1, "choose one"),
+        (["{recording}", "--set", "global_map.size=1"], 1, "there is no global_map.size"),
+        (["{recording}", "--start", "0", "--timeout-s", "0"], 2, "not in the range"),
+    ],
+)
+def test_mistakes_get_one_line(
+    recording: Path, tmp_path: Path, arguments: list[str], status: int, message: str
+) -> None:
+    result = lidarslam("compare", *(a.format(recording=recording) for a in arguments), "--out", tmp_path / "out")
+    assert result.exit_code == status
+    assert message in result.stderr
+    assert status == 2 or result.stderr.count("\n") == 1

@@ -1,0 +1,65 @@
+"""Methods as the command line names them."""
+
+import pytest
+
+from lidarslam.config import load_config
+from lidarslam.core.errors import ConfigError
+from lidarslam.methods import parse_method, parse_methods
+
+
+def test_a_plain_name_sets_the_odometry_and_switches_mapping_off() -> None:
+    config = load_config(None, parse_method("kiss-icp").settings)
+    assert config.odometry.method == "kiss-icp"
+    assert config.odometry.kiss_icp.voxel_size_m is None
+    assert config.mapping.enabled is False
+
+
+def test_map_overrules_a_configuration_either_way() -> None:
+    assert load_config(None, ["mapping.enabled=false", *parse_method("kiss-icp+map").settings]).mapping.enabled
+    assert not load_config(None, ["mapping.enabled=true", *parse_method("kiss-icp").settings]).mapping.enabled
+
+
+@pytest.mark.parametrize(("name", "size_m"), [("kiss-icp@0.5", 0.5), ("kiss-icp@1", 1.0), ("kiss-icp@0.25+map", 0.25)])
+def test_a_voxel_size_stands_behind_the_at(name: str, size_m: float) -> None:
+    assert load_config(None, parse_method(name).settings).odometry.kiss_icp.voxel_size_m == size_m
+
+
+def test_prior_is_the_external_odometry() -> None:
+    method = parse_method("prior+map")
+    assert method.needs_prior
+    assert load_config(None, method.settings).odometry.method == "external"
+    assert not parse_method("kiss-icp").needs_prior
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("loam", r"no method is called 'loam'; there are: learned, kiss-icp, constant-velocity, prior;"),
+        ("external", "no method is called 'external'"),
+        ("kiss-icp+mapping", r"no method is called 'kiss-icp\+mapping'"),
+        ("kiss-icp+graph+map", "no method is called"),
+        ("", "no method is called ''"),
+        ("prior@0.5", "only kiss-icp takes a voxel size"),
+        ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
+        ("kiss-icp@-1", "expected a voxel size"),
+        ("kiss-icp@nan", "expected a voxel size"),
+        ("constant-velocity", r"only predicts; compare constant-velocity\+map"),
+    ],
+)
+def test_what_is_no_method_is_refused_in_words(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_method(name)
+
+
+def test_a_list_keeps_its_order_and_its_names() -> None:
+    assert [method.name for method in parse_methods(" kiss-icp@0.5, kiss-icp,prior")] == [
+        "kiss-icp@0.5",
+        "kiss-icp",
+        "prior",
+    ]
+
+
+@pytest.mark.parametrize(("names", "message"), [("kiss-icp,kiss-icp", "named twice"), (" , ", "no method is named")])
+def test_a_list_names_each_method_once(names: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_methods(names)
