@@ -13,6 +13,7 @@ import numpy as np
 
 from evaluation.trajectory_metrics import evaluate_trajectory
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.localisation import OdometryAlone
 from lidarslam.pipeline import Pipeline
 from lidarslam.prefetch import prefetch
 from lidarslam.simulation.carriers import CARRIERS
@@ -35,7 +36,7 @@ def run_one(world: str, motion: str, sensor: str, scans: int, seed: int) -> str:
     recording = Simulation(place, find_sensor(sensor), carried, T_body_lidar, scans, seed)
     odometry = KissOdometry(KissConfig())
     try:
-        pipeline = Pipeline(odometry, ConsistencyCheck(ConsistencyConfig()), GlobalMapConfig())
+        pipeline = Pipeline(odometry, OdometryAlone(ConsistencyCheck(ConsistencyConfig())), GlobalMapConfig())
         results = list(pipeline.run(prefetch(recording.scans())))
     finally:
         odometry.close()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from lidarslam.core.errors import LidarSlamError
@@ -198,11 +199,11 @@ def info(
 @click.option(
     "--odometry",
     type=click.Choice(["kiss-icp", "constant-velocity"]),
-    help="Where the motion between scans comes from.  [default: kiss-icp]",
+    help="Where the motion between scans comes from.  [default: constant-velocity; kiss-icp with --no-mapping]",
 )
 @click.option("--prior", type=_FILE, metavar="TUM_FILE", help="A trajectory of another program as the odometry.")
 @click.option(
-    "--mapping/--no-mapping", default=False, help="Correct the odometry against the map.  [default: no-mapping]"
+    "--mapping/--no-mapping", default=None, help="Lay every scan on the map of those before.  [default: mapping]"
 )
 @click.option(
     "--pose-graph/--no-pose-graph", default=False, help="Close loops in a pose graph.  [default: no-pose-graph]"
@@ -228,8 +229,10 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     from lidarslam.run import RunRequest, execute
     from lidarslam.summary_text import format_outcome
 
-    settings = _method_settings(options.pop("odometry"), options["prior"], options.pop("settings"))
-    _refuse_missing_parts(options.pop("mapping"), options.pop("pose_graph"))
+    settings = _method_settings(
+        options.pop("odometry"), options["prior"], options.pop("mapping"), options.pop("settings")
+    )
+    _refuse_missing_parts(options.pop("pose_graph"))
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     config = _resolve(options.pop("config_file"), settings, **reader)
     _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
@@ -243,19 +246,21 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
         ctx.exit(EXIT_LOST)
 
 
-def _method_settings(odometry: str | None, prior: Path | None, settings: tuple[str, ...]) -> tuple[str, ...]:
+def _method_settings(
+    odometry: str | None, prior: Path | None, mapping: bool | None, settings: tuple[str, ...]
+) -> tuple[str, ...]:
     if prior is not None:
         if odometry is not None:
             raise click.UsageError("--prior is an odometry of its own; leave --odometry out")
         odometry = "external"
-    return settings if odometry is None else (*settings, f"odometry.method={odometry}")
+    if odometry is not None:
+        settings = (*settings, f"odometry.method={odometry}")
+    return settings if mapping is None else (*settings, f"mapping.enabled={str(mapping).lower()}")
 
 
-def _refuse_missing_parts(mapping: bool, pose_graph: bool) -> None:
+def _refuse_missing_parts(pose_graph: bool) -> None:
     from lidarslam.core.errors import ConfigError
 
-    if mapping:
-        raise ConfigError("scan-to-map refinement is not part of this version; run with --no-mapping")
     if pose_graph:
         raise ConfigError("the pose graph is not part of this version; run with --no-pose-graph")
 
@@ -427,10 +432,12 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
     if benchmark is None and options["data"] is not None:
         raise click.UsageError("--data goes with --benchmark")
-    for name in ("prior", "reference_map", "sequence"):
-        if options[name] is not None and len(sources) != 1:
+    single = ("prior", "reference_map", "sequence")
+    of_sources = single if sources else (*single, "reference", "start", "stop", "step")
+    for name in of_sources:
+        if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT and len(sources) != 1:
             flag = f"--{name.replace('_', '-')}"
-            raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each")
+            raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
     if not run_compare(CompareOptions(sources, benchmark, **options), click.echo, _tell):
         ctx.exit(EXIT_MENDABLE)
 

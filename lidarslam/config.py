@@ -56,9 +56,17 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     for setting in settings:
         _apply(tree, setting)
     try:
-        return Config.model_validate(tree)
+        return resolved(Config.model_validate(tree))
     except ValidationError as error:
         raise ConfigError(_explain(error, _origin(path, settings))) from None
+
+
+def resolved(config: Config) -> Config:
+    """The configuration with what depends on other choices filled in."""
+    if config.odometry.method is not None:
+        return config
+    method = "constant-velocity" if config.mapping.enabled else "kiss-icp"
+    return config.model_copy(update={"odometry": config.odometry.model_copy(update={"method": method})})
 
 
 def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:

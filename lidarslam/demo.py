@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.config import Config, load_config
+from lidarslam.config import load_config
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_tum, write_tum
@@ -57,7 +57,16 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0) -> list[DemoRow]:
     write_tum(wheels, drifting(read_tum(source / "ground_truth.tum"), seed))
     external = load_config(None, ["odometry.method=external"])
     rows = [
-        _run(_KISS_ICP, RunRequest(source, out / _KISS_ICP, Config(), rerun="save", overwrite=True)),
+        _run(
+            _KISS_ICP,
+            RunRequest(
+                source,
+                out / _KISS_ICP,
+                load_config(None, ["odometry.method=kiss-icp", "mapping.enabled=false"]),
+                rerun="save",
+                overwrite=True,
+            ),
+        ),
         _run(_PRIOR, RunRequest(source, out / _PRIOR, external, prior=wheels, rerun="save", overwrite=True)),
     ]
     for name in (RECORDING, _KISS_ICP, _PRIOR):

@@ -48,7 +48,11 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray | 
 
 
 def _vertices(errors: CloudErrors, clip_m: float) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    fields = [*((axis, "<f8") for axis in "xyz"), *((c, "|u1") for c in ("red", "green", "blue")), ("distance_m", "<f4")]
+    fields = [
+        *((axis, "<f8") for axis in "xyz"),
+        *((c, "|u1") for c in ("red", "green", "blue")),
+        ("distance_m", "<f4"),
+    ]
     vertices = np.empty(len(errors.points), fields)
     colours = error_colours(errors.distances_m, clip_m)
     for column, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):

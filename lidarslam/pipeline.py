@@ -1,8 +1,8 @@
 """One scan after another through odometry and into the map: no files, no printing, no window.
 
-Odometry is where the time goes, and one scan's motion must be known before the next can be estimated. What follows
-from a motion (compensating the sweep, checking the motion, adding to the map) happens on a second thread meanwhile,
-one scan later, when the motion after the scan is known as well.
+One scan's motion must be known before the next can be estimated. What follows from a motion (laying the scan on the map
+or holding it against the one before, and adding it to the global map) happens on a second thread meanwhile, one scan
+later, when the motion after the scan is known as well.
 """
 
 import time
@@ -12,22 +12,22 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
+from lidarslam.localisation import Estimated, Localised, Localiser, SweepMotion
 from mapping.config import GlobalMapConfig
-from mapping.deskew import body_velocity, deskew
 from mapping.global_map import GlobalMap, voxel_size_for
-from odometry.consistency import Consistency, ConsistencyCheck
-from odometry.interface import Motion, Odometry
+from odometry.interface import Odometry
 
 # How many scans the second thread may lag behind: the map now and then takes as long as several scans to tidy up.
 _MAX_BEHIND = 8
 
-STAGES = ("read", "odometry", "deskew", "check", "map")
+STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +41,11 @@ class ScanResult:
         status: whether to believe the pose, and `message` why not.
         points: (N, 3) in the LiDAR frame at the stamp, motion compensated, within the map's range, one a voxel.
         points_read, points_dropped: valid points of the raw scan, and how many were left out as invalid.
-        points_used: how many the motion rests on.
-        residual_m, inlier_ratio: how the scan lies on the previous one; None when that cannot be told.
-        stage_ms: wall time of each of the `STAGES`; read is the time spent waiting for the scan.
+        points_used: how many the pose rests on.
+        residual_m, inlier_ratio: how the scan lies on the map or on the previous one; None when that cannot be told.
+        degenerate: names of the directions of motion that the scan says nothing about.
+        covariance: (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none.
+        stage_ms: wall time of those of the `STAGES` that were gone through; read is the time waited for the scan.
     """
 
     stamp: float
@@ -57,23 +59,17 @@ class ScanResult:
     points_used: int
     residual_m: float | None
     inlier_ratio: float | None
+    degenerate: tuple[str, ...] = ()
+    covariance: FloatArray | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
-class _Estimated:
-    """A scan whose motion is known, and what else is needed to go on with it."""
+class _Timed:
+    """A scan whose motion is known, and the time that took."""
 
-    scan: Scan
-    motion: Motion
-    T_odom_lidar: FloatArray
-    interval_s: float | None  # that the motion took; None when nothing was measured
+    estimated: Estimated
     stage_ms: dict[str, float]
-
-    @property
-    def velocity(self) -> FloatArray | None:
-        """(6,) between the previous stamp and this one; None when it was not measured."""
-        return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +77,7 @@ class _Compensated:
     """A scan that waits to be added to the map until the motion it was compensated with is checked."""
 
     thinned: Scan
-    velocity_before: FloatArray | None
+    motion: SweepMotion
     points: FloatArray
     T_world_lidar: FloatArray
 
@@ -89,9 +85,9 @@ class _Compensated:
 class Pipeline:
     """Turns a stream of scans into a stream of results and a global map."""
 
-    def __init__(self, odometry: Odometry, check: ConsistencyCheck, config: GlobalMapConfig) -> None:
+    def __init__(self, odometry: Odometry, localiser: Localiser, config: GlobalMapConfig) -> None:
         self._odometry = odometry
-        self._check = check
+        self._localiser = localiser
         self._config = config
         self._voxel_size_m = config.voxel_size_m
         self._waiting: _Compensated | None = None
@@ -104,7 +100,8 @@ class Pipeline:
         """
         jobs: deque[Future[ScanResult]] = deque()
         error: Exception | None = None
-        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
+        # Matrices here are small: a BLAS of several threads spends its time on waiting, and takes it from the others.
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
             estimates = _with_next(self._estimate(scans))
             while error is None:
                 try:
@@ -123,9 +120,8 @@ class Pipeline:
         if error is not None:
             raise error
 
-    def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Estimated]:
+    def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Timed]:
         """Read and estimate scan after scan."""
-        T_odom_lidar = np.eye(4)
         measured_stamp: float | None = None  # of the scan before, unless its motion was only predicted
         started = time.perf_counter()
         for scan in scans:
@@ -135,43 +131,22 @@ class Pipeline:
             measured = motion.failure is None
             interval_s = scan.stamp - measured_stamp if measured and measured_stamp is not None else None
             measured_stamp = scan.stamp if measured else None
-            T_odom_lidar = T_odom_lidar @ motion.T_prev_curr
-            yield _Estimated(scan, motion, T_odom_lidar, interval_s, stage_ms)
+            yield _Timed(Estimated(scan, motion, interval_s), stage_ms)
             started = time.perf_counter()
 
-    def _follow(self, estimated: _Estimated, following: _Estimated | None) -> ScanResult:
-        """Everything that follows from a motion: compensate the sweep, check the motion, add to the map."""
-        scan, motion = estimated.scan, estimated.motion
-        started = time.perf_counter()
-        before, after = estimated.velocity, following.velocity if following else None
+    def _follow(self, timed: _Timed, following: _Timed | None) -> ScanResult:
+        """Everything that follows from a motion: find the pose, compensate the sweep, add to the map."""
+        scan = timed.estimated.scan
+        localised = self._localiser.localise(timed.estimated, following.estimated if following else None)
+        found = time.perf_counter()
         thinned = self._thin(scan)
-        points = _compensate(thinned, before, after)
+        points = localised.motion.compensate(thinned)
         compensated = time.perf_counter()
-        fit = self._check.check(_compensate(self._check.sample(scan), before, after), motion.T_prev_curr)
-        checked = time.perf_counter()
-        status, message = _judge(motion, fit)
-        self._add_waiting(status)
-        if status is not Status.LOST:  # a pose that is not believed must not draw walls
-            self._waiting = _Compensated(thinned, before, points, estimated.T_odom_lidar)
-        followed_ms = {
-            "deskew": _ms(started, compensated),
-            "check": _ms(compensated, checked),
-            "map": _ms(checked, time.perf_counter()),
-        }
-        return ScanResult(
-            stamp=scan.stamp,
-            T_world_lidar=estimated.T_odom_lidar,
-            T_odom_lidar=estimated.T_odom_lidar,
-            status=status,
-            message=message,
-            points=points,
-            points_read=len(scan),
-            points_dropped=scan.dropped,
-            points_used=motion.points_used,
-            residual_m=fit.residual_m,
-            inlier_ratio=fit.inlier_ratio,
-            stage_ms=estimated.stage_ms | followed_ms,
-        )
+        self._add_waiting(localised.status)
+        if localised.status is not Status.LOST:  # a pose that is not believed must not draw walls
+            self._waiting = _Compensated(thinned, localised.motion, points, localised.T_world_lidar)
+        followed_ms = {"deskew": _ms(found, compensated), "map": _ms(compensated, time.perf_counter())}
+        return _result(scan, localised, points, timed.stage_ms | localised.stage_ms | followed_ms)
 
     def _thin(self, scan: Scan) -> Scan:
         """The points within the map's range, one a voxel of the map: more would not change it."""
@@ -190,15 +165,15 @@ class Pipeline:
             return
         points = scan.points
         if next_status is Status.LOST:
-            points = _compensate(scan.thinned, scan.velocity_before, None)
+            points = SweepMotion(scan.motion.before, None).compensate(scan.thinned)
         if self.global_map is None:
             self.global_map = GlobalMap(self._voxel_size_m)
         self.global_map.add(points, scan.T_world_lidar)
 
 
-def _with_next(items: Iterable[_Estimated]) -> Iterator[tuple[_Estimated, _Estimated | None]]:
+def _with_next(items: Iterable[_Timed]) -> Iterator[tuple[_Timed, _Timed | None]]:
     """Each item with the one after it, None after the last."""
-    held: _Estimated | None = None
+    held: _Timed | None = None
     error: LidarSlamError | None = None
     try:
         for item in items:
@@ -213,27 +188,23 @@ def _with_next(items: Iterable[_Estimated]) -> Iterator[tuple[_Estimated, _Estim
         raise error
 
 
-def _compensate(scan: Scan, before: FloatArray | None, after: FloatArray | None) -> FloatArray:
-    """The scan's points as seen from the pose at its stamp.
-
-    A sweep lies between two motions. Stamps stand at its start in most recordings, so that going on with the motion
-    before would be a guess; the one after it is known by now.
-    """
-    known = [velocity for velocity in (before, after) if velocity is not None]
-    if scan.time_offsets is None or not known:
-        return scan.points
-    return deskew(scan.points, scan.time_offsets, known[0], known[-1])
-
-
-def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
-    """A motion that was not measured is lost, whatever it fits; else the fit decides."""
-    if motion.failure is not None:
-        return Status.LOST, motion.failure
-    if fit.status is Status.OK:
-        return Status.OK, ""
-    if fit.inlier_ratio is None:
-        return fit.status, "too few planes to check the motion against the previous scan"
-    return fit.status, f"only {100.0 * fit.inlier_ratio:.0f} % of the scan lies on the previous one"
+def _result(scan: Scan, localised: Localised, points: FloatArray, stage_ms: dict[str, float]) -> ScanResult:
+    return ScanResult(
+        stamp=scan.stamp,
+        T_world_lidar=localised.T_world_lidar,
+        T_odom_lidar=localised.T_odom_lidar,
+        status=localised.status,
+        message=localised.message,
+        points=points,
+        points_read=len(scan),
+        points_dropped=scan.dropped,
+        points_used=localised.points_used,
+        residual_m=localised.residual_m,
+        inlier_ratio=localised.inlier_ratio,
+        degenerate=localised.degenerate,
+        covariance=localised.covariance,
+        stage_ms=stage_ms,
+    )
 
 
 def _ms(start: float, end: float) -> float:

@@ -85,7 +85,7 @@ class RerunViewer:
         points = _every_nth(result.points, self._config.scan_points)
         self._recording.log("world/lidar/scan", rr.Points3D(points, colors=[_SCAN_COLOUR], radii=_SCAN_RADIUS))
         self._log_path(T[:3, 3], result.status)
-        self._recording.log("plots/ms", rr.Scalars([result.stage_ms[stage] for stage in STAGES]))
+        self._recording.log("plots/ms", rr.Scalars([result.stage_ms.get(stage, 0.0) for stage in STAGES]))
         for plot, value in (("residual", result.residual_m), ("inliers", result.inlier_ratio)):
             if value is not None:
                 self._recording.log(f"plots/{plot}", rr.Scalars(value))

@@ -12,7 +12,7 @@ import numpy as np
 
 from evaluation.trajectory_metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam import run_directory as files
-from lidarslam.config import Config, dump_yaml
+from lidarslam.config import Config, dump_yaml, resolved
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
@@ -20,6 +20,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, format_tum, read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.localisation import Localiser, OdometryAlone, ScanToMap
 from lidarslam.pipeline import Pipeline, ScanResult
 from lidarslam.prefetch import prefetch
 from lidarslam.run_directory import RunDirectory
@@ -29,6 +30,7 @@ from lidarslam.viewer import NullViewer, Viewer
 from mapping.config import GlobalMapConfig
 from mapping.global_map import GlobalMap
 from mapping.map_io import write_cloud
+from mapping.mapper import Mapper
 from odometry.consistency import ConsistencyCheck
 from odometry.interface import Odometry
 from odometry.registry import make_odometry
@@ -92,28 +94,29 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     """
     if request.out.resolve() == request.source.resolve():
         raise OutputError(f"{request.out}: is the recording itself; name another directory for the run")
-    recording = open_recording(request.source, request.config.reader)
+    config = resolved(request.config)
+    recording = open_recording(request.source, config.reader)
     chosen = range(len(recording))[request.start : request.stop : request.step]
     if not chosen:
         raise InputError(
             f"{request.source}: none of its {len(recording)} scans is left after --start, --stop and --step"
         )
     with ExitStack() as stack:
-        odometry = _make_odometry(request)
+        odometry = _make_odometry(config, request.prior)
         stack.callback(odometry.close)
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
         log = stack.enter_context(ScanLog.open(directory))
         truth = _ground_truth(recording, log)
-        pipeline = Pipeline(odometry, ConsistencyCheck(request.config.odometry.consistency), request.config.global_map)
+        pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
         scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
         with _viewing(request, recording, directory) as viewer:
             watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
             stopped = _process(pipeline, scans, watch)
         if not len(log):
             raise InputError(f"{request.source}: no scan could be used{f': {stopped}' if stopped else ''}")
-        directory.write_text(files.CONFIG, dump_yaml(request.config, _describe(request)))
+        directory.write_text(files.CONFIG, dump_yaml(config, _describe(request)))
         metrics = _write_trajectories(directory, recording.T_cam_lidar, truth, log)
-        map_points = _write_map(directory, pipeline.global_map, request.config.global_map, request.pcd)
+        map_points = _write_map(directory, pipeline.global_map, config.global_map, request.pcd)
         voxel_size_m = None if pipeline.global_map is None else pipeline.global_map.voxel_size_m
         skipped = 0 if stopped else len(chosen) - len(log)
         summary = summarise(log, watch.total_ms, map_points, voxel_size_m, skipped)
@@ -178,16 +181,23 @@ def _ground_truth(recording: Recording, log: ScanLog) -> Trajectory | None:
         return None
 
 
-def _make_odometry(request: RunRequest) -> Odometry:
-    config = request.config.odometry
-    if config.method == "constant-velocity":
+def _make_odometry(config: Config, prior: Path | None) -> Odometry:
+    method = config.odometry.method
+    if method == "constant-velocity" and not config.mapping.enabled:
         raise ConfigError(
             "constant-velocity only predicts; without scan-to-map refinement it would stand still."
-            " Choose --odometry kiss-icp, or give a trajectory with --prior"
+            " Choose --odometry kiss-icp, give a trajectory with --prior, or leave --no-mapping out"
         )
-    if config.method == "external" and request.prior is None:
+    if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
-    return make_odometry(config, None if request.prior is None else read_tum(request.prior))
+    return make_odometry(config.odometry, None if prior is None else read_tum(prior))
+
+
+def make_localiser(config: Config) -> Localiser:
+    """Scan-to-map refinement when it is enabled, else the odometry's word."""
+    if config.mapping.enabled:
+        return ScanToMap(Mapper(config.mapping))
+    return OdometryAlone(ConsistencyCheck(config.odometry.consistency))
 
 
 @contextmanager

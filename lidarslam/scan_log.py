@@ -55,7 +55,7 @@ class ScanLog:
 
     def add(self, result: ScanResult) -> None:
         """Take note of one scan."""
-        ms = [result.stage_ms[stage] for stage in STAGES]
+        ms = [result.stage_ms.get(stage, 0.0) for stage in STAGES]
         row = [
             len(self),
             f"{result.stamp:.9f}",
@@ -65,7 +65,7 @@ class ScanLog:
             result.points_used,
             _number(result.residual_m),
             _number(result.inlier_ratio),
-            "",  # known to scan-to-map refinement only
+            " ".join(result.degenerate),
             *(f"{value:.2f}" for value in ms),
             result.message,
         ]

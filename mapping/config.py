@@ -35,7 +35,7 @@ class RefinementConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_iterations: int = Field(12, ge=1, description="steps, the surfaces looked up anew before each")
+    max_iterations: int = Field(20, ge=1, description="steps, the surfaces looked up anew before each")
     coarse_iterations: int = Field(3, ge=0, description="of them on coarser cells, when the prediction may be far off")
     converged_rotation_deg: float = Field(0.02, gt=0.0, description="smaller steps end the iteration")
     converged_translation_m: float = Field(0.001, gt=0.0, description="likewise")
@@ -50,8 +50,8 @@ class TrackingConfig(BaseModel):
     gate_cells: float = Field(0.5, gt=0.0, description="largest distance of an inlier from its surface, in cells")
     gate_ratio: float = Field(0.02, gt=0.0, description="likewise, as a fraction of its range")
     gate_min_m: float = Field(0.05, gt=0.0, description="likewise, the least it can be")
-    degraded_below: float = Field(0.65, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
-    lost_below: float = Field(0.4, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
+    degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
+    lost_below: float = Field(0.45, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
     search_yaw_step_deg: float = Field(15.0, gt=0.0, description="start rotations around gravity when lost")
     give_up_after: int = Field(20, ge=1, description="lost scans in a row after which a new map is begun")
 
@@ -61,7 +61,7 @@ class MappingConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    enabled: bool = Field(False, description="correct the odometry against the local map")
+    enabled: bool = Field(True, description="correct the odometry against the local map")
     cell_m: float | None = Field(
         None, gt=0.0, description="edge of the map's finest cells; null: follows the median range of the scene"
     )

@@ -75,4 +75,4 @@ def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
 def plane_distances(world: FloatArray, matches: Matches) -> FloatArray:
     """How far (M,) the matched points of the world are from their surfaces."""
     offsets = world.take(matches.index, axis=0) - matches.points
-    return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
+    return np.asarray(np.abs(np.einsum("ij,ij->i", offsets, matches.normals)), dtype=np.float64)

@@ -142,7 +142,8 @@ def _are_resolved(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
     """Which patches (N,), seen along `views` (N, 3), are surfaces rather than the trace of a single ring."""
     ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
     facing = np.abs(np.einsum("ij,ij->i", views, patches.normals))
-    return (facing > _LEAST_SINE * ranges) | (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
+    resolved = (facing > _LEAST_SINE * ranges) | (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
+    return np.asarray(resolved, dtype=np.bool_)
 
 
 def _pull_to_planes(index: NDArray[np.intp], patches: PatchTable) -> Matches:

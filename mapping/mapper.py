@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
@@ -108,10 +108,8 @@ class Mapper:
         sampled = self._sampler.sample(scan)
         self._interval_s = 0.0 if self._last is None else scan.stamp - self._last.stamp
         expected = self._predict(prior)
-        if self._map is None:
-            mapped = self._begin(sampled, expected)
-        else:
-            mapped = self._lay(sampled, expected, self._map)
+        local_map = self._map
+        mapped = self._begin(sampled, expected) if local_map is None else self._lay(sampled, expected, local_map)
         self._last = _Tracked(scan.stamp, mapped.T_world_lidar, mapped.velocity)
         return mapped
 
@@ -126,7 +124,9 @@ class Mapper:
         velocity = last.velocity if prior.velocity is None else prior.velocity
         return T_prev_curr, self._prediction(last.T_world_lidar @ T_prev_curr, velocity, prior, interval_s)
 
-    def _prediction(self, T_world_lidar: FloatArray, velocity: FloatArray, prior: Prior, interval_s: float) -> Prediction:
+    def _prediction(
+        self, T_world_lidar: FloatArray, velocity: FloatArray, prior: Prior, interval_s: float
+    ) -> Prediction:
         rotation, translation = np.deg2rad(self._config.prior_rotation_deg), self._config.prior_translation_m
         pose_sigmas = np.array([rotation] * 3 + [translation] * 3)
         if prior.T_prev_curr is None:
@@ -162,7 +162,8 @@ class Mapper:
         self._lost_in_a_row = 0
         correction = log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
         self._expected_error_m = max(_CAUTION * self._expected_error_m, _displacement(correction, sampled))
-        self._add(sampled, refined.T_world_lidar, refined.velocity)
+        if fit.inlier_ratio is not None and fit.inlier_ratio >= self._config.tracking.degraded_below:
+            self._add(sampled, refined.T_world_lidar, refined.velocity)
         status, message = self._judge(fit, refined, correction, prediction)
         return MappedScan(
             T_world_lidar=refined.T_world_lidar,
@@ -251,9 +252,7 @@ class Mapper:
             sensor=T_world_lidar[:3, 3],
         )
 
-    def _judge(
-        self, fit: Fit, refined: Refined, correction: FloatArray, prediction: Prediction
-    ) -> tuple[Status, str]:
+    def _judge(self, fit: Fit, refined: Refined, correction: FloatArray, prediction: Prediction) -> tuple[Status, str]:
         """The fit decides; a fitting scan far from where it was expected is degraded, one held by the prior as well."""
         status, message = fit.status(self._config.tracking), fit.explain(self._config.tracking)
         if status is not Status.OK:

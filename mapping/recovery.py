@@ -14,7 +14,9 @@ _HALF_CELLS = 2.0
 
 
 def start_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float) -> FloatArray:
-    """Poses (K, 4, 4) at one place, turned around `up` (3,), the vertical of the world, in even steps; the given first."""
+    """Poses (K, 4, 4) at one place, turned in even steps around `up` (3,), the vertical of the world.
+
+    The given one comes first, then those turned by little."""
     count = max(1, round(360.0 / yaw_step_deg))
     steps = np.arange(count)
     signed = np.where(steps % 2 == 1, (steps + 1) // 2, -(steps // 2))

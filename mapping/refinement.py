@@ -14,14 +14,15 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, orthonormaliz
 from mapping.config import RefinementConfig
 from mapping.degeneracy import Degeneracy, find_degeneracy
 from mapping.deskew import move
-from mapping.local_map import LocalMap, Matches
+from mapping.local_map import LEVELS, LocalMap, Matches
 
 # Standard deviation of a range measurement: no surface is known better than that.
 _RANGE_NOISE_M = 0.02
 # The kernel's scale follows the residuals: this many times their median, within bounds in cells.
 _SCALE_PER_MEDIAN = 1.5
 _LEAST_SCALE = 0.03
-_COARSE_SCALE = 0.6
+# A step of less than this share of a cell makes the next finer cells the better ones.
+_SETTLED = 0.1
 # Farther from its surface than this, in cells, a point belongs to something else.
 _GATE = 6.0
 # How firmly the prior is kept along directions that the matches leave open: as if measured to a tenth of a millimetre.
@@ -110,26 +111,21 @@ def refine(
         None when too few points meet a surface.
     """
     T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
-    solution: _Solution | None = None
-    for iteration in range(config.max_iterations):
-        coarse = coarse_first and iteration < config.coarse_iterations
-        points, matches = _match(sweep, T_world_lidar, velocity, local_map, coarse)
+    rolling = with_velocity and sweep.is_rolling
+    schedule = _Schedule(config, local_map.cell_m, coarse_first)
+    while True:
+        points, matches = _match(sweep, T_world_lidar, velocity, local_map, schedule.level)
         if len(matches) < config.min_matches:
             return None
-        solution = _solve(
-            _Linearised.at(T_world_lidar, points, matches, local_map.cell_m, coarse),
-            _times(sweep, matches) if with_velocity and sweep.is_rolling else None,
-            prediction,
-            T_world_lidar,
-            velocity,
-        )
+        system = _Linearised.at(T_world_lidar, points, matches, schedule.cell_m)
+        times = _times(sweep, matches) if rolling else None
+        solution = _solve(system, times, prediction, T_world_lidar, velocity)
         T_world_lidar = T_world_lidar @ exp(solution.pose_step)
         velocity = velocity + solution.velocity_step
-        if not coarse and _has_converged(solution.pose_step, config):
+        if schedule.is_done_after(solution.pose_step, system.lever_m):
             break
-    assert solution is not None
     return Refined(
-        orthonormalize(T_world_lidar), velocity, solution.covariance, solution.degeneracy, iteration + 1
+        orthonormalize(T_world_lidar), velocity, solution.covariance, solution.degeneracy, schedule.iterations
     )
 
 
@@ -139,13 +135,11 @@ def compensated(points: FloatArray, times: FloatArray | None, velocity: FloatArr
 
 
 def _match(
-    sweep: Sweep, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap, coarse: bool
+    sweep: Sweep, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap, level: int
 ) -> tuple[FloatArray, Matches]:
     """The compensated points (N + E, 3), planes first, and what they are pulled to."""
     planes = compensated(sweep.planes, sweep.plane_times, velocity)
-    matches = local_map.match_planes(
-        transform_points(T_world_lidar, planes), T_world_lidar[:3, 3], first_level=1 if coarse else 0
-    )
+    matches = local_map.match_planes(transform_points(T_world_lidar, planes), T_world_lidar[:3, 3], first_level=level)
     if not len(sweep.edges):
         return planes, matches
     edges = compensated(sweep.edges, sweep.edge_times, velocity)
@@ -162,11 +156,38 @@ def _times(sweep: Sweep, matches: Matches) -> FloatArray:
     return times.take(matches.index)
 
 
-def _has_converged(step: FloatArray, config: RefinementConfig) -> bool:
-    return bool(
-        np.linalg.norm(step[:3]) < np.deg2rad(config.converged_rotation_deg)
-        and np.linalg.norm(step[3:]) < config.converged_translation_m
-    )
+class _Schedule:
+    """Which cells the next step looks at: coarse ones until the pose is within the next finer ones' reach."""
+
+    def __init__(self, config: RefinementConfig, finest_m: float, coarse_first: bool) -> None:
+        self._config = config
+        self._finest_m = finest_m
+        self.level = len(LEVELS) - 1 if coarse_first else 0
+        self._steps_at_level = 0
+        self.iterations = 0
+
+    @property
+    def cell_m(self) -> float:
+        """The cells' size at the present level."""
+        return self._finest_m * LEVELS[self.level]
+
+    def is_done_after(self, step: FloatArray, lever_m: float) -> bool:
+        """Take note of a step (6,); whether it was the last."""
+        self.iterations += 1
+        self._steps_at_level += 1
+        if self.level == 0:
+            return self.iterations >= self._config.max_iterations or self._has_converged(step)
+        moved_m = float(np.linalg.norm(step[:3]) * lever_m + np.linalg.norm(step[3:]))
+        if self._steps_at_level >= self._config.coarse_iterations or moved_m < _SETTLED * self.cell_m:
+            self.level -= 1
+            self._steps_at_level = 0
+        return False
+
+    def _has_converged(self, step: FloatArray) -> bool:
+        return bool(
+            np.linalg.norm(step[:3]) < np.deg2rad(self._config.converged_rotation_deg)
+            and np.linalg.norm(step[3:]) < self._config.converged_translation_m
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +201,7 @@ class _Linearised:
     lever_m: float
 
     @classmethod
-    def at(
-        cls, T_world_lidar: FloatArray, points: FloatArray, matches: Matches, cell_m: float, coarse: bool
-    ) -> "_Linearised":
+    def at(cls, T_world_lidar: FloatArray, points: FloatArray, matches: Matches, cell_m: float) -> "_Linearised":
         p = points.take(matches.index, axis=0)
         offsets = transform_points(T_world_lidar, p) - matches.points
         residuals = np.einsum("ij,ij->i", offsets, matches.normals)
@@ -191,19 +210,18 @@ class _Linearised:
         return cls(
             residuals,
             np.concatenate([_cross(p, normals), normals], axis=1),
-            _weights(residuals, matches.thickness_m, cell_m, coarse),
+            _weights(residuals, matches.thickness_m, cell_m),
             matches.tilt,
             lever_m,
         )
 
 
-def _weights(residuals: FloatArray, thickness_m: FloatArray, cell_m: float, coarse: bool) -> FloatArray:
+def _weights(residuals: FloatArray, thickness_m: FloatArray, cell_m: float) -> FloatArray:
     """Information of each residual, under the kernel of Geman and McClure with a scale that follows the residuals."""
     size = np.abs(residuals)
-    least = _COARSE_SCALE if coarse else _LEAST_SCALE
-    scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), least * cell_m)
+    scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), _LEAST_SCALE * cell_m)
     weights = 1.0 / ((1.0 + (size / scale) ** 2) ** 2 * (thickness_m**2 + _RANGE_NOISE_M**2))
-    weights[size > _GATE * cell_m * (2.0 if coarse else 1.0)] = 0.0
+    weights[size > _GATE * cell_m] = 0.0
     return np.asarray(weights, dtype=np.float64)
 
 
@@ -236,16 +254,15 @@ def _solve(
     error = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
     b[:6] = -(JW.T @ r) - (np.diag(prediction.pose_sigmas**-2) + held) @ error
     if times is None:
-        covariance = np.linalg.inv(H[:6, :6])
-        step = covariance @ b[:6]
-        return _Solution(step, np.zeros(6), _honest(covariance, prediction, degeneracy), degeneracy)
+        alone: FloatArray = np.linalg.inv(H[:6, :6])
+        return _Solution(alone @ b[:6], np.zeros(6), _honest(alone, prediction, degeneracy), degeneracy)
     JWt = JW * times[:, None]
     about_velocity = np.diag(prediction.velocity_sigmas**-2) + held * float(np.mean(times**2))
     H[:6, 6:] = JW.T @ (J * times[:, None])
     H[6:, :6] = H[:6, 6:].T
     H[6:, 6:] = JWt.T @ (J * times[:, None]) + about_velocity
     b[6:] = -(JWt.T @ r) - about_velocity @ (velocity - prediction.velocity)
-    covariance = np.linalg.inv(H)
+    covariance: FloatArray = np.linalg.inv(H)
     step = covariance @ b
     return _Solution(step[:6], step[6:], _honest(covariance[:6, :6], prediction, degeneracy), degeneracy)
 

@@ -60,6 +60,8 @@ class OdometryConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: OdometryName = "kiss-icp"
+    method: OdometryName | None = Field(
+        None, description="null: constant-velocity with scan-to-map refinement, kiss-icp without"
+    )
     kiss_icp: KissConfig = KissConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()

@@ -73,8 +73,5 @@ class ExternalOdometry:
         is_hole = end - start > self._largest_interval_s
         return (start, end) if is_hole and min(stamp - start, end - stamp) > _SAME_INSTANT_S else None
 
-    def correct(self, T_prev_curr: FloatArray) -> None:
-        """A recorded trajectory does not learn."""
-
     def close(self) -> None:
         """Nothing is held."""

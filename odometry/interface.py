@@ -29,8 +29,5 @@ class Odometry(Protocol):
     def estimate(self, scan: Scan) -> Motion:
         """The motion since the previous scan given to this method; a scan that cannot be used gives a prediction."""
 
-    def correct(self, T_prev_curr: FloatArray) -> None:
-        """Hand back the last scan's motion as a map corrected it; the next prediction starts from there."""
-
     def close(self) -> None:
         """Let go of whatever the method holds."""

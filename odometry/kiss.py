@@ -116,9 +116,6 @@ class KissOdometry:
             return self._begin(_TimedPose(scan.stamp, pose.T_map_lidar))
         return Motion(self._motion(last, pose, scan.stamp), int(reply[16]))
 
-    def correct(self, T_prev_curr: FloatArray) -> None:
-        """KISS-ICP keeps its own map; as the method compared with, it stays as it is."""
-
     def close(self) -> None:
         """End the child process."""
         if self._worker is not None:

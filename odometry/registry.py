@@ -22,7 +22,7 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         from odometry.external import ExternalOdometry
 
         return ExternalOdometry(prior)
-    if config.method == "kiss-icp":
+    if config.method != "constant-velocity":
         from odometry.kiss import KissOdometry
 
         return KissOdometry(config.kiss_icp)

@@ -330,6 +330,8 @@ def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, t
         ([], 2, "name a SOURCE"),
         (["{recording}", "--data", "x"], 2, "--data goes with --benchmark"),
         (["{recording}", "{recording}", "--prior", "{recording}/ground_truth.tum"], 2, "--prior belongs to one SOURCE"),
+        (["--benchmark", "{recording}/timestamps.txt", "--stop", "3"], 2, "--stop belongs to one SOURCE"),
+        (["--benchmark", "{recording}/timestamps.txt"], 1, "timestamps.txt: "),
         (["{recording}", "--methods", "loam"], 1, "no method is called 'loam'"),
         (["{recording}", "--reuse", "--overwrite"], 1, "choose one"),
         (["{recording}", "--set", "global_map.size=1"], 1, "there is no global_map.size"),

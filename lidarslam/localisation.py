@@ -1,0 +1,169 @@
+"""Two ways to a scan's pose: the odometry's word, held against the scan before; or scan-to-map refinement."""
+
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from mapping.deskew import body_velocity, deskew
+from mapping.mapper import Mapper, Prior
+from odometry.consistency import Consistency, ConsistencyCheck
+from odometry.interface import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """A scan with what the odometry says of it.
+
+    Attributes:
+        scan: as read.
+        motion: since the scan before.
+        interval_s: that the motion took; None when nothing was measured.
+    """
+
+    scan: Scan
+    motion: Motion
+    interval_s: float | None
+
+    @property
+    def velocity(self) -> FloatArray | None:
+        """(6,) between the previous stamp and this one; None when it was not measured."""
+        return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepMotion:
+    """How the sensor moved before and after the stamp of a scan, (6,) each; None where that is not known."""
+
+    before: FloatArray | None
+    after: FloatArray | None
+
+    def compensate(self, scan: Scan) -> FloatArray:
+        """The scan's points (N, 3) as seen from the pose at its stamp.
+
+        A sweep lies between two motions. Stamps stand at its start in most recordings, so that going on with the
+        motion before would be a guess; the one after it is known by now.
+        """
+        known = [velocity for velocity in (self.before, self.after) if velocity is not None]
+        if scan.time_offsets is None or not known:
+            return scan.points
+        return deskew(scan.points, scan.time_offsets, known[0], known[-1])
+
+    def mean(self, scan: Scan) -> FloatArray | None:
+        """One velocity (6,) for the whole sweep: the mean, by how much of it lies before and after the stamp."""
+        if self.before is None or self.after is None or scan.time_offsets is None or not len(scan):
+            return self.before if self.after is None else self.after
+        begin, end = float(scan.time_offsets.min()), float(scan.time_offsets.max())
+        share_after = 1.0 if end <= begin else np.clip(end / (end - begin), 0.0, 1.0)
+        return np.asarray(share_after * self.after + (1.0 - share_after) * self.before, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Localised:
+    """Where a scan was taken.
+
+    Attributes:
+        T_world_lidar: (4, 4), the pose at the stamp.
+        T_odom_lidar: (4, 4), what the odometry alone says; where it measured nothing, what was expected.
+        covariance: (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none.
+        motion: during the sweep.
+        status, message: whether to believe the pose, and why not.
+        points_used: how many the pose rests on.
+        residual_m, inlier_ratio: how the scan lies on what it was held against; None when that cannot be told.
+        degenerate: names of the directions of motion that the scan says nothing about.
+        stage_ms: wall time of the stages gone through.
+    """
+
+    T_world_lidar: FloatArray
+    T_odom_lidar: FloatArray
+    covariance: FloatArray | None
+    motion: SweepMotion
+    status: Status
+    message: str
+    points_used: int
+    residual_m: float | None
+    inlier_ratio: float | None
+    degenerate: tuple[str, ...]
+    stage_ms: dict[str, float]
+
+
+class Localiser(Protocol):
+    """Says where each scan was taken, one after the other."""
+
+    def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
+        """The pose of a scan; the one that follows is known already, None after the last."""
+
+
+class OdometryAlone:
+    """Believes the odometry, unless the scan does not fit the one before."""
+
+    def __init__(self, check: ConsistencyCheck) -> None:
+        self._check = check
+        self._T_odom_lidar = np.eye(4)
+
+    def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
+        """Chain the motion, and hold the scan against the one before it."""
+        started = time.perf_counter()
+        motion = estimated.motion
+        self._T_odom_lidar = self._T_odom_lidar @ motion.T_prev_curr
+        sweep = SweepMotion(estimated.velocity, following.velocity if following else None)
+        fit = self._check.check(sweep.compensate(self._check.sample(estimated.scan)), motion.T_prev_curr)
+        status, message = _judge(motion, fit)
+        return Localised(
+            T_world_lidar=self._T_odom_lidar,
+            T_odom_lidar=self._T_odom_lidar,
+            covariance=None,
+            motion=sweep,
+            status=status,
+            message=message,
+            points_used=motion.points_used,
+            residual_m=fit.residual_m,
+            inlier_ratio=fit.inlier_ratio,
+            degenerate=(),
+            stage_ms={"check": 1e3 * (time.perf_counter() - started)},
+        )
+
+
+class ScanToMap:
+    """Lays every scan on the map, from where the odometry says it is."""
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._T_odom_lidar = np.eye(4)
+
+    def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
+        """Refine the odometry's pose; where it measured nothing, the mapper goes on with the motion it saw last."""
+        started = time.perf_counter()
+        measured = estimated.interval_s is not None
+        odometry = SweepMotion(estimated.velocity, following.velocity if following else None)
+        prior = Prior(estimated.motion.T_prev_curr if measured else None, odometry.mean(estimated.scan))
+        mapped = self._mapper.process(estimated.scan, prior)
+        self._T_odom_lidar = self._T_odom_lidar @ mapped.T_prev_curr_prior
+        return Localised(
+            T_world_lidar=mapped.T_world_lidar,
+            T_odom_lidar=self._T_odom_lidar,
+            covariance=mapped.covariance,
+            motion=SweepMotion(mapped.velocity, mapped.velocity),
+            status=mapped.status,
+            message=mapped.message,
+            points_used=mapped.fit.matched if mapped.fit else 0,
+            residual_m=mapped.fit.residual_m if mapped.fit else None,
+            inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,
+            degenerate=mapped.degenerate,
+            stage_ms={"refine": 1e3 * (time.perf_counter() - started)},
+        )
+
+
+def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
+    """A motion that was not measured is lost, whatever it fits; else the fit decides."""
+    if motion.failure is not None:
+        return Status.LOST, motion.failure
+    if fit.status is Status.OK:
+        return Status.OK, ""
+    if fit.inlier_ratio is None:
+        return fit.status, "too few planes to check the motion against the previous scan"
+    return fit.status, f"only {100.0 * fit.inlier_ratio:.0f} % of the scan lies on the previous one"
