@@ -152,7 +152,8 @@ def _evaluate_map(
     if reference_map is None:
         return None
     if estimate.map_file is None and request.reference_map is None:
-        notes.append("the run has no map to compare with that of the simulation")
+        if estimate.run is not None:
+            notes.append("the run has no map to compare with that of the simulation")
         return None
     # Poses of KITTI's camera say nothing about where the LiDAR's world lies.
     in_camera = estimate.run is not None and reference is not None and reference.stamps is None

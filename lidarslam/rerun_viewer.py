@@ -12,6 +12,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from evaluation.error_colours import error_colours
+from evaluation.map_metrics import CloudErrors, MapComparison
 from lidarslam.config import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
@@ -241,3 +243,53 @@ def _log_run(
     points = _every_nth(run.map_points, config.map_points)
     cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
     recording.log([*entity, "map"], cloud, static=True)
+
+
+def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | None, clip_m: float) -> None:
+    """Write a recording of a map coloured by its distance to the reference, and of the reference by that to the map.
+
+    Args:
+        path: the .rrd file.
+        comparison: what is shown; about its middle, because the viewer counts in single precision.
+        positions: (K, 3) where the sensor was, in the reference's frame.
+        clip_m: the distance of the brightest colour.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    recording = rr.RecordingStream("lidarslam")
+    points = comparison.reference_errors.points
+    middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
+    try:
+        recording.save(path)
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        _log_errors(recording, "world/map_to_reference", comparison.map_errors, middle, clip_m)
+        _log_errors(recording, "world/reference_to_map", comparison.reference_errors, middle, clip_m)
+        if positions is not None:
+            line = rr.LineStrips3D([positions - middle], colors=[_REFERENCE_COLOUR], radii=_PATH_RADIUS)
+            recording.log("world/path", line, static=True)
+        text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {', '.join(f'{m:.0f}' for m in middle)}"
+        recording.log("legend", rr.TextDocument(text), static=True)
+        recording.send_blueprint(_errors_blueprint())
+        recording.flush()
+        recording.disconnect()
+    except (RuntimeError, OSError) as error:
+        raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())})") from error
+
+
+def _log_errors(
+    recording: rr.RecordingStream, entity: str, errors: CloudErrors, middle: FloatArray, clip_m: float
+) -> None:
+    colours = error_colours(errors.distances_m, clip_m)
+    recording.log(entity, rr.Points3D(errors.points - middle, colors=colours, radii=_MAP_RADIUS), static=True)
+
+
+def _errors_blueprint() -> rrb.Blueprint:
+    """The map's errors beside the reference's, moved by hand alike."""
+    views = [
+        rrb.Spatial3DView(origin="/world", name=title, contents=["/world/path", f"/world/{entity}"])
+        for title, entity in (("Map: how far from the reference", "map_to_reference"),
+                              ("Reference: how far from the map", "reference_to_map"))
+    ]  # fmt: skip
+    legend = rrb.TextDocumentView(origin="/legend", name="Colours")
+    return rrb.Blueprint(rrb.Vertical(rrb.Horizontal(*views), legend, row_shares=[8, 1]), collapse_panels=True)

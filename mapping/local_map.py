@@ -96,6 +96,7 @@ class LocalMap:
         """
         waiting = np.arange(len(points))
         parts = []
+        bodies: tuple[NDArray[np.intp], PatchTable] | None = None
         for grid in self._planes[first_level:]:
             there = points.take(waiting, axis=0)
             rows = grid.look_up(there)
@@ -104,9 +105,15 @@ class LocalMap:
             views = there.take(occupied, axis=0) - sensor
             chosen = np.flatnonzero(patches.is_plane & _are_resolved(patches, views))
             parts.append(_pull_to_planes(waiting[occupied[chosen]], patches.select(chosen)))
+            if bodies is None:
+                body = np.flatnonzero(_are_bodies(patches, views))
+                bodies = waiting[occupied[body]], patches.select(body)
             still = np.ones(len(waiting), dtype=np.bool_)
             still[occupied[chosen]] = False
             waiting = waiting[still]
+        if bodies is not None:
+            left = np.flatnonzero(np.isin(bodies[0], waiting, assume_unique=True))
+            parts.append(_pull_to_bodies(bodies[0][left], bodies[1].select(left)))
         return Matches.join(parts)
 
     def match_lines(self, points: FloatArray) -> Matches:
@@ -144,6 +151,26 @@ def _are_resolved(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
     facing = np.abs(np.einsum("ij,ij->i", views, patches.normals))
     resolved = (facing > _LEAST_SINE * ranges) | (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
     return np.asarray(resolved, dtype=np.bool_)
+
+
+def _are_bodies(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
+    """Which patches (N,), seen along `views` (N, 3), are neither planes nor the trace of a single ring."""
+    ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
+    bodies = ~patches.is_plane & (patches.counts >= 6) & (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
+    return np.asarray(bodies, dtype=np.bool_)
+
+
+def _pull_to_bodies(index: NDArray[np.intp], patches: PatchTable) -> Matches:
+    """Towards the middle of the patch along each of its axes, the more firmly the thinner it is."""
+    spreads = patches.spreads_m
+    across = np.cross(patches.directions, patches.normals)
+    return Matches(
+        np.concatenate([index, index, index]),
+        np.concatenate([patches.points] * 3),
+        np.concatenate([patches.normals, across, patches.directions]),
+        np.concatenate([spreads[:, 0], spreads[:, 1], spreads[:, 2]]),
+        np.zeros(3 * len(index)),
+    )
 
 
 def _pull_to_planes(index: NDArray[np.intp], patches: PatchTable) -> Matches:

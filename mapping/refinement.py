@@ -219,8 +219,9 @@ class _Linearised:
 def _weights(residuals: FloatArray, thickness_m: FloatArray, cell_m: float) -> FloatArray:
     """Information of each residual, under the kernel of Geman and McClure with a scale that follows the residuals."""
     size = np.abs(residuals)
+    variances = thickness_m**2 + _RANGE_NOISE_M**2
     scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), _LEAST_SCALE * cell_m)
-    weights = 1.0 / ((1.0 + (size / scale) ** 2) ** 2 * (thickness_m**2 + _RANGE_NOISE_M**2))
+    weights = 1.0 / ((1.0 + size**2 / (scale**2 + thickness_m**2)) ** 2 * variances)
     weights[size > _GATE * cell_m] = 0.0
     return np.asarray(weights, dtype=np.float64)
 
