@@ -87,13 +87,16 @@ def _features(points: FloatArray, cell_m: float) -> FloatArray:
     # The path is unknown; one common side is enough for a feature to be the same in both clouds.
     cloud.orient_normals_to_align_with_direction([0.0, 0.0, 1.0])
     neighbourhood = o3d.geometry.KDTreeSearchParamHybrid(_FEATURE_CELLS * cell_m, 100)
-    return np.asarray(o3d.pipelines.registration.compute_fpfh_feature(cloud, neighbourhood).data).T.astype(np.float64)
+    features = o3d.pipelines.registration.compute_fpfh_feature(  # type: ignore[call-arg] # the stub lacks the defaults
+        cloud, neighbourhood
+    )
+    return np.asarray(features.data, dtype=np.float64).T
 
 
 def _matches(source: FloatArray, target: FloatArray) -> IntArray:
     """Pairs (K, 2) of points whose features are each other's nearest."""
-    nearest = cKDTree(target).query(source, workers=-1)[1]
-    back = cKDTree(source).query(target, workers=-1)[1]
+    nearest = np.asarray(cKDTree(target).query(source, workers=-1)[1], dtype=np.intp)
+    back = np.asarray(cKDTree(source).query(target, workers=-1)[1], dtype=np.intp)
     mutual = np.flatnonzero(back[nearest] == np.arange(len(source)))
     return np.stack([mutual, nearest[mutual]], axis=1)
 

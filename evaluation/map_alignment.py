@@ -1,7 +1,7 @@
 """Bringing a map to the frame of a reference map; the pose is returned, nothing is moved."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from evaluation.global_registration import candidate_poses, is_same
 from evaluation.voxel_thinning import thin
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 
 GLOBAL = "global"
 
@@ -115,19 +115,24 @@ def align_map(
 def _search(clouds: "_Clouds") -> MapAlignment | None:
     """The best pose that a global search finds, with the fitness of the next best."""
     poses = candidate_poses(clouds.mapped, clouds.reference)
-    refined = sorted(
-        (clouds.judge(clouds.to_given(T), GLOBAL, refine=True) for T in poses), key=lambda found: -found.fitness
-    )
-    if not refined:
+    judged = [clouds.judge(clouds.to_given(T), GLOBAL, refine=True) for T in poses]
+    if not judged:
         return None
-    best = refined[0]
-    T_best = clouds.to_local(best.T_reference_map)
-    others = [o.fitness for o in refined[1:] if not is_same(T_best, clouds.to_local(o.T_reference_map), _DISTINCT_M)]
+    # What the search may have missed: buildings tend to look alike when they are turned by right angles.
+    likeliest = clouds.to_local(max(judged, key=lambda found: found.fitness).T_reference_map)
+    judged += [clouds.judge(clouds.to_given(likeliest @ T), GLOBAL, refine=True) for T in _turns(clouds.mapped)]
+    judged.sort(key=lambda found: -found.fitness)
+    T_best = clouds.to_local(judged[0].T_reference_map)
+    others = [o.fitness for o in judged[1:] if not is_same(T_best, clouds.to_local(o.T_reference_map), _DISTINCT_M)]
     # How far ICP moved it from a rough candidate tells nobody anything.
-    return MapAlignment(
-        best.T_reference_map, GLOBAL, True, best.fitness, best.inlier_rmse_m, best.inlier_m,
-        runner_up=max(others, default=0.0),
-    )  # fmt: skip
+    return replace(judged[0], moved_m=0.0, moved_deg=0.0, runner_up=max(others, default=0.0))
+
+
+def _turns(points: FloatArray) -> list[FloatArray]:
+    """Right angles about the vertical through the middle of a cloud's extent, as transforms (4, 4)."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    to_middle, back = make_transform(np.eye(3), -middle), make_transform(np.eye(3), middle)
+    return [back @ exp([0.0, 0.0, angle, 0.0, 0.0, 0.0]) @ to_middle for angle in (0.5 * np.pi, np.pi, 1.5 * np.pi)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +194,8 @@ class _Clouds:
     def _fitness(self, T_local: FloatArray) -> tuple[float, float | None]:
         moved = transform_points(T_local, self.mapped)
         distances, _ = self.tree.query(moved, distance_upper_bound=self.inlier_m, workers=-1)
-        near = distances[np.isfinite(distances)]
-        return len(near) / len(distances), float(np.sqrt(np.mean(near**2))) if len(near) else None
+        near = np.asarray(distances)[np.isfinite(distances)]
+        return len(near) / len(moved), float(np.sqrt(np.mean(near**2))) if len(near) else None
 
 
 def _icp(source: FloatArray, target: FloatArray, T_target_source: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """How crisp a map is, without any reference."""
 
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +84,7 @@ def _chunks(counts: NDArray[np.int64]) -> list[slice]:
     """Stretches of points with no more neighbours together than fit into memory."""
     number = np.cumsum(counts) // _CHUNK
     borders = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(counts)]
-    return [slice(first, end) for first, end in zip(borders[:-1], borders[1:], strict=True)]
+    return [slice(first, end) for first, end in pairwise(borders)]
 
 
 def _entropies(centres: FloatArray, neighbours: FloatArray, counts: NDArray[np.int64]) -> FloatArray:

@@ -174,7 +174,7 @@ def _median_gap(points: FloatArray) -> float | None:
         return None
     sample = points[:: max(1, len(points) // _GAP_SAMPLES)]
     distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2, workers=-1)
-    return float(np.median(distances[:, 1]))
+    return float(np.median(np.asarray(distances)[:, 1]))
 
 
 def _in_box(points: FloatArray, reference: FloatArray) -> NDArray[np.bool_]:

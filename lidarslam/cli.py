@@ -368,7 +368,9 @@ def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: 
     metavar="MAP",
     help=".ply, .pcd, .las, .laz or .e57 file.  [default: the exact map of a simulated source]",
 )
-@click.option("--map", "map_file", type=_PATH, metavar="FILE", help="Map of a bare trajectory, or instead of the run's.")
+@click.option(
+    "--map", "map_file", type=_PATH, metavar="FILE", help="Map of a bare trajectory, or instead of the run's."
+)
 @click.option(
     "--map-alignment",
     metavar="[auto|trajectory|global|none|FILE]",

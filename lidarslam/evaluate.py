@@ -75,7 +75,7 @@ class Evaluation:
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json."""
         return {
-            **metrics_json(self.metrics, self.map and self.map.json),
+            **metrics_json(self.metrics, None if self.map is None else self.map.json),
             "map_alignment": self.map and self.map.alignment.to_json(),
             "map_entropy": self.entropy and self.entropy.to_json(),
         }

@@ -49,7 +49,9 @@ def _row(label: str, text: str) -> str:
 
 def _trajectory(metrics: TrajectoryMetrics) -> Iterator[str]:
     association, errors = metrics.association, metrics.errors
-    matched = f"{len(association):,} of {association.estimate_count:,} ({association.reference_count:,} in the reference)"
+    matched = (
+        f"{len(association):,} of {association.estimate_count:,} ({association.reference_count:,} in the reference)"
+    )
     yield _row("poses matched", f"{matched}, {errors.length_m:.1f} m")
     yield ""
     yield _row("TRAJECTORY", f"{'translation':>12}{'rotation':>14}")

@@ -152,7 +152,8 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
             f" {len(reference.T_world_lidar):,}, and KITTI's text format has no stamps to match them by;"
             " give both as TUM files, or the same poses in both"
         )
-    common = next((s for s in stamps if s is not None), _KITTI_PERIOD_S * np.arange(len(poses.T_world_lidar)))
+    counted: FloatArray = _KITTI_PERIOD_S * np.arange(len(poses.T_world_lidar), dtype=np.float64)
+    common = next((s for s in stamps if s is not None), counted)
     return Trajectory(common, poses.T_world_lidar), Trajectory(common, reference.T_world_lidar)
 
 

@@ -6,11 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from mapping.deskew import body_velocity, deskew
-from mapping.mapper import Mapper, Prior
+from mapping.mapper import Mapper
+from mapping.prediction import Prior
 from odometry.consistency import Consistency, ConsistencyCheck
 from odometry.interface import Motion
 
@@ -134,6 +135,7 @@ class ScanToMap:
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
         self._T_odom_lidar = np.eye(4)
+        self._T_world_last = np.eye(4)
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Refine the odometry's pose; where it measured nothing, the mapper goes on with the motion it saw last."""
@@ -142,12 +144,14 @@ class ScanToMap:
         odometry = SweepMotion(estimated.velocity, following.velocity if following else None)
         prior = Prior(estimated.motion.T_prev_curr if measured else None, odometry.mean(estimated.scan))
         mapped = self._mapper.process(estimated.scan, prior)
-        self._T_odom_lidar = self._T_odom_lidar @ mapped.T_prev_curr_prior
+        expected = inverse(self._T_world_last) @ mapped.T_world_expected
+        self._T_odom_lidar = self._T_odom_lidar @ (estimated.motion.T_prev_curr if measured else expected)
+        self._T_world_last = mapped.state.T_world_lidar
         return Localised(
-            T_world_lidar=mapped.T_world_lidar,
+            T_world_lidar=mapped.state.T_world_lidar,
             T_odom_lidar=self._T_odom_lidar,
-            covariance=mapped.covariance,
-            motion=SweepMotion(mapped.velocity, mapped.velocity),
+            covariance=mapped.state.covariance[:6, :6] if mapped.registered else None,
+            motion=SweepMotion(mapped.state.velocity, mapped.state.velocity),
             status=mapped.status,
             message=mapped.message,
             points_used=mapped.fit.matched if mapped.fit else 0,

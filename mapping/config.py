@@ -75,8 +75,12 @@ class MappingConfig(BaseModel):
     second_deskew: bool = Field(
         True, description="without continuous time: compensate again with the refined motion where it differs"
     )
-    prior_rotation_deg: float = Field(5.0, gt=0.0, description="standard deviation of the predicted rotation")
-    prior_translation_m: float = Field(0.2, gt=0.0, description="standard deviation of the predicted translation")
+    prior_rotation_deg: float = Field(
+        3.0, gt=0.0, description="standard deviation of an odometry's rotation, about each axis"
+    )
+    prior_translation_m: float = Field(
+        0.15, gt=0.0, description="standard deviation of an odometry's translation, along each axis"
+    )
     features: FeatureConfig = FeatureConfig()
     refinement: RefinementConfig = RefinementConfig()
     tracking: TrackingConfig = TrackingConfig()

@@ -44,6 +44,11 @@ class Matches:
     def __len__(self) -> int:
         return len(self.index)
 
+    def one_each(self) -> "Matches":
+        """The first pull of every point, that across its surface."""
+        index, first = np.unique(self.index, return_index=True)
+        return Matches(index, self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first])
+
     @classmethod
     def join(cls, parts: Sequence["Matches"]) -> "Matches":
         """All of them after one another."""

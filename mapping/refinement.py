@@ -15,6 +15,7 @@ from mapping.config import RefinementConfig
 from mapping.degeneracy import Degeneracy, find_degeneracy
 from mapping.deskew import move
 from mapping.local_map import LEVELS, LocalMap, Matches
+from mapping.prediction import Prediction
 
 # Standard deviation of a range measurement: no surface is known better than that.
 _RANGE_NOISE_M = 0.02
@@ -27,8 +28,7 @@ _SETTLED = 0.1
 _GATE = 6.0
 # How firmly the prior is kept along directions that the matches leave open: as if measured to a tenth of a millimetre.
 _HELD = 1e8
-# Weights take residuals for independent; neighbouring points err together. Compared with true errors on simulated
-# recordings (tests/mapping/test_refinement.py), variances are too small by this factor.
+# Neighbouring points err together, and count for as much less; compared with true errors on simulated recordings.
 _CORRELATION = 25.0
 
 
@@ -53,31 +53,14 @@ class Sweep:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """Where a scan is expected before it is held against the map.
-
-    Attributes:
-        T_world_lidar: (4, 4) at the stamp.
-        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        pose_sigmas: (6,) standard deviations, rotation first, in the LiDAR frame.
-        velocity_sigmas: (6,).
-    """
-
-    T_world_lidar: FloatArray
-    velocity: FloatArray
-    pose_sigmas: FloatArray
-    velocity_sigmas: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Refined:
     """A registered scan.
 
     Attributes:
         T_world_lidar: (4, 4) at the stamp.
         velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        covariance: (6, 6) of the pose, of the error `xi` in `T_true = T_world_lidar @ exp(xi)`: rotation first, in the
-            LiDAR frame, as GTSAM has it.
+        covariance: (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`:
+            rotation first, in the LiDAR frame, as GTSAM has it.
         degeneracy: the directions along which the prediction was kept.
         iterations: how many it took.
     """
@@ -248,34 +231,37 @@ def _solve(
     J, r = system.jacobian, system.residuals
     degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
     held = _HELD * degeneracy.projector()
-    JW = J * system.weights[:, None]
-    H = np.zeros((12, 12))
-    b = np.zeros(12)
-    H[:6, :6] = JW.T @ J + np.diag(prediction.pose_sigmas**-2) + held
-    error = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
-    b[:6] = -(JW.T @ r) - (np.diag(prediction.pose_sigmas**-2) + held) @ error
-    if times is None:
-        alone: FloatArray = np.linalg.inv(H[:6, :6])
-        return _Solution(alone @ b[:6], np.zeros(6), _honest(alone, prediction, degeneracy), degeneracy)
-    JWt = JW * times[:, None]
-    about_velocity = np.diag(prediction.velocity_sigmas**-2) + held * float(np.mean(times**2))
-    H[:6, 6:] = JW.T @ (J * times[:, None])
-    H[6:, :6] = H[:6, 6:].T
-    H[6:, 6:] = JWt.T @ (J * times[:, None]) + about_velocity
-    b[6:] = -(JWt.T @ r) - about_velocity @ (velocity - prediction.velocity)
-    covariance: FloatArray = np.linalg.inv(H)
-    step = covariance @ b
-    return _Solution(step[:6], step[6:], _honest(covariance[:6, :6], prediction, degeneracy), degeneracy)
+    pose_information = np.linalg.inv(prediction.pose_covariance)
+    velocity_information = np.linalg.inv(prediction.velocity_covariance)
+    JW = J * (system.weights / _CORRELATION)[:, None]
+    H, b = np.zeros((12, 12)), np.zeros(12)
+    H[:6, :6] = JW.T @ J + pose_information
+    H[6:, 6:] = velocity_information
+    b[:6] = -(JW.T @ r) - (pose_information + held) @ log(inverse(prediction.T_world_lidar) @ T_world_lidar)
+    b[6:] = -velocity_information @ (velocity - prediction.velocity)
+    holding = np.zeros((12, 12))
+    holding[:6, :6] = held
+    if times is not None:
+        Jt = J * times[:, None]
+        JWt = JW * times[:, None]
+        H[:6, 6:] = JW.T @ Jt
+        H[6:, :6] = H[:6, 6:].T
+        H[6:, 6:] += JWt.T @ Jt
+        holding[6:, 6:] = held * float(np.mean(times**2))
+        b[6:] -= JWt.T @ r + holding[6:, 6:] @ (velocity - prediction.velocity)
+    step = np.linalg.solve(H + holding, b)
+    return _Solution(step[:6], step[6:], _covariance(H, prediction, degeneracy), degeneracy)
 
 
-def _honest(covariance: FloatArray, prediction: Prediction, degeneracy: Degeneracy) -> FloatArray:
-    """The covariance with the residuals' correlation made up for, and the prediction's where that was kept."""
-    inflated = _CORRELATION * covariance
+def _covariance(H: FloatArray, prediction: Prediction, degeneracy: Degeneracy) -> FloatArray:
+    """The inverse of the information, with the prediction's variance where that was kept."""
+    covariance: FloatArray = np.array(np.linalg.inv(H))
     scale = np.array([degeneracy.lever_m] * 3 + [1.0] * 3)
     for direction in degeneracy.directions:
-        motion = direction / scale
-        inflated = inflated + float(direction**2 @ (prediction.pose_sigmas * scale) ** 2) * np.outer(motion, motion)
-    return np.asarray(inflated, dtype=np.float64)
+        along, measure = direction / scale, direction * scale
+        covariance[:6, :6] += float(measure @ prediction.pose_covariance @ measure) * np.outer(along, along)
+        covariance[6:, 6:] += float(measure @ prediction.velocity_covariance @ measure) * np.outer(along, along)
+    return covariance
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -51,6 +51,11 @@ class SampledScan:
         return len(self.points)
 
     @property
+    def seen_until_s(self) -> float:
+        """From the stamp to the last point; 0 when the scan is compensated already."""
+        return 0.0 if self.times is None or not len(self) else max(0.0, float(self.times.max()))
+
+    @property
     def sweep(self) -> Sweep:
         """What is registered."""
         times = None if self.times is None else self.times.take(self.keys)

@@ -1,0 +1,119 @@
+"""Laying one scan on the map: from its prediction, again from coarser cells, and at last from anywhere."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.tracking import Status
+from mapping.config import MappingConfig
+from mapping.deskew import body_velocity
+from mapping.fit import Fit, measure_fit
+from mapping.local_map import LocalMap
+from mapping.prediction import Prediction, State
+from mapping.recovery import best_starts, start_poses
+from mapping.refinement import Refined, Sweep, compensated, refine
+
+# A sweep compensated with a motion that turns out to be this different is compensated again.
+_SAME_ROTATION = np.deg2rad(0.1)
+_SAME_TRANSLATION_M = 0.01
+# A search may end anywhere, but must then have found much of what the scan sees.
+_ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
+_OVERLAP_TO_RETURN = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A scan laid on the map, and how it lies; not registered when too little of it met a surface."""
+
+    refined: Refined | None
+    fit: Fit
+
+    def status(self, config: MappingConfig) -> Status:
+        """What the fit means."""
+        return Status.LOST if self.refined is None else self.fit.status(config.tracking)
+
+
+def place(
+    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig,
+    coarse_first: bool,
+) -> Placed:  # fmt: skip
+    """Lay a sweep on the map from where it is expected; where it does not fit there, by way of coarser cells.
+
+    Args:
+        sweep: the points.
+        prediction: where the scan is expected.
+        last: the scan before, and `interval_s` since its stamp.
+        local_map: what is laid on.
+        config: how.
+        coarse_first: whether to begin with coarser cells at once.
+    """
+    placed = _place_once(sweep, prediction, last, interval_s, local_map, config, coarse_first)
+    if coarse_first or placed.status(config) is Status.OK:
+        return placed
+    again = _place_once(sweep, prediction, last, interval_s, local_map, config, coarse_first=True)
+    return again if again.fit.inlier_share > placed.fit.inlier_share else placed
+
+
+def search(
+    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig
+) -> Placed | None:
+    """Try a scan turned all around, where it is expected and where the last one was; None when nothing fits well."""
+    points = compensated(sweep.planes, sweep.plane_times, prediction.velocity)
+    if not len(points):
+        return None
+    up, step_deg = local_map.vertical(), config.tracking.search_yaw_step_deg
+    places = (prediction.T_world_lidar, last.T_world_lidar)
+    starts = np.concatenate([start_poses(T_world_lidar, up, step_deg) for T_world_lidar in places])
+    best: Placed | None = None
+    for start in best_starts(points, starts, local_map):
+        free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
+        placed = _place_once(sweep, free, last, interval_s, local_map, config, coarse_first=True)
+        if placed.status(config) is not Status.OK or placed.fit.overlap < _OVERLAP_TO_RETURN:
+            continue
+        if best is None or placed.fit.inlier_share > best.fit.inlier_share:
+            best = placed
+    return best
+
+
+def _place_once(
+    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig,
+    coarse_first: bool,
+) -> Placed:  # fmt: skip
+    refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
+    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
+        refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
+    if refined is None:
+        return Placed(None, Fit(0, 0.0, None, None))
+    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
+    return Placed(refined, measure_fit(points, refined.T_world_lidar, local_map, config.tracking))
+
+
+def _with_own_motion(
+    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig,
+    refined: Refined,
+) -> Refined | None:  # fmt: skip
+    """Without an estimate of its own, the velocity is that since the last scan.
+
+    A sweep that was compensated with another one is compensated again, and registered again.
+    """
+    velocity = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)
+    change = np.abs(velocity - prediction.velocity) * interval_s
+    same = np.linalg.norm(change[:3]) < _SAME_ROTATION and np.linalg.norm(change[3:]) < _SAME_TRANSLATION_M
+    if sweep.is_rolling and config.second_deskew and not same:
+        again = replace(prediction, T_world_lidar=refined.T_world_lidar, velocity=velocity)
+        second = refine(sweep, again, local_map, config.refinement, coarse_first=False, with_velocity=False)
+        if second is None:
+            return None
+        refined = second
+        velocity = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)
+    return replace(refined, velocity=velocity, covariance=_with_velocity(refined.covariance, last, interval_s))
+
+
+def _with_velocity(covariance: FloatArray, last: State, interval_s: float) -> FloatArray:
+    """The covariance of pose and velocity, the velocity being the difference of two poses over the time between."""
+    both = np.zeros((12, 12))
+    both[:6, :6] = covariance[:6, :6]
+    both[:6, 6:] = both[6:, :6] = covariance[:6, :6] / interval_s
+    both[6:, 6:] = (covariance[:6, :6] + last.covariance[:6, :6]) / interval_s**2
+    return both

@@ -1,0 +1,123 @@
+"""Where the next scan is expected: how the sensor was moving, and what an odometry says, each as far as it is trusted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, skew
+from mapping.config import MappingConfig
+
+# Accelerations that carriers reach, one standard deviation: rotation about each axis, translation along it.
+_ACCELERATION = np.array([np.deg2rad(600.0)] * 3 + [10.0] * 3)
+# What is known of a sensor before its first scans, and after it was lost.
+_ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
+_ASTRAY = np.array([np.deg2rad(20.0)] * 3 + [1.0] * 3)
+# No pose is better than this, whatever its residuals say.
+_LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What an odometry says of a scan; None where it says nothing.
+
+    Attributes:
+        T_prev_curr: (4, 4) the motion since the previous scan.
+        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
+    """
+
+    T_prev_curr: FloatArray | None = None
+    velocity: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A scan's pose and motion.
+
+    Attributes:
+        stamp: seconds.
+        T_world_lidar: (4, 4) at the stamp.
+        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
+        covariance: (12, 12) of the errors of pose and velocity; the pose's is `xi` in
+            `T_true = T_world_lidar @ exp(xi)`.
+        seen_until_s: from the stamp to the last point of the sweep; up to there the velocity was seen.
+    """
+
+    stamp: float
+    T_world_lidar: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+    seen_until_s: float = 0.0
+
+    @classmethod
+    def first(cls, stamp: float, velocity: FloatArray | None) -> "State":
+        """At the origin, moving anyhow unless something is known."""
+        sigmas = np.concatenate([_LEAST_SIGMA, _ANY_VELOCITY])
+        return cls(stamp, np.eye(4), np.zeros(6) if velocity is None else velocity, np.diag(sigmas**2))
+
+    @classmethod
+    def astray(cls, stamp: float, T_world_lidar: FloatArray, velocity: FloatArray) -> "State":
+        """Somewhere near here, moving anyhow."""
+        sigmas = np.concatenate([_ASTRAY, _ANY_VELOCITY])
+        return cls(stamp, T_world_lidar, velocity, np.diag(sigmas**2))
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where a scan is expected before it is held against the map.
+
+    Attributes:
+        T_world_lidar: (4, 4) at the stamp.
+        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
+        pose_covariance: (6, 6) rotation first, in the LiDAR frame.
+        velocity_covariance: (6, 6).
+    """
+
+    T_world_lidar: FloatArray
+    velocity: FloatArray
+    pose_covariance: FloatArray
+    velocity_covariance: FloatArray
+
+
+def predict(state: State, stamp: float, prior: Prior, config: MappingConfig) -> Prediction:
+    """Go on from the last scan's state with its velocity, and correct that by what the odometry says.
+
+    A sweep's velocity was seen from its first point to its last. Where stamps stand at the start of sweeps, the next
+    pose lies at the end of what was seen, and needs no extrapolation: turns on the spot are no surprise.
+    """
+    interval_s = stamp - state.stamp
+    T_moved = exp(state.velocity * interval_s)
+    F = np.eye(12)
+    F[:6, :6] = adjoint(inverse(T_moved))
+    F[:6, 6:] = interval_s * np.eye(6)
+    covariance = F @ state.covariance @ F.T
+    unseen_s = max(0.0, interval_s - state.seen_until_s)
+    drift = _ACCELERATION * (interval_s**2 / 8.0 + unseen_s * interval_s)
+    pose_covariance = covariance[:6, :6] + np.diag(drift**2 + _LEAST_SIGMA**2)
+    velocity_covariance = covariance[6:, 6:] + np.diag((_ACCELERATION * interval_s) ** 2)
+    T_world_lidar, velocity = state.T_world_lidar @ T_moved, state.velocity
+    sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
+    if prior.T_prev_curr is not None:
+        error = log(inverse(T_world_lidar) @ state.T_world_lidar @ prior.T_prev_curr)
+        step, pose_covariance = _fuse(pose_covariance, error, np.diag(sigmas**2))
+        T_world_lidar = T_world_lidar @ exp(step)
+    if prior.velocity is not None and interval_s > 0.0:
+        step, velocity_covariance = _fuse(
+            velocity_covariance, prior.velocity - velocity, np.diag((sigmas / interval_s) ** 2)
+        )
+        velocity = velocity + step
+    return Prediction(T_world_lidar, velocity, pose_covariance, velocity_covariance)
+
+
+def adjoint(T_a_b: FloatArray) -> FloatArray:
+    """(6, 6): takes tangent vectors, rotation first, from frame b to frame a."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[3:, :3] = skew(t) @ R
+    return A
+
+
+def _fuse(covariance: FloatArray, difference: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What to add to an estimate for a second one that differs, and the covariance of both together."""
+    gain = covariance @ np.linalg.inv(covariance + other)
+    return gain @ difference, covariance - gain @ covariance

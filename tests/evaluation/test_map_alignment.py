@@ -1,0 +1,116 @@
+"""Maps brought back to where they were taken from."""
+
+import numpy as np
+import pytest
+
+from evaluation.map_alignment import align_map
+from evaluation.voxel_thinning import thin
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+
+UTM = np.array([5e5, 5e6, 300.0])
+
+
+def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 60.0) -> FloatArray:
+    """Points on the faces of a box."""
+    low_, high_ = np.array(low), np.array(high)
+    faces = []
+    for axis in range(3):
+        area = float(np.prod(np.delete(high_ - low_, axis)))
+        for side in (low_[axis], high_[axis]):
+            face = rng.uniform(low_, high_, (int(per_m2 * area), 3))
+            face[:, axis] = side
+            faces.append(face)
+    return np.concatenate(faces)
+
+
+@pytest.fixture(scope="module")
+def building() -> FloatArray:
+    """A room with furniture that stands nowhere twice alike, and a smaller room beside it."""
+    rng = np.random.default_rng(7)
+    boxes = [
+        ((0, 0, 0), (14, 9, 3)), ((14, 2, 0), (19, 7, 2.5)), ((2, 1, 0), (3, 4, 1.2)), ((6, 6, 0), (9, 7, 0.8)),
+        ((11, 1, 0), (11.6, 1.6, 3)), ((4.5, 5, 0), (5, 7, 2.2)), ((16, 4, 0), (17.5, 5, 1)), ((8, 2, 0), (9.5, 3, 1.6)),
+    ]  # fmt: skip
+    return np.concatenate([_box(rng, *box) for box in boxes])
+
+
+def _error(T_a: FloatArray, T_b: FloatArray, points: FloatArray) -> float:
+    return float(np.linalg.norm(transform_points(T_a, points) - transform_points(T_b, points), axis=1).max())
+
+
+@pytest.mark.parametrize(
+    ("xi", "origin"),
+    [([0.0, 0.0, 1.8, 3.0, -20.0, 1.0], np.zeros(3)), ([0.02, -0.03, -2.9, 0.0, 7.0, 0.0], UTM)],
+)
+def test_a_turned_map_is_found_without_a_guess(
+    building: FloatArray, rng: np.random.Generator, xi: list[float], origin: FloatArray
+) -> None:
+    part = building[building[:, 0] < 16.0]
+    T_reference_map = exp(xi)
+    T_reference_map[:3, 3] += origin
+    seen = transform_points(inverse(T_reference_map), part + origin + rng.normal(0.0, 0.01, part.shape))
+    # Only half of the cloud is the same points, so that no point meets itself by design.
+    found = align_map(seen[::2], building + origin, {}, search=True)
+    assert found.method == "global"
+    assert found.is_trustworthy
+    assert found.fitness > 0.99
+    assert found.runner_up is not None
+    assert found.runner_up < 0.9 * found.fitness
+    assert _error(found.T_reference_map, T_reference_map, seen) < 0.02
+
+
+def test_the_same_twice(building: FloatArray) -> None:
+    seen = transform_points(exp([0.0, 0.0, 1.0, 2.0, 3.0, 0.0]), building[::3])
+    first, second = (align_map(seen, building, {}, search=True) for _ in range(2))
+    np.testing.assert_allclose(first.T_reference_map, second.T_reference_map, atol=1e-6)
+
+
+def test_a_guess_is_refined_and_the_correction_told(building: FloatArray) -> None:
+    T_off = exp([0.0, 0.0, 0.02, 0.2, -0.1, 0.05])
+    seen = transform_points(inverse(T_off), building[::2])
+    found = align_map(seen, building, {"file": np.eye(4)})
+    assert _error(found.T_reference_map, T_off, building) < 0.01
+    assert found.moved_deg == pytest.approx(np.rad2deg(rotation_angle(T_off)), abs=0.02)
+    middle = np.median(thin(seen, 0.1), axis=0, keepdims=True)
+    assert found.moved_m == pytest.approx(_error(T_off, np.eye(4), middle), abs=0.01)
+    assert found.refined
+
+
+def test_without_refinement_the_guess_stands(building: FloatArray) -> None:
+    T_off = exp([0.0, 0.0, 0.0, 0.15, 0.0, 0.0])
+    found = align_map(building, building, {"none": T_off}, refine=False)
+    np.testing.assert_allclose(found.T_reference_map, T_off, atol=1e-12)
+    assert (found.moved_m, found.refined, found.method) == (0.0, False, "none")
+
+
+def test_a_wrong_guess_gives_way_to_the_search(building: FloatArray) -> None:
+    T_true = exp([0.0, 0.0, 2.0, 30.0, 0.0, 0.0])
+    seen = transform_points(inverse(T_true), building[::2])
+    found = align_map(seen, building, {"none": np.eye(4)}, search=True)
+    assert found.method == "global"
+    assert align_map(seen, building, {"trajectory": T_true}, search=True).method == "trajectory"
+
+
+def test_another_place_is_refused(building: FloatArray) -> None:
+    rng = np.random.default_rng(3)
+    elsewhere = rng.uniform(0.0, 12.0, (8_000, 3))
+    with pytest.raises(InputError, match="cannot be laid on its reference .* --map-alignment FILE"):
+        align_map(elsewhere, building, {"none": np.eye(4)}, search=True)
+    taken = align_map(elsewhere + 100.0, building, {"none": np.eye(4)})
+    assert not taken.is_trustworthy
+    assert taken.fitness == 0.0
+    assert taken.inlier_rmse_m is None
+
+
+def test_a_place_with_two_fitting_poses_is_refused() -> None:
+    """An empty box looks the same when it is turned by 180 degrees."""
+    box = _box(np.random.default_rng(0), (0, 0, 0), (12, 8, 3))
+    seen = transform_points(exp([0.0, 0.0, 1.2, 1.0, 2.0, 0.0]), box[::2])
+    with pytest.raises(InputError, match="in more than one way"):
+        align_map(seen, box, {}, search=True)
+
+
+def test_nothing_cannot_be_aligned(building: FloatArray) -> None:
+    with pytest.raises(InputError, match="holds no point"):
+        align_map(np.empty((0, 3)), building, {"none": np.eye(4)})

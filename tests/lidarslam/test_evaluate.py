@@ -1,0 +1,233 @@
+"""Evaluation from files to figures: runs, recordings, trajectory files, maps."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarslam.config import Config, dump_yaml
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import format_kitti, write_tum
+from lidarslam.datasets.ply import read_ply
+from lidarslam.evaluate import EvaluateRequest, evaluate
+from lidarslam.evaluate_text import format_evaluation
+from lidarslam.map_evaluation import MapOptions, evaluate_map_of_run, read_transform
+from lidarslam.reference_map import find_reference_map, load_reference_map
+from mapping.global_map import PointCloud
+from mapping.map_io import write_cloud
+
+# Where the run's world lies in the recording's.
+T_TRUTH_RUN = exp([0.0, 0.0, 2.0, 5.0, -3.0, 0.5])
+
+
+@pytest.fixture
+def surfaces(rng: np.random.Generator) -> FloatArray:
+    """The floor and two walls of a hall."""
+    u, v = rng.uniform(0.0, 1.0, (2, 9_000)) * [[20.0], [12.0]]
+    nought = np.zeros(len(u))
+    walls = [np.stack(c, axis=1) for c in ((u, v, nought), (u, nought, v / 4.0), (nought, v, u / 7.0))]
+    return np.concatenate(walls)
+
+
+@pytest.fixture
+def recording(tmp_path: Path, surfaces: FloatArray) -> Path:
+    """What a simulated recording of two scans leaves: scans, truth, map and README."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for number in range(2):
+        np.save(folder / f"scan_{number}.npy", np.ones((100, 3)))
+    stamps = 0.1 * np.arange(60)
+    T = exp(np.multiply.outer(stamps, [0.0, 0.0, 0.2, 1.0, 0.1, 0.0]))
+    write_tum(folder / "ground_truth.tum", Trajectory(stamps, T_TRUTH_RUN @ T))
+    write_cloud(folder / "map.ply", PointCloud(surfaces, np.zeros_like(surfaces)))
+    (folder / "README.md").write_text("Made by `lidarslam simulate` (version 0)")
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path: Path, recording: Path, surfaces: FloatArray) -> Path:
+    """A run without error but for its map, of which every point is 3 cm too high."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    stamps = 0.1 * np.arange(60)
+    T = exp(np.multiply.outer(stamps, [0.0, 0.0, 0.2, 1.0, 0.1, 0.0]))
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
+    (folder / "trajectory.kitti").write_text(format_kitti(T))
+    points = transform_points(inverse(T_TRUTH_RUN), surfaces + [0.0, 0.0, 0.03])
+    write_cloud(folder / "map.ply", PointCloud(points, np.zeros_like(points)))
+    (folder / "config.yaml").write_text(dump_yaml(Config(), {"source": str(recording)}))
+    (folder / "metrics.json").write_text("{}")
+    return folder
+
+
+def test_a_simulated_recording_brings_truth_and_map(run: Path, recording: Path) -> None:
+    evaluation = evaluate(EvaluateRequest(run, map_options=MapOptions(refine=False)))
+    written = json.loads((run / "metrics.json").read_text())
+    assert written["association"] == {"matched": 60, "estimate": 60, "reference": 60}
+    assert written["trajectory"]["ate_rmse_m"] < 1e-6
+    assert written["map"]["accuracy_mean_m"] == pytest.approx(0.02, abs=0.011)
+    assert written["map"]["coverage_percent"] == {"1.0": 100.0}
+    assert set(written["map"]) >= {"completeness_mean_m", "chamfer_m", "f_score_percent", "deviation_percent"}
+    assert written["map_alignment"]["method"] == "trajectory"
+    np.testing.assert_allclose(written["map_alignment"]["T_reference_map"], T_TRUTH_RUN, atol=1e-6)
+    assert written["map_entropy"]["mean_map_entropy"] == written["map"]["mean_map_entropy"]
+    text = format_evaluation(evaluation)
+    for words in (f"the ground truth of {recording}", "60 of 60", "the exact map of the simulation", "not refined"):
+        assert words in text
+    assert f"written to {run / 'metrics.json'}" in text
+
+
+def test_refinement_takes_the_offset_away_and_says_so(run: Path) -> None:
+    kept = evaluate(EvaluateRequest(run, map_options=MapOptions(refine=False)))
+    refined = evaluate(EvaluateRequest(run))
+    assert kept.map is not None
+    assert refined.map is not None
+    assert refined.map.alignment.moved_m == pytest.approx(0.03, abs=0.01)
+    assert refined.map.json["chamfer_m"] < kept.map.json["chamfer_m"]  # type: ignore[operator]
+    assert "ICP, which moved it by 0.03" in format_evaluation(refined)
+
+
+@pytest.mark.parametrize("alignment", ["trajectory", "global", "none", "FILE"])
+def test_every_alignment_is_told(run: Path, tmp_path: Path, alignment: str) -> None:
+    np.savetxt(tmp_path / "T.txt", T_TRUTH_RUN)
+    chosen = str(tmp_path / "T.txt") if alignment == "FILE" else alignment
+    evaluation = evaluate(EvaluateRequest(run, map_options=MapOptions(alignment=chosen)))
+    assert evaluation.map is not None
+    found = evaluation.map.alignment
+    assert found.method == ("file" if alignment == "FILE" else alignment)
+    assert found.refined == (alignment != "none")
+    if alignment == "none":  # wrong here: said in figures and in words
+        assert not found.is_trustworthy
+        assert any("its alignment is wrong" in note for note in evaluation.notes)
+    else:
+        assert evaluation.map.json["accuracy_mean_m"] < 0.02  # type: ignore[operator]
+
+
+def test_the_figures_for_a_comparison(run: Path, recording: Path) -> None:
+    reference = find_reference_map(recording)
+    assert reference is not None
+    evaluation = evaluate_map_of_run(run, None, reference)
+    assert evaluation.alignment.method == "trajectory"
+    assert len(evaluation.errors.points) == len(evaluation.errors.distances_m) > 1_000
+    assert evaluation.errors.distances_m.max() < 0.2
+    assert find_reference_map(run) is None
+    assert load_reference_map(run / "map.ply").truth is None
+
+
+def test_the_map_alone_of_a_run_without_truth(run: Path, recording: Path, surfaces: FloatArray) -> None:
+    write_cloud(run.parent / "site.ply", PointCloud(surfaces, np.zeros_like(surfaces)))
+    (recording / "ground_truth.tum").unlink()
+    (recording / "map.ply").unlink()
+    evaluation = evaluate(EvaluateRequest(run, reference_map=run.parent / "site.ply"))
+    written = json.loads((run / "metrics.json").read_text())
+    assert written["association"] is written["trajectory"] is written["kitti"] is None
+    assert written["map"]["accuracy_mean_m"] < 0.02
+    assert written["map_alignment"]["method"] == "global"
+    assert any("the trajectory is not evaluated" in note for note in evaluation.notes)
+
+
+def test_nothing_to_compare_with(run: Path, recording: Path) -> None:
+    (recording / "ground_truth.tum").unlink()
+    with pytest.raises(InputError, match="came with no ground truth; name a trajectory with --reference"):
+        evaluate(EvaluateRequest(run))
+    recording.rename(recording.with_name("elsewhere"))
+    with pytest.raises(InputError, match="is not there any more; .* --reference"):
+        evaluate(EvaluateRequest(run))
+    evaluation = evaluate(EvaluateRequest(run, needs_reference=False))
+    assert evaluation.entropy is not None
+    assert json.loads((run / "metrics.json").read_text())["map"] is None
+    assert "mean map entropy" in format_evaluation(evaluation)
+
+
+@pytest.mark.parametrize("name", ["truth.tum", "truth.kitti", "folder", "run"])
+def test_references_of_every_kind(run: Path, recording: Path, tmp_path: Path, name: str) -> None:
+    stamps, T = 0.1 * np.arange(60), exp(np.multiply.outer(0.1 * np.arange(60), [0.0, 0.0, 0.2, 1.0, 0.1, 0.0]))
+    write_tum(tmp_path / "truth.tum", Trajectory(stamps, T))
+    (tmp_path / "truth.kitti").write_text(format_kitti(T))
+    reference = {"folder": recording, "run": run}.get(name, tmp_path / name)
+    evaluation = evaluate(EvaluateRequest(run, reference=reference, out=tmp_path / "figures.json"))
+    assert evaluation.metrics is not None
+    assert evaluation.metrics.errors.ate_rmse_m < 1e-6
+    assert json.loads((tmp_path / "figures.json").read_text())["association"]["matched"] == 60
+    assert (run / "metrics.json").read_text() == "{}"
+
+
+def test_kitti_files_are_matched_by_number(tmp_path: Path) -> None:
+    T = exp(np.multiply.outer(np.arange(50.0), [0.0, 0.0, 0.01, 1.0, 0.0, 0.0]))
+    (tmp_path / "a.txt").write_text(format_kitti(T))
+    (tmp_path / "b.txt").write_text(format_kitti(T[:-1]))
+    evaluation = evaluate(EvaluateRequest(tmp_path / "a.txt", reference=tmp_path / "a.txt"))
+    assert evaluation.written == []
+    with pytest.raises(InputError, match=r"a\.txt has 50 poses, .*b\.txt has 49, .* no stamps"):
+        evaluate(EvaluateRequest(tmp_path / "a.txt", reference=tmp_path / "b.txt"))
+
+
+def test_a_kitti_estimate_meets_the_truth_in_the_cameras_frame(tmp_path: Path) -> None:
+    folder = tmp_path / "sequences" / "00"
+    (folder / "velodyne").mkdir(parents=True)
+    (tmp_path / "poses").mkdir()
+    for number in range(2):
+        np.ones((100, 4), dtype=np.float32).tofile(folder / "velodyne" / f"{number:06d}.bin")
+    poses = exp(np.multiply.outer(np.arange(40.0), [0.0, 0.05, 0.0, 0.0, 0.0, 1.0]))
+    (tmp_path / "poses" / "00.txt").write_text(format_kitti(poses))
+    Tr = "0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3"
+    (folder / "calib.txt").write_text("".join(f"P{n}: 1 0 0 0 0 1 0 0 0 0 1 0\n" for n in range(4)) + f"Tr: {Tr}\n")
+    (tmp_path / "estimate.txt").write_text(format_kitti(poses))
+    evaluation = evaluate(EvaluateRequest(tmp_path / "estimate.txt", reference=folder))
+    assert evaluation.metrics is not None
+    assert evaluation.metrics.errors.ate_rmse_m < 1e-6
+    assert evaluation.metrics.errors.rpe_translation_rmse_m < 1e-6  # type: ignore[operator]
+
+
+def test_errors_are_written_as_coloured_points(run: Path, tmp_path: Path) -> None:
+    ply, rrd = tmp_path / "errors.ply", tmp_path / "errors.rrd"
+    evaluation = evaluate(EvaluateRequest(run, errors=[ply, rrd], map_options=MapOptions(refine=False)))
+    vertices = read_ply(ply)
+    assert evaluation.map is not None
+    np.testing.assert_allclose(vertices["distance_m"], evaluation.map.comparison.map_errors.distances_m, rtol=1e-6)
+    assert vertices.dtype["x"] == np.float64
+    from rerun.chunk import RrdReader
+
+    entities = {chunk.entity_path for chunk in RrdReader(rrd).stream()}
+    assert {"/world/map_to_reference", "/world/reference_to_map", "/world/path", "/legend"} <= entities
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        ({"errors": ["x.txt"]}, OutputError, r"\.ply or \.rrd"),
+        ({"errors": ["none/x.ply"]}, OutputError, "there is no folder"),
+        ({"reference_map": "none.ply"}, InputError, "no such file"),
+        ({"reference": "none.tum"}, InputError, "no such trajectory"),
+        ({"run": "none"}, InputError, "no such run directory"),
+        ({"run": "recording"}, InputError, "not a run directory"),
+        ({"map_file": "recording/README.md"}, InputError, "not a point cloud"),
+    ],
+)
+def test_mistakes_are_named(
+    run: Path, tmp_path: Path, change: dict[str, object], kind: type[Exception], message: str
+) -> None:
+    places = {
+        k: [tmp_path / str(p) for p in v] if isinstance(v, list) else tmp_path / str(v) for k, v in change.items()
+    }
+    with pytest.raises(kind, match=message):
+        evaluate(EvaluateRequest(**({"run": run} | places)))  # type: ignore[arg-type]
+    assert (run / "metrics.json").read_text() == "{}"
+
+
+def test_a_global_search_needs_icp() -> None:
+    with pytest.raises(ConfigError, match="let --refine follow it"):
+        MapOptions(alignment="global", refine=False)
+
+
+@pytest.mark.parametrize("spoil", [lambda T: T[:3], lambda T: 2.0 * T, lambda T: T[:, :3]])
+def test_a_file_that_is_no_pose(tmp_path: Path, spoil: Callable[[FloatArray], FloatArray]) -> None:
+    np.savetxt(tmp_path / "T.txt", T_TRUTH_RUN)
+    np.testing.assert_allclose(read_transform(tmp_path / "T.txt"), T_TRUTH_RUN, atol=1e-12)
+    np.savetxt(tmp_path / "T.txt", spoil(T_TRUTH_RUN))
+    with pytest.raises(InputError, match=r"T\.txt"):
+        read_transform(tmp_path / "T.txt")

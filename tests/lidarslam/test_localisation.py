@@ -1,0 +1,161 @@
+"""From odometry to a pose: what the motion during a sweep is taken for, and the way through the whole pipeline."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.localisation import Estimated, Localised, ScanToMap, SweepMotion
+from lidarslam.pipeline import Pipeline, ScanResult
+from mapping.config import GlobalMapConfig, MappingConfig
+from mapping.mapper import Mapper
+from odometry.constant_velocity import ConstantVelocity
+from odometry.external import ExternalOdometry
+from odometry.interface import Motion, Odometry
+
+BEFORE, AFTER = np.arange(6.0), np.arange(6.0) ** 2 - 3.0
+
+
+def sweep(begin: float, end: float) -> Scan:
+    offsets = np.linspace(begin, end, 11)
+    return Scan(np.ones((11, 3)), 0.0, offsets)
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "share_after"),
+    [(0.0, 0.1, 1.0), (-0.1, 0.0, 0.0), (-0.05, 0.05, 0.5), (-0.075, 0.025, 0.25), (0.02, 0.1, 1.0)],
+    ids=["stamped at the start", "at the end", "in the middle", "late", "before its start"],
+)
+def test_the_mean_motion_counts_how_much_of_the_sweep_lies_after_the_stamp(
+    begin: float, end: float, share_after: float
+) -> None:
+    mean = SweepMotion(BEFORE, AFTER).mean(sweep(begin, end))
+    np.testing.assert_allclose(mean, share_after * AFTER + (1.0 - share_after) * BEFORE, atol=1e-12)
+
+
+def test_a_motion_known_on_one_side_only_serves_for_the_other() -> None:
+    scan = sweep(-0.05, 0.05)
+    np.testing.assert_array_equal(SweepMotion(BEFORE, None).mean(scan), BEFORE)
+    np.testing.assert_array_equal(SweepMotion(None, AFTER).mean(scan), AFTER)
+    assert SweepMotion(None, None).mean(scan) is None
+
+
+def test_a_sweep_that_was_compensated_already_is_left_alone() -> None:
+    scan = Scan(np.ones((5, 3)), 0.0)
+    np.testing.assert_array_equal(SweepMotion(BEFORE, AFTER).compensate(scan), scan.points)
+
+
+def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> None:
+    scan = sweep(-0.05, 0.05)
+    assert scan.time_offsets is not None
+    expected = [
+        transform_points(exp(t * (BEFORE if t < 0.0 else AFTER)), p[None])[0]
+        for t, p in zip(scan.time_offsets, scan.points, strict=True)
+    ]
+    np.testing.assert_allclose(SweepMotion(BEFORE, AFTER).compensate(scan), expected, atol=1e-12)
+
+
+def localise_all(scans: list[Scan], motions: list[Motion]) -> list[Localised]:
+    localiser = ScanToMap(Mapper(MappingConfig()))
+    measured = [motion.failure is None for motion in motions]
+    estimates = [
+        Estimated(scan, motion, 0.1 if k and measured[k] and measured[k - 1] else None)
+        for k, (scan, motion) in enumerate(zip(scans, motions, strict=True))
+    ]
+    return [
+        localiser.localise(estimate, following)
+        for estimate, following in zip(estimates, [*estimates[1:], None], strict=True)
+    ]
+
+
+def test_the_odometrys_own_path_is_its_motions_chained_however_wrong(
+    room_scans: list[Scan], room_truth: Trajectory, rng: np.random.Generator
+) -> None:
+    errors = exp(rng.normal(0.0, [0.01] * 3 + [0.02] * 3, (len(room_scans) - 1, 6)))
+    wrong = [np.eye(4), *(room_truth.relative_motions() @ errors)]
+    localised = localise_all(room_scans, [Motion(T, 100) for T in wrong])
+    chained = np.eye(4)
+    for T_prev_curr, found in zip(wrong, localised, strict=True):
+        chained = chained @ T_prev_curr
+        np.testing.assert_allclose(found.T_odom_lidar, chained, atol=1e-9)
+    assert np.linalg.norm(chained[:3, 3] - localised[-1].T_world_lidar[:3, 3]) > 0.02, "but not the pose"
+
+
+def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_motion(
+    room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    nothing = [Motion(np.eye(4), 0, "covered") for _ in room_scans]
+    localised = localise_all(room_scans, nothing)
+    moved = np.linalg.norm(localised[-1].T_odom_lidar[:3, 3])
+    true_path = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar[-1]
+    assert moved == pytest.approx(np.linalg.norm(true_path[:3, 3]), abs=0.2)
+
+
+def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanResult], Pipeline]:
+    pipeline = Pipeline(odometry, ScanToMap(Mapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
+    return list(pipeline.run(scans)), pipeline
+
+
+def check_poses_and_map(
+    results: list[ScanResult], pipeline: Pipeline, room: Any, room_truth: Trajectory, skipped: int = 0
+) -> None:
+    truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
+    errors = inverse(truth) @ np.array([result.T_world_lidar for result in results])
+    assert np.linalg.norm(errors[skipped:, :3, 3], axis=1).max() < 0.01
+    assert np.rad2deg(rotation_angle(errors[skipped:])).max() < 0.1
+    assert all(result.status is Status.OK for result in results)
+    assert pipeline.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    distance = room.distance_to_surface(in_room)
+    assert np.median(distance) < 0.005
+    assert np.percentile(distance, 99) < 0.06
+
+
+def test_true_odometry_through_the_map_gives_true_poses_and_a_true_map(
+    room: Any, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    results, pipeline = run(ExternalOdometry(room_truth), room_scans)
+    check_poses_and_map(results, pipeline, room, room_truth)
+
+
+def test_a_drifting_odometry_is_corrected_by_the_map(
+    room: Any, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
+    step = exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
+    motions = room_truth.relative_motions() @ step
+    poses = [np.eye(4)]
+    for T_prev_curr in motions:
+        poses.append(poses[-1] @ T_prev_curr)
+    results, pipeline = run(ExternalOdometry(Trajectory(room_truth.stamps, np.array(poses))), room_scans)
+    check_poses_and_map(results, pipeline, room, room_truth)
+
+
+def test_without_any_odometry_poses_and_map_are_true_once_it_has_begun_to_move(
+    room: Any, room_truth: Trajectory, drive: Callable[[FloatArray], FloatArray]
+) -> None:
+    """The first sweep is taken for one at rest: it is one here."""
+
+    def from_rest(time: FloatArray) -> FloatArray:
+        return drive(0.1 + np.maximum(0.0, np.asarray(time) - 0.2))
+
+    stamps = room_truth.stamps
+    scans = [room.sweep(from_rest, float(stamp)) for stamp in stamps]
+    results, pipeline = run(ConstantVelocity(), scans)
+    check_poses_and_map(results, pipeline, room, Trajectory(stamps, from_rest(stamps)))
+
+
+def test_results_carry_what_the_map_says_of_the_pose(room_scans: list[Scan], room_truth: Trajectory) -> None:
+    results, _ = run(ExternalOdometry(room_truth), room_scans[:4])
+    assert results[0].covariance is None
+    assert results[3].covariance is not None
+    assert results[3].covariance.shape == (6, 6)
+    assert results[3].inlier_ratio is not None
+    assert results[3].inlier_ratio > 0.9
+    assert results[3].degenerate == ()
+    assert set(results[3].stage_ms) == {"read", "odometry", "refine", "deskew", "map"}

@@ -1,0 +1,113 @@
+"""Clouds of every format, with the coordinates of a survey."""
+
+import builtins
+from collections.abc import Callable
+from pathlib import Path
+
+import laspy
+import numpy as np
+import open3d as o3d
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.reference_cloud import read_cloud
+
+UTM = np.array([5e5, 5e6, 300.0])
+
+
+@pytest.fixture
+def survey(rng: np.random.Generator) -> FloatArray:
+    """Points around UTM coordinates, whole millimetres."""
+    return np.round(rng.uniform(-20.0, 20.0, (500, 3)), 3) + UTM
+
+
+def _write_las(path: Path, points: FloatArray) -> None:
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.offsets, header.scales = UTM, np.full(3, 0.001)
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.write(path)
+
+
+def _write_e57(path: Path, points: FloatArray) -> None:
+    pye57 = pytest.importorskip("pye57")
+    file = pye57.E57(str(path), mode="w")
+    local = points - UTM
+    for half in (local[::2], local[1::2]):
+        columns = {f"cartesian{axis}": half[:, column].copy() for column, axis in enumerate("XYZ")}
+        file.write_scan_raw(columns, rotation=np.array([1.0, 0.0, 0.0, 0.0]), translation=UTM)
+    file.close()
+
+
+def _write_ply(path: Path, points: FloatArray) -> None:
+    o3d.io.write_point_cloud(path, o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+
+
+def _write_pcd(path: Path, points: FloatArray) -> None:
+    header = f"VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+    path.write_bytes(f"{header}POINTS {len(points)}\nDATA binary\n".encode() + points.tobytes())
+
+
+WRITERS: dict[str, Callable[[Path, FloatArray], None]] = {
+    "cloud.las": _write_las,
+    "cloud.laz": _write_las,
+    "cloud.e57": _write_e57,
+    "cloud.ply": _write_ply,
+    "cloud.PCD": _write_pcd,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_large_coordinates_survive(tmp_path: Path, survey: FloatArray, name: str) -> None:
+    WRITERS[name](tmp_path / name, survey)
+    points = read_cloud(tmp_path / name)
+    assert points.dtype == np.float64
+    in_order = [cloud[np.lexsort(np.round(cloud, 3).T)] for cloud in (points, survey)]
+    np.testing.assert_allclose(*in_order, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("share", [0.02, 0.6])
+def test_a_truncated_file_gets_one_line(tmp_path: Path, survey: FloatArray, name: str, share: float) -> None:
+    WRITERS[name](tmp_path / "whole", survey) if name != "cloud.ply" else WRITERS[name](tmp_path / name, survey)
+    whole = tmp_path / (name if name == "cloud.ply" else "whole")
+    content = whole.read_bytes()
+    (tmp_path / name).write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match=rf"{name}: not a readable") as caught:
+        read_cloud(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_points_that_are_none_are_dropped(tmp_path: Path, survey: FloatArray) -> None:
+    survey[::5, 1] = np.nan
+    _write_pcd(tmp_path / "cloud.pcd", survey)
+    assert len(read_cloud(tmp_path / "cloud.pcd")) == 400
+    survey[:] = np.inf
+    _write_pcd(tmp_path / "cloud.pcd", survey)
+    with pytest.raises(InputError, match=r"cloud\.pcd: holds no point"):
+        read_cloud(tmp_path / "cloud.pcd")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("none.ply", "no such file"), ("cloud.obj", "must end in .ply"), ("", "is a folder")]
+)
+def test_what_is_no_cloud(tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "cloud.obj").write_text("v 0 0 0\n")
+    with pytest.raises(InputError, match=message):
+        read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(("name", "library"), [("cloud.las", "laspy"), ("cloud.e57", "pye57")])
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, library: str) -> None:
+    original = builtins.__import__
+
+    def refuse(wanted: str, *rest: object, **more: object) -> object:
+        if wanted == library:
+            raise ImportError(wanted)
+        return original(wanted, *rest, **more)  # type: ignore[arg-type]
+
+    (tmp_path / name).write_bytes(b"")
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(InputError, match=f"need {library}; type: pip install"):
+        read_cloud(tmp_path / name)

@@ -1,0 +1,113 @@
+"""How well scans at known poses lie on a box, and what is made of it."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.tracking import Status
+from mapping.config import TrackingConfig
+from mapping.fit import Fit, measure_fit
+from mapping.local_map import LocalMap
+
+CONFIG = TrackingConfig()
+HALF = np.array([7.0, 5.0, 2.0])
+T_WORLD_LIDAR = exp([0.0, 0.0, 0.4, 1.0, -0.5, 0.2])
+
+
+def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> FloatArray:
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
+    return points
+
+
+@pytest.fixture
+def box_map(rng: np.random.Generator) -> LocalMap:
+    local_map = LocalMap(0.2, 100.0)
+    points = box_points(rng, 60_000)
+    local_map.add(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.empty((0, 3)), np.zeros(3))
+    return local_map
+
+
+@pytest.fixture
+def scan_points(rng: np.random.Generator) -> FloatArray:
+    """Seen from `T_WORLD_LIDAR`, away from the box's edges."""
+    return transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 3_000, margin=0.5))
+
+
+def test_a_scan_in_its_place_fits_entirely(box_map: LocalMap, scan_points: FloatArray) -> None:
+    fit = measure_fit(scan_points, T_WORLD_LIDAR, box_map, CONFIG)
+    assert fit.matched == len(scan_points)
+    assert fit.overlap == 1.0
+    assert fit.inlier_ratio == 1.0
+    assert fit.residual_m is not None
+    assert fit.residual_m < 1e-5
+    assert fit.status(CONFIG) is Status.OK
+    assert fit.explain(CONFIG) == ""
+
+
+def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map: LocalMap, scan_points: FloatArray) -> None:
+    elsewhere = scan_points + [0.0, 0.0, 50.0]
+    fit = measure_fit(np.concatenate([scan_points, elsewhere]), T_WORLD_LIDAR, box_map, CONFIG)
+    assert fit.overlap == pytest.approx(0.5)
+    assert fit.inlier_ratio == 1.0
+    assert fit.inlier_share == pytest.approx(0.5)
+
+
+def test_points_at_corners_count_once_each(box_map: LocalMap, rng: np.random.Generator) -> None:
+    """Whatever a point there is held against, planes, lines or bodies."""
+    points = transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 4_000))
+    fit = measure_fit(points, T_WORLD_LIDAR, box_map, CONFIG)
+    assert fit.matched <= len(points)
+    assert 0.8 < fit.overlap <= 1.0
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_worst_axis_decides(box_map: LocalMap, scan_points: FloatArray, axis: int) -> None:
+    """A shift by a little more than the gate along one axis of the world: the others' walls all fit."""
+    shift = np.eye(4)
+    shift[axis, 3] = 0.35
+    fit = measure_fit(scan_points, shift @ T_WORLD_LIDAR, box_map, CONFIG)
+    assert fit.inlier_ratio is not None
+    assert fit.inlier_ratio < 0.05
+    assert fit.status(CONFIG) is Status.LOST
+    assert "lies on the map" in fit.explain(CONFIG)
+
+
+def test_a_scan_far_from_everything_does_not_meet_the_map(box_map: LocalMap, scan_points: FloatArray) -> None:
+    far = np.eye(4)
+    far[:3, 3] = 500.0
+    fit = measure_fit(scan_points, far, box_map, CONFIG)
+    assert fit == Fit(0, 0.0, None, None)
+    assert fit.status(CONFIG) is Status.LOST
+    assert fit.inlier_share == 0.0
+    assert "0 % of the scan meets the map" in fit.explain(CONFIG)
+
+
+def test_no_points_fit_nothing(box_map: LocalMap) -> None:
+    assert measure_fit(np.empty((0, 3)), np.eye(4), box_map, CONFIG) == Fit(0, 0.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("inlier_ratio", "status"),
+    [(1.0, Status.OK), (0.6, Status.OK), (0.59, Status.DEGRADED), (0.45, Status.DEGRADED), (0.44, Status.LOST)],
+)
+def test_the_share_of_inliers_decides_on_the_status(inlier_ratio: float, status: Status) -> None:
+    config = TrackingConfig(degraded_below=0.6, lost_below=0.45)
+    assert Fit(1_000, 0.9, 0.01, inlier_ratio).status(config) is status
+
+
+def test_a_scan_that_hardly_meets_the_map_is_lost_however_it_fits() -> None:
+    assert Fit(50, 0.05, 0.001, 1.0).status(CONFIG) is Status.LOST
+    assert Fit(50, 0.05, 0.001, 1.0).explain(CONFIG) == "only 5 % of the scan meets the map"
+
+
+def test_far_points_may_lie_farther_from_their_surface(rng: np.random.Generator) -> None:
+    """At 40 m two per cent of the range are 0.8 m; the same offset nearby is none of an inlier."""
+    for distance, expected in ((40.0, 1.0), (5.0, 0.0)):
+        wall = np.column_stack([np.full(20_000, distance), rng.uniform(-3, 3, (20_000, 2))])
+        local_map = LocalMap(0.5, 100.0)
+        local_map.add(wall, rng.uniform(-0.1, 0.1, 20_000), np.empty((0, 3)), np.zeros(3))
+        asked = np.column_stack([np.full(500, distance - 0.4), rng.uniform(-2, 2, (500, 2))])
+        fit = measure_fit(asked, np.eye(4), local_map, CONFIG)
+        assert fit.inlier_ratio == expected

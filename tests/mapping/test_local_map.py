@@ -1,0 +1,226 @@
+"""Matches of points with surfaces that have formulas."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from mapping.local_map import LEVELS, LocalMap, Matches
+
+CELL = 0.4
+HALF = np.array([7.0, 5.0, 2.0])
+HERE = np.zeros(3)
+NO_EDGES = np.empty((0, 3))
+
+
+def elevations_of(points: FloatArray) -> FloatArray:
+    return np.asarray(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
+
+
+def map_of(points: FloatArray, edges: FloatArray = NO_EDGES, cell_m: float = CELL) -> LocalMap:
+    local_map = LocalMap(cell_m, 100.0)
+    local_map.add(points, elevations_of(points), edges, HERE)
+    return local_map
+
+
+def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> FloatArray:
+    """Points (N, 3) on the six sides of a box, as far from its edges as the margin."""
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
+    return points
+
+
+def floor_points(rng: np.random.Generator, count: int, half_size: float = 4.0, z: float = -1.0) -> FloatArray:
+    return np.column_stack([rng.uniform(-half_size, half_size, (count, 2)), np.full(count, z)])
+
+
+def ring(elevation_deg: float, walls: tuple[float, float] | None = None, z: float | None = None) -> FloatArray:
+    """Where one laser meets two walls around a corner, at x and y, or the floor at height z."""
+    azimuth = np.deg2rad(np.linspace(0.0, 90.0, 901)[1:-1])
+    tangent = np.tan(np.deg2rad(elevation_deg))
+    if walls is not None:
+        distance = np.minimum(walls[0] / np.cos(azimuth), walls[1] / np.sin(azimuth))
+    else:
+        assert z is not None
+        distance = np.full(len(azimuth), z / tangent)
+    return np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), distance * tangent])
+
+
+def distances(points: FloatArray, matches: Matches) -> FloatArray:
+    offsets = points[matches.index] - matches.points
+    return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
+
+
+def test_points_on_walls_meet_the_walls(rng: np.random.Generator) -> None:
+    local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
+    matches = local_map.match_planes(asked, HERE)
+    np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
+    assert distances(asked, matches).max() < 1e-5
+    assert matches.thickness_m.max() < 1e-3
+    side = (np.abs(np.abs(asked) - HALF) < 1e-9).argmax(axis=1)[matches.index]
+    np.testing.assert_allclose(np.abs(matches.normals[np.arange(len(side)), side]), 1.0, atol=1e-9)
+
+
+def test_the_finest_grid_that_shows_a_plane_decides(rng: np.random.Generator) -> None:
+    """Two floors, one above the other: only fine cells keep them apart."""
+    lower, upper = floor_points(rng, 20_000, z=-1.0), floor_points(rng, 20_000, z=-1.0 + 3.2 * CELL)
+    local_map = map_of(np.concatenate([lower, upper]))
+    inner = np.abs(lower[:, :2]).max(axis=1) < 2.0
+    fine = local_map.match_planes(lower[inner], HERE)
+    assert len(fine) == inner.sum()
+    assert distances(lower[inner], fine).max() < 1e-5
+
+
+def test_where_fine_cells_show_nothing_coarse_ones_do(rng: np.random.Generator) -> None:
+    sparse = floor_points(rng, 150)
+    asked = floor_points(rng, 300, half_size=3.0)
+    local_map = map_of(sparse)
+    matches = local_map.match_planes(asked, HERE)
+    np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
+    assert distances(asked, matches).max() < 1e-5
+
+
+@pytest.mark.parametrize("first_level", range(len(LEVELS)))
+def test_coarse_grids_reach_farther(rng: np.random.Generator, first_level: int) -> None:
+    """Alone they reach at least as far above the floor as their own cells, and not three times as far."""
+    local_map = map_of(floor_points(rng, 40_000, z=-0.01))
+    cell_m = CELL * LEVELS[first_level]
+    above = floor_points(rng, 100, half_size=1.0, z=0.9 * cell_m)
+    assert len(local_map.match_planes(above, np.array([0.0, 0.0, 5.0]), first_level)) == 100
+    beyond = above + [0.0, 0.0, 3.0 * CELL * LEVELS[-1]]
+    assert len(local_map.match_planes(beyond, np.array([0.0, 0.0, 9.0]), first_level)) == 0
+
+
+def test_finer_grids_are_left_out_on_request(rng: np.random.Generator) -> None:
+    """Of floors half a coarse cell apart, fine cells show each, coarse ones something between."""
+    low, high = floor_points(rng, 30_000, z=-1.0), floor_points(rng, 5_000, z=-1.0 + 3.2 * CELL)
+    local_map = map_of(np.concatenate([low, high]))
+    asked = floor_points(rng, 200, half_size=2.0)
+    assert distances(asked, local_map.match_planes(asked, HERE, 0)).max() < 1e-5
+    assert distances(asked, local_map.match_planes(asked, HERE, len(LEVELS) - 1)).min() > 0.01
+
+
+@pytest.mark.parametrize("elevation_deg", [-4.0, 0.5, 8.0])
+def test_a_ring_bent_around_a_corner_is_no_plane(elevation_deg: float) -> None:
+    points = ring(elevation_deg, walls=(4.0, 5.0))
+    assert len(map_of(points).match_planes(points, HERE)) == 0
+
+
+def test_a_ring_on_the_ground_far_away_is_no_plane() -> None:
+    points = ring(-5.7, z=-1.0)
+    assert len(map_of(points).match_planes(points, HERE)) == 0
+
+
+def test_two_rings_on_the_ground_show_it() -> None:
+    points = np.concatenate([ring(-5.7, z=-1.0), ring(-6.7, z=-1.0)])
+    matches = map_of(points).match_planes(points, HERE)
+    assert len(np.unique(matches.index)) > 0.95 * len(points)
+    np.testing.assert_allclose(np.abs(matches.normals[:, 2]), 1.0, atol=1e-6)
+
+
+def test_two_rings_on_walls_show_them() -> None:
+    points = np.concatenate([ring(3.0, walls=(4.0, 5.0)), ring(6.0, walls=(4.0, 5.0))])
+    away = np.abs(points[:, 0] - points[:, 1] * 4.0 / 5.0) > 2.5  # from the corner
+    matches = map_of(points).match_planes(points[away], HERE)
+    assert len(np.unique(matches.index)) > 0.9 * away.sum()
+    assert distances(points[away], matches).max() < 1e-5
+
+
+def test_nothing_is_matched_in_an_empty_map(rng: np.random.Generator) -> None:
+    empty = LocalMap(CELL, 100.0)
+    assert len(empty.match_planes(floor_points(rng, 10), HERE)) == 0
+    assert len(empty.match_lines(floor_points(rng, 10))) == 0
+
+
+def test_no_points_have_no_matches(rng: np.random.Generator) -> None:
+    local_map = map_of(floor_points(rng, 2_000))
+    assert len(local_map.match_planes(np.empty((0, 3)), HERE)) == 0
+    assert len(local_map.match_lines(np.empty((0, 3)))) == 0
+
+
+def test_a_point_beside_a_line_is_pulled_across_it_both_ways(rng: np.random.Generator) -> None:
+    direction = np.array([0.6, 0.0, 0.8])
+    line = [1.0, 2.0, 0.0] + rng.uniform(-3.0, 3.0, (600, 1)) * direction
+    local_map = map_of(floor_points(rng, 100), edges=line)
+    foot = np.array([1.0, 2.0, 0.0]) + 0.3 * direction
+    point = foot + [0.0, 0.07, 0.0]
+    matches = local_map.match_lines(point[None])
+    assert matches.index.tolist() == [0, 0]
+    np.testing.assert_allclose(matches.normals @ direction, 0.0, atol=1e-4)
+    pull = np.einsum("ij,ij->i", point - matches.points, matches.normals) @ matches.normals
+    np.testing.assert_allclose(pull, point - foot, atol=1e-4)
+
+
+def test_edges_are_no_planes_and_planes_no_edges(rng: np.random.Generator) -> None:
+    line = np.column_stack([rng.uniform(-3.0, 3.0, 600), np.zeros((600, 2))])
+    assert len(map_of(np.empty((0, 3)), edges=line).match_planes(line, np.array([0.0, 0.0, 3.0]))) == 0
+    assert len(map_of(line).match_lines(line)) == 0
+
+
+def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
+    local_map = LocalMap(0.5, 50.0)
+    sizes = []
+    for step in range(200):
+        sensor = np.array([10.0 * step, 0.0, 0.0])
+        points = sensor + rng.uniform(-30.0, 30.0, (300, 3)) * [1.0, 1.0, 0.1]
+        local_map.add(points, np.zeros(300), points[:30], sensor)
+        sizes.append(len(local_map))
+    assert max(sizes[100:]) < 1.2 * max(sizes[:30])
+    assert min(sizes[100:]) > 0.5 * max(sizes[:30])
+
+
+def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
+    local_map = LocalMap(CELL, 20.0)
+    floor = floor_points(rng, 20_000, half_size=3.0)
+    local_map.add(floor, elevations_of(floor), NO_EDGES, HERE)
+    away = floor + [30.0, 0.0, 0.0]
+    local_map.add(away, elevations_of(floor), NO_EDGES, np.array([30.0, 0.0, 0.0]))
+    assert len(local_map.match_planes(floor[:200], HERE)) == 0
+    assert len(local_map.match_planes(away[:200], np.array([30.0, 0.0, 0.0]))) == 200
+
+
+@pytest.mark.parametrize("factor", [0.45, 0.5, 0.8, 1.5, 2.0, 2.2])
+def test_planes_stay_in_place_when_cells_change_their_size(rng: np.random.Generator, factor: float) -> None:
+    """By more than two it changes when the sensor leaves a hall for a corridor, or the other way round."""
+    resized = map_of(box_points(rng, 60_000)).resized(CELL * factor)
+    assert resized.cell_m == CELL * factor
+    asked = box_points(rng, 2_000, margin=max(1.0, 2 * CELL * factor))
+    matches = resized.match_planes(asked, HERE)
+    assert len(np.unique(matches.index)) > 0.95 * len(asked)
+    off = distances(asked, matches)
+    assert np.median(off) < 1e-3
+    assert np.percentile(off, 90) < 0.03
+
+
+def test_grazed_ground_is_still_known_when_cells_change_their_size(rng: np.random.Generator) -> None:
+    azimuth, elevation_deg = rng.uniform(-np.pi, np.pi, 20_000), rng.uniform(-8.0, -4.0, 20_000)
+    distance = 1.0 / np.tan(np.deg2rad(-elevation_deg))
+    ground = np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), np.full(20_000, -1.0)])
+    local_map = map_of(ground)
+    before, after = (len(m.match_planes(ground[:500], HERE)) for m in (local_map, local_map.resized(2.0 * CELL)))
+    assert after > 0.8 * before > 350
+
+
+def test_lines_stay_in_place_when_cells_change_their_size(rng: np.random.Generator) -> None:
+    line = np.column_stack([np.full(600, 1.03), np.full(600, 2.02), rng.uniform(-3.0, 3.0, 600)])
+    resized = map_of(floor_points(rng, 100), edges=line).resized(CELL * 2.0)
+    matches = resized.match_lines(line)
+    assert len(np.unique(matches.index)) > 0.9 * len(line)
+    assert distances(line, matches).max() < 1e-4
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 10.0, -35.0])
+@pytest.mark.parametrize("pitch_deg", [0.0, 25.0])
+def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(
+    rng: np.random.Generator, roll_deg: float, pitch_deg: float
+) -> None:
+    R = exp(np.deg2rad([roll_deg, pitch_deg, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
+    vertical = map_of(box_points(rng, 40_000) @ R.T).vertical()
+    tilt_deg = np.hypot(roll_deg, pitch_deg)  # the corners of a room as small as this pull at it
+    assert np.rad2deg(np.arccos(vertical @ R[:, 2])) < 1.0 + 0.16 * tilt_deg
+    assert np.linalg.norm(vertical) == pytest.approx(1.0)
+
+
+def test_without_a_floor_the_vertical_is_the_worlds(rng: np.random.Generator) -> None:
+    wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
+    np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])

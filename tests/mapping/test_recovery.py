@@ -1,0 +1,85 @@
+"""Starts all around, and the right one among them."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
+from mapping.local_map import LocalMap
+from mapping.recovery import best_starts, start_poses
+
+UP = np.array([0.0, 0.0, 1.0])
+T_GIVEN = exp([0.1, -0.2, 0.7, 3.0, -2.0, 0.5])
+
+
+def test_the_given_pose_comes_first() -> None:
+    np.testing.assert_allclose(start_poses(T_GIVEN, UP, 15.0)[0], T_GIVEN, atol=1e-12)
+
+
+@pytest.mark.parametrize(("step_deg", "count"), [(15.0, 24), (90.0, 4), (50.0, 7), (400.0, 1)])
+def test_turns_are_even_and_go_all_around(step_deg: float, count: int) -> None:
+    starts = start_poses(T_GIVEN, UP, step_deg)
+    assert len(starts) == count
+    turns = starts[:, :3, :3] @ T_GIVEN[:3, :3].T
+    yaw_deg = np.sort(np.rad2deg(np.arctan2(turns[:, 1, 0], turns[:, 0, 0])) % 360.0)
+    np.testing.assert_allclose(np.diff(yaw_deg), 360.0 / count, atol=1e-9)
+
+
+def test_small_turns_come_before_large_ones() -> None:
+    starts = start_poses(T_GIVEN, UP, 15.0)
+    angles = rotation_angle(inverse(T_GIVEN) @ starts)
+    assert all(after >= before - 1e-9 for before, after in pairwise(angles))
+
+
+def test_all_starts_are_rigid_and_at_the_same_place() -> None:
+    starts = start_poses(T_GIVEN, UP, 15.0)
+    assert is_rigid(starts, 1e-12)
+    np.testing.assert_array_equal(starts[:, :3, 3], np.tile(T_GIVEN[:3, 3], (len(starts), 1)))
+
+
+def test_turns_are_about_the_given_vertical() -> None:
+    """In a world that is tilted, as the first scan was, the sensor keeps its lean against the true vertical."""
+    up = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
+    starts = start_poses(T_GIVEN, up, 15.0)
+    np.testing.assert_allclose(up @ starts[:, :3, 2].T, up @ T_GIVEN[:3, 2], atol=1e-12)
+
+
+def l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
+    """Points (N, 3) on the walls, floor and ceiling of a room that looks the same from no two directions."""
+    corners = np.array([[-4, -3], [6, -3], [6, 1], [1, 1], [1, 5], [-4, 5], [-4, -3]], dtype=float)
+    parts = []
+    for a, b in pairwise(corners):
+        along = rng.uniform(0.0, 1.0, (round(count * np.linalg.norm(b - a) / 36.0), 1))
+        parts.append(np.column_stack([a + along * (b - a), rng.uniform(-1.5, 1.5, len(along))]))
+    flat = rng.uniform([-4, -3], [6, 5], (count, 2))
+    flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
+    parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
+    return np.concatenate(parts)
+
+
+@pytest.fixture
+def l_map(rng: np.random.Generator) -> LocalMap:
+    points = l_shaped_room(rng, 20_000)
+    local_map = LocalMap(0.2, 100.0)
+    elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
+    local_map.add(points, elevations, np.empty((0, 3)), np.zeros(3))
+    return local_map
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 100.0, 180.0, -97.0, 40.0])
+def test_the_right_yaw_is_found_in_an_l_shaped_room(
+    rng: np.random.Generator, l_map: LocalMap, turned_deg: float
+) -> None:
+    """The sensor was turned on the spot by some angle that nobody knows."""
+    before = exp([0.0, 0.0, 0.2, 0.5, -0.5, 0.1])
+    after = before @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
+    points = transform_points(inverse(after), l_shaped_room(rng, 3_000))
+    best = best_starts(points, start_poses(before, UP, 15.0), l_map)
+    assert np.rad2deg(rotation_angle(inverse(best[0]) @ after)) <= 7.5 + 1e-6
+    assert 1 < len(best) < 6
+
+
+def test_no_points_choose_no_start_in_particular(l_map: LocalMap) -> None:
+    starts = start_poses(T_GIVEN, UP, 90.0)
+    assert best_starts(np.empty((0, 3)), starts, l_map).shape[1:] == (4, 4)

@@ -1,0 +1,218 @@
+"""Surfels of surfaces that have formulas: planes, lines, rings."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray
+from mapping.surfel_grid import SurfelGrid
+from mapping.voxel_table import ABSENT
+
+CELL = 0.5
+
+
+def unit(v: FloatArray) -> FloatArray:
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def on_plane(
+    rng: np.random.Generator, normal: FloatArray, through: FloatArray, half_size: float = 1.5, count: int = 4_000
+) -> FloatArray:
+    """Points (N, 3) on a square piece of a plane."""
+    along = unit(np.cross(normal, [0.3, 0.5, 0.8]))
+    coordinates = rng.uniform(-half_size, half_size, (count, 2))
+    return through + coordinates @ np.stack([along, np.cross(normal, along)])
+
+
+def grid_of(points: FloatArray, elevations: FloatArray | None = None) -> SurfelGrid:
+    grid = SurfelGrid(CELL)
+    grid.add(points, np.zeros(len(points)) if elevations is None else elevations)
+    return grid
+
+
+def cloud(rng: np.random.Generator, count: int = 5_000, half_size: float = 5.0) -> FloatArray:
+    return rng.uniform(-half_size, half_size, (count, 3))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("away_m", [0.0, 10_000.0])
+def test_patches_of_a_plane_lie_on_it_wherever_it_is(seed: int, away_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    normal, through = unit(rng.normal(size=3)), away_m * unit(rng.normal(size=3))
+    points = on_plane(rng, normal, through)
+    grid = grid_of(points)
+    patches = grid.patches(grid.look_up(points))
+    assert patches.is_plane.all()
+    np.testing.assert_allclose(np.abs(patches.normals @ normal), 1.0, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(np.cross(patches.normals, normal), 0.0, atol=2e-5)
+    np.testing.assert_allclose((patches.points - through) @ normal, 0.0, atol=2e-6)
+    assert patches.spreads_m[:, 0].max() < 1e-3
+
+
+def test_a_patch_is_as_thick_as_the_noise(rng: np.random.Generator) -> None:
+    normal = unit(np.array([0.2, -0.3, 0.9]))
+    points = on_plane(rng, normal, np.zeros(3), count=20_000)
+    grid = grid_of(points + rng.normal(0.0, 0.02, (len(points), 1)) * normal)
+    inner = np.abs(points).max(axis=1) < 0.5
+    thickness = grid.patches(grid.look_up(points[inner])).spreads_m[:, 0]
+    np.testing.assert_allclose(thickness, 0.02, rtol=0.1)
+
+
+def test_several_batches_make_what_one_makes(rng: np.random.Generator) -> None:
+    points, elevations = cloud(rng, 20_000), rng.normal(size=20_000)
+    at_once, in_parts = grid_of(points, elevations), SurfelGrid(CELL)
+    for part in np.array_split(np.arange(len(points)), 7):
+        in_parts.add(points[part], elevations[part])
+    assert len(at_once) == len(in_parts)
+    one = at_once.patches(at_once.look_up(points))
+    other = in_parts.patches(in_parts.look_up(points))
+    np.testing.assert_allclose(other.points, one.points, atol=1e-5)
+    np.testing.assert_allclose(other.spreads_m, one.spreads_m, atol=1e-4)
+    np.testing.assert_allclose(other.elevation_spreads, one.elevation_spreads, atol=1e-4)
+    np.testing.assert_allclose(other.counts, one.counts, rtol=1e-5)
+
+
+@pytest.mark.parametrize("offset", [-0.004, 0.004])
+def test_a_wall_along_the_border_of_cells_is_one_plane(rng: np.random.Generator, offset: float) -> None:
+    """Noise throws half of its points into the cells on either side."""
+    points = np.column_stack([rng.normal(offset, 0.005, 6_000), rng.uniform(-2, 2, (6_000, 2))])
+    grid = grid_of(points)
+    inner = np.abs(points[:, 1:]).max(axis=1) < 1.0
+    patches = grid.patches(grid.look_up(points[inner]))
+    assert patches.is_plane.all()
+    np.testing.assert_allclose(patches.points[:, 0], offset, atol=0.002)
+    assert np.rad2deg(np.arccos(np.abs(patches.normals[:, 0]).min())) < 0.5
+
+
+def test_two_walls_beyond_each_others_neighbourhood_do_not_mix(rng: np.random.Generator) -> None:
+    across = np.repeat([0.25, 0.25 + 2 * CELL], 3_000)
+    points = np.column_stack([across, rng.uniform(-1, 1, (6_000, 2))])
+    grid = grid_of(points)
+    np.testing.assert_allclose(grid.patches(grid.look_up(points)).points[:, 0], across, atol=1e-5)
+
+
+def test_neighbours_count_less_than_the_cell_itself() -> None:
+    """Two points beside one another in neighbouring cells: the patch lies nearer to the cell's own."""
+    grid = grid_of(np.array([[0.25, 0.25, 0.25], [0.75, 0.25, 0.25]]))
+    patch = grid.patches(grid.look_up(np.array([[0.25, 0.25, 0.25]])))
+    np.testing.assert_allclose(patch.points, [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
+    np.testing.assert_allclose(patch.counts, 1.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_line_has_its_direction(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    direction, through = unit(rng.normal(size=3)), 100.0 * rng.normal(size=3)
+    points = through + rng.uniform(-3.0, 3.0, (600, 1)) * direction
+    grid = grid_of(points)
+    patches = grid.patches(grid.look_up(points))
+    assert patches.is_line.all()
+    assert not patches.is_plane.any()
+    np.testing.assert_allclose(np.cross(patches.directions, direction), 0.0, atol=2e-5)
+    np.testing.assert_allclose(np.cross(patches.points - through, direction), 0.0, atol=1e-5)
+
+
+def test_a_ball_of_points_is_neither_plane_nor_line(rng: np.random.Generator) -> None:
+    grid = grid_of(cloud(rng, 20_000, half_size=1.5))
+    patches = grid.patches(grid.look_up(np.array([[0.1, 0.2, 0.3]])))
+    assert not patches.is_plane.any()
+    assert not patches.is_line.any()
+
+
+def test_five_points_show_nothing() -> None:
+    grid = grid_of(np.array([[0.1, 0.1, 0.1], [0.4, 0.1, 0.1], [0.1, 0.4, 0.1], [0.4, 0.4, 0.1], [0.2, 0.3, 0.1]]))
+    patches = grid.patches(grid.look_up(np.array([[0.2, 0.2, 0.1]])))
+    assert not patches.is_plane.any()
+    assert not patches.is_line.any()
+
+
+def test_an_empty_cell_shows_the_nearest_around_it() -> None:
+    held = np.array([[0.75, 0.25, 0.25], [0.25, 0.95, 0.25], [-0.45, 0.25, 0.25]])
+    grid = grid_of(held)
+    asked = np.array([[0.3, 0.3, 0.3], [0.05, 0.3, 0.3], [0.3, 0.4, 0.3], [-0.4, 0.45, 0.7]])
+    asked[1, 0] = 0.01
+    rows = grid.look_up(asked)
+    own = grid.look_up(held)
+    distances = np.linalg.norm(asked[:, None] - held, axis=2)
+    np.testing.assert_array_equal(rows, own[distances.argmin(axis=1)])
+    assert len(set(rows.tolist())) > 1
+
+
+def test_nothing_is_found_two_cells_away() -> None:
+    grid = grid_of(np.array([[0.25, 0.25, 0.25]]))
+    asked = np.array([[0.75, 0.75, 0.75], [1.01, 0.25, 0.25], [-0.51, 0.25, 0.25], [1e4, 1e4, 1e4]])
+    assert (grid.look_up(asked) == ABSENT).tolist() == [False, True, True, True]
+
+
+def test_nothing_is_found_in_an_empty_grid(rng: np.random.Generator) -> None:
+    grid = SurfelGrid(CELL)
+    rows = grid.look_up(cloud(rng, 50))
+    assert (rows == ABSENT).all()
+    assert len(grid.patches(rows[:0])) == 0
+
+
+def test_means_are_those_of_the_cells_points(rng: np.random.Generator) -> None:
+    points = cloud(rng, 3_000) - 200.0
+    cells, inverse = np.unique(np.floor(points / CELL), axis=0, return_inverse=True)
+    expected = np.stack([np.bincount(inverse, points[:, k]) for k in range(3)], axis=1)
+    expected /= np.bincount(inverse)[:, None]
+    means = grid_of(points).means()
+    order, other = np.lexsort(np.floor(means / CELL).T), np.lexsort(cells.T)
+    np.testing.assert_allclose(means[order], expected[other], atol=1e-5)
+
+
+def test_what_is_near_stays_with_its_patches_when_the_rest_is_forgotten(rng: np.random.Generator) -> None:
+    points = cloud(rng, 20_000)
+    grid = grid_of(points)
+    centre = np.array([1.0, 0.0, -1.0])
+    middles = (np.floor(points / CELL) + 0.5) * CELL
+    distance = np.linalg.norm(middles - centre, axis=1)
+    # Patches are worked out before: what is kept must not be worked out from what is gone.
+    before = grid.patches(grid.look_up(points)).values
+    held = len(grid)
+    grid.forget_beyond(centre, 3.0)
+    near = distance <= 3.0
+    assert len(grid) == len(np.unique(middles[near], axis=0)) < held
+    np.testing.assert_array_equal(grid.patches(grid.look_up(points[near])).values, before[near])
+    far = distance > 3.0 + 2.0 * CELL * 3**0.5
+    assert (grid.look_up(points[far]) == ABSENT).all()
+
+
+def test_goes_on_growing_after_forgetting(rng: np.random.Generator) -> None:
+    points = cloud(rng, 20_000)
+    grid = grid_of(points)
+    grid.forget_beyond(np.zeros(3), 2.0)
+    other = cloud(rng) + 50.0
+    grid.add(other, np.zeros(len(other)))
+    fresh = grid_of(other)
+    np.testing.assert_allclose(
+        grid.patches(grid.look_up(other)).points, fresh.patches(fresh.look_up(other)).points, atol=1e-9
+    )
+
+
+def test_a_cell_that_has_seen_enough_moves_no_more(rng: np.random.Generator) -> None:
+    wall = np.column_stack([np.full(9_000, 0.25), rng.uniform(-1, 1, (9_000, 2))])
+    grid = grid_of(wall)
+    before = grid.patches(grid.look_up(wall)).values
+    drifted = wall + [0.1, 0.0, 0.0]
+    grid.add(drifted, np.zeros(len(wall)))
+    np.testing.assert_array_equal(grid.patches(grid.look_up(wall)).values, before)
+
+
+def test_a_cell_that_has_seen_little_still_moves(rng: np.random.Generator) -> None:
+    def wall(x: float) -> FloatArray:
+        return np.column_stack([np.full(120, x), rng.uniform(-1, 1, (120, 2))])
+
+    grid = grid_of(wall(0.2))
+    asked = np.array([[0.2, 0.25, 0.25]])
+    np.testing.assert_allclose(grid.patches(grid.look_up(asked)).points[:, 0], 0.2, atol=1e-6)
+    grid.add(wall(0.3), np.zeros(120))
+    moved = grid.patches(grid.look_up(asked)).points[0, 0]
+    assert 0.23 < moved < 0.27
+
+
+def test_one_ring_has_no_spread_of_elevation_and_two_have_half_their_distance(rng: np.random.Generator) -> None:
+    points = np.column_stack([np.full(400, 10.1), rng.uniform(-0.2, 0.2, 400), np.full(400, 0.1)])
+    one = grid_of(points, np.full(400, 0.25))
+    assert one.patches(one.look_up(points)).elevation_spreads.max() < 3e-4
+    two = grid_of(points, np.repeat([0.25, 0.29], 200))
+    np.testing.assert_allclose(two.patches(two.look_up(points)).elevation_spreads, 0.02, rtol=0.1)
