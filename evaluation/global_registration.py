@@ -14,8 +14,8 @@ _MOST_POINTS = 12_000
 _CELLS_ACROSS = 80
 # Radii of the normals' and the features' neighbourhoods, in cells (Rusu et al.; the choice of Open3D's tutorials).
 _NORMAL_CELLS, _FEATURE_CELLS = 2.0, 5.0
-_TRIPLES = 400_000
-_MOST_HYPOTHESES = 4_000
+_TRIPLES = 200_000
+_MOST_HYPOTHESES = 2_000
 # Lengths of corresponding sides of a triple may differ by this share.
 _LEAST_RATIO = 0.9
 _INLIER_CELLS = 1.5

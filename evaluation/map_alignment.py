@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,6 +26,8 @@ _LEAST_INLIER_M = 0.2
 # ICP looks for partners this far away, coarse to fine.
 _ICP_STAGES_M = (2.0, 1.0, 0.5)
 _ICP_ITERATIONS = 40
+# Of the map's points, while many poses are tried.
+_SEARCH_POINTS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +119,19 @@ def align_map(
 def _search(clouds: "_Clouds") -> MapAlignment | None:
     """The best pose that a global search finds, with the fitness of the next best."""
     poses = candidate_poses(clouds.mapped, clouds.reference)
-    judged = [clouds.judge(clouds.to_given(T), GLOBAL, refine=True) for T in poses]
+    judged = [clouds.judge(clouds.to_given(T), GLOBAL, True, _SEARCH_POINTS) for T in poses]
     if not judged:
         return None
     # What the search may have missed: buildings tend to look alike when they are turned by right angles.
     likeliest = clouds.to_local(max(judged, key=lambda found: found.fitness).T_reference_map)
-    judged += [clouds.judge(clouds.to_given(likeliest @ T), GLOBAL, refine=True) for T in _turns(clouds.mapped)]
+    turned = (clouds.to_given(likeliest @ T) for T in _turns(clouds.mapped))
+    judged += [clouds.judge(T, GLOBAL, True, _SEARCH_POINTS) for T in turned]
     judged.sort(key=lambda found: -found.fitness)
-    T_best = clouds.to_local(judged[0].T_reference_map)
+    best = clouds.judge(judged[0].T_reference_map, GLOBAL, refine=True)
+    T_best = clouds.to_local(best.T_reference_map)
     others = [o.fitness for o in judged[1:] if not is_same(T_best, clouds.to_local(o.T_reference_map), _DISTINCT_M)]
     # How far ICP moved it from a rough candidate tells nobody anything.
-    return replace(judged[0], moved_m=0.0, moved_deg=0.0, runner_up=max(others, default=0.0))
+    return replace(best, moved_m=0.0, moved_deg=0.0, runner_up=max(others, default=0.0))
 
 
 def _turns(points: FloatArray) -> list[FloatArray]:
@@ -170,12 +176,17 @@ class _Clouds:
         R = T_local[:3, :3]
         return make_transform(R, T_local[:3, 3] + self.middle_reference - R @ self.middle_map)
 
-    def judge(self, T_reference_map: FloatArray, method: str, refine: bool) -> MapAlignment:
-        """The guess, refined where that brings more of the map onto the reference, with its fitness."""
+    def judge(
+        self, T_reference_map: FloatArray, method: str, refine: bool, most_points: int = _MOST_POINTS
+    ) -> MapAlignment:
+        """The guess, refined where that brings more of the map onto the reference, with its fitness.
+
+        ICP moves `most_points` of the map.
+        """
         T_guess = self.to_local(T_reference_map)
         T_local, (fitness, rmse_m) = T_guess, self._fitness(T_guess)
         if refine:
-            T_icp = _icp(self.mapped, self.reference, T_guess)
+            T_icp = self._icp(T_guess, self.mapped[:: -(-len(self.mapped) // most_points)])
             after = self._fitness(T_icp)
             if after[0] >= fitness:
                 T_local, (fitness, rmse_m) = T_icp, after
@@ -191,27 +202,36 @@ class _Clouds:
             moved_deg=float(np.rad2deg(rotation_angle(moved))),
         )
 
+    @cached_property
+    def _with_normals(self) -> Any:
+        """The reference as Open3D's cloud; its normals are estimated once for all poses."""
+        import open3d as o3d
+
+        still = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.reference))
+        still.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
+        return still
+
+    def _icp(self, T_local: FloatArray, mapped: FloatArray) -> FloatArray:
+        """The pose (4, 4) of some of the map, improved from point to plane, partners nearer and nearer.
+
+        Chen, Medioni, "Object modelling by registration of multiple range images", IVC 1992.
+        """
+        import open3d as o3d
+
+        moving = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mapped))
+        registration = o3d.pipelines.registration
+        to_plane = registration.TransformationEstimationPointToPlane()
+        stop = registration.ICPConvergenceCriteria(max_iteration=_ICP_ITERATIONS)
+        for distance_m in _ICP_STAGES_M:
+            found = registration.registration_icp(moving, self._with_normals, distance_m, T_local, to_plane, stop)
+            T_local = np.array(found.transformation, dtype=np.float64)
+        return T_local
+
     def _fitness(self, T_local: FloatArray) -> tuple[float, float | None]:
         moved = transform_points(T_local, self.mapped)
         distances, _ = self.tree.query(moved, distance_upper_bound=self.inlier_m, workers=-1)
         near = np.asarray(distances)[np.isfinite(distances)]
         return len(near) / len(moved), float(np.sqrt(np.mean(near**2))) if len(near) else None
-
-
-def _icp(source: FloatArray, target: FloatArray, T_target_source: FloatArray) -> FloatArray:
-    """The pose (4, 4) improved by point-to-plane ICP (Chen, Medioni, 1992), partners nearer and nearer."""
-    import open3d as o3d
-
-    moving = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(source))
-    still = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(target))
-    still.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
-    registration = o3d.pipelines.registration
-    to_plane = registration.TransformationEstimationPointToPlane()
-    stop = registration.ICPConvergenceCriteria(max_iteration=_ICP_ITERATIONS)
-    for distance_m in _ICP_STAGES_M:
-        found = registration.registration_icp(moving, still, distance_m, T_target_source, to_plane, stop)
-        T_target_source = np.array(found.transformation, dtype=np.float64)
-    return T_target_source
 
 
 def _explain(tried: list[MapAlignment]) -> str:

@@ -116,13 +116,14 @@ def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -
     """What the trajectory is held against; with a map to compare, doing without is only noted."""
     if request.reference is not None:
         return read_reference(request.reference, estimate.config.reader)
+    if not request.needs_reference:
+        return None
     try:
         return _own_truth(estimate)
     except InputError as error:
-        if request.needs_reference and request.reference_map is None:
+        if request.reference_map is None:
             raise
-        if request.needs_reference:
-            notes.append(f"the trajectory is not evaluated: {error}")
+        notes.append(f"the trajectory is not evaluated: {error}")
         return None
 
 
@@ -164,6 +165,8 @@ def _evaluate_map(
 def _reference_map(request: EvaluateRequest, estimate: Estimate) -> ReferenceMap | None:
     if request.reference_map is not None:
         return load_reference_map(request.reference_map)
+    if not request.needs_reference:
+        return None
     sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
     return next((found for found in map(find_reference_map, sources) if found is not None), None)
 

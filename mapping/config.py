@@ -65,11 +65,11 @@ class MappingConfig(BaseModel):
     cell_m: float | None = Field(
         None, gt=0.0, description="edge of the map's finest cells; null: follows the median range of the scene"
     )
-    cells_per_range: float = Field(25.0, gt=0.0, description="how many cells make the median range")
+    cells_per_range: float = Field(30.0, gt=0.0, description="how many cells make the median range")
     radius_m: float = Field(100.0, gt=0.0, description="the map is forgotten beyond")
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
     max_range_m: float = Field(100.0, gt=0.0, description="farther points are left out")
-    keypoints: int = Field(2500, ge=100, description="points of a scan that are registered, about")
+    keypoints: int = Field(3000, ge=100, description="points of a scan that are registered, about")
     edges: bool = Field(False, description="register LOAM's edges to lines, beside planes")
     continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
     second_deskew: bool = Field(

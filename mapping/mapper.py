@@ -149,7 +149,7 @@ class Mapper:
     def _judge(
         self, placed: Placed, refined: Refined, correction: FloatArray, prediction: Prediction
     ) -> tuple[Status, str]:
-        """The fit decides; a scan that fits far from where it was expected is degraded, one that the prior holds too."""
+        """The fit decides; one that fits far from where it was expected is degraded, and one that the prior holds."""
         status = placed.status(self._config)
         if status is not Status.OK:
             return status, placed.fit.explain(self._config.tracking)

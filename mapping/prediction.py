@@ -1,4 +1,4 @@
-"""Where the next scan is expected: how the sensor was moving, and what an odometry says, each as far as it is trusted."""
+"""Where the next scan is expected: how the sensor was moving and what an odometry says, each as far as trusted."""
 
 from dataclasses import dataclass
 

@@ -249,7 +249,7 @@ def _solve(
         H[6:, 6:] += JWt.T @ Jt
         holding[6:, 6:] = held * float(np.mean(times**2))
         b[6:] -= JWt.T @ r + holding[6:, 6:] @ (velocity - prediction.velocity)
-    step = np.linalg.solve(H + holding, b)
+    step: FloatArray = np.asarray(np.linalg.solve(H + holding, b), dtype=np.float64)
     return _Solution(step[:6], step[6:], _covariance(H, prediction, degeneracy), degeneracy)
 
 

@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 UTM = np.array([5e5, 5e6, 300.0])
 
 
-def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 60.0) -> FloatArray:
+def _box(rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...], per_m2: float = 25.0) -> FloatArray:
     """Points on the faces of a box."""
     low_, high_ = np.array(low), np.array(high)
     faces = []
@@ -30,7 +30,8 @@ def building() -> FloatArray:
     rng = np.random.default_rng(7)
     boxes = [
         ((0, 0, 0), (14, 9, 3)), ((14, 2, 0), (19, 7, 2.5)), ((2, 1, 0), (3, 4, 1.2)), ((6, 6, 0), (9, 7, 0.8)),
-        ((11, 1, 0), (11.6, 1.6, 3)), ((4.5, 5, 0), (5, 7, 2.2)), ((16, 4, 0), (17.5, 5, 1)), ((8, 2, 0), (9.5, 3, 1.6)),
+        ((11, 1, 0), (11.6, 1.6, 3)), ((4.5, 5, 0), (5, 7, 2.2)), ((16, 4, 0), (17.5, 5, 1)),
+        ((8, 2, 0), (9.5, 3, 1.6)),
     ]  # fmt: skip
     return np.concatenate([_box(rng, *box) for box in boxes])
 
@@ -57,13 +58,7 @@ def test_a_turned_map_is_found_without_a_guess(
     assert found.fitness > 0.99
     assert found.runner_up is not None
     assert found.runner_up < 0.9 * found.fitness
-    assert _error(found.T_reference_map, T_reference_map, seen) < 0.02
-
-
-def test_the_same_twice(building: FloatArray) -> None:
-    seen = transform_points(exp([0.0, 0.0, 1.0, 2.0, 3.0, 0.0]), building[::3])
-    first, second = (align_map(seen, building, {}, search=True) for _ in range(2))
-    np.testing.assert_allclose(first.T_reference_map, second.T_reference_map, atol=1e-6)
+    assert _error(found.T_reference_map, T_reference_map, seen) < 0.03
 
 
 def test_a_guess_is_refined_and_the_correction_told(building: FloatArray) -> None:
@@ -89,13 +84,15 @@ def test_a_wrong_guess_gives_way_to_the_search(building: FloatArray) -> None:
     seen = transform_points(inverse(T_true), building[::2])
     found = align_map(seen, building, {"none": np.eye(4)}, search=True)
     assert found.method == "global"
+    again = align_map(seen, building, {}, search=True)
+    np.testing.assert_allclose(again.T_reference_map, found.T_reference_map, atol=1e-6)
     assert align_map(seen, building, {"trajectory": T_true}, search=True).method == "trajectory"
 
 
 def test_another_place_is_refused(building: FloatArray) -> None:
     rng = np.random.default_rng(3)
-    elsewhere = rng.uniform(0.0, 12.0, (8_000, 3))
-    with pytest.raises(InputError, match="cannot be laid on its reference .* --map-alignment FILE"):
+    elsewhere = rng.uniform(0.0, 12.0, (4_000, 3))
+    with pytest.raises(InputError, match=r"cannot be laid on its reference .* --map-alignment FILE"):
         align_map(elsewhere, building, {"none": np.eye(4)}, search=True)
     taken = align_map(elsewhere + 100.0, building, {"none": np.eye(4)})
     assert not taken.is_trustworthy

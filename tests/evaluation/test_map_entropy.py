@@ -34,7 +34,7 @@ def test_a_thicker_wall_has_more(rng: np.random.Generator) -> None:
 def test_a_flawless_plane_is_finite_and_the_place_does_not_matter(rng: np.random.Generator) -> None:
     x, y = np.meshgrid(0.07 * np.arange(60), 0.07 * np.arange(60))
     plane = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    here, there = map_entropy(plane), map_entropy(plane + [5e5, 5e6, 100.0])
+    here, there = map_entropy(plane), map_entropy(plane + np.array([5e5, 5e6, 100.0]))
     assert here is not None
     assert there is not None
     assert np.isfinite(here.mean)

@@ -49,7 +49,7 @@ def test_outliers_deviate_though_they_are_outside_the_box(plane: FloatArray) -> 
 
 
 def test_points_inside_the_box_count_for_accuracy(plane: FloatArray) -> None:
-    above = plane[::4] + [0.0, 0.0, 0.9]
+    above = plane[::4] + np.array([0.0, 0.0, 0.9])
     metrics = compare_maps(np.concatenate([plane, above]), plane).metrics
     assert metrics.accuracy_mean_m == pytest.approx(0.9 * 2_500 / 12_500)
 
@@ -64,7 +64,7 @@ def test_what_no_sensor_could_see_is_not_missing(plane: FloatArray) -> None:
 
 
 def test_density_changes_nothing(plane: FloatArray) -> None:
-    shifted = plane + [0.0, 0.0, 0.2]
+    shifted = plane + np.array([0.0, 0.0, 0.2])
     crowded = np.concatenate([shifted, *[plane[:50] + 1e-4 * k for k in range(200)]])
     once, often = compare_maps(np.concatenate([shifted, plane[:50]]), plane), compare_maps(crowded, plane)
     assert often.metrics.accuracy_mean_m == pytest.approx(once.metrics.accuracy_mean_m, rel=0.01)
@@ -95,7 +95,7 @@ def test_the_keys_of_the_file() -> None:
 def test_distances_belong_to_their_points(plane: FloatArray) -> None:
     compared = compare_maps(np.concatenate([plane, [[5.0, 5.0, 0.7]]]) + UTM, plane + UTM)
     worst = int(compared.map_errors.distances_m.argmax())
-    np.testing.assert_allclose(compared.map_errors.points[worst], UTM + [5.0, 5.0, 0.7], atol=1e-6)
+    np.testing.assert_allclose(compared.map_errors.points[worst], UTM + np.array([5.0, 5.0, 0.7]), atol=1e-6)
     assert compared.map_errors.distances_m[worst] == pytest.approx(0.7, abs=1e-6)
     assert compared.map_gap_m == pytest.approx(0.1, abs=1e-6)
 

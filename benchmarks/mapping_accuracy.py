@@ -1,0 +1,226 @@
+"""Scan-to-map refinement beside KISS-ICP: how far each one's trajectory is from the truth, on the same scans.
+
+    python benchmarks/mapping_accuracy.py KITTI/sequences/04 2011_09_26/2011_09_26_drive_0005_sync
+    python benchmarks/mapping_accuracy.py --worlds office tunnel --motions handheld tracked
+
+Prints a Markdown table, a row for each recording: ATE in metres after SE(3) alignment, over all scans, of
+
+- KISS-ICP with its defaults;
+- KISS-ICP with the voxel size, of `--voxels`, that makes its ATE on this very recording smallest;
+- scan-to-map refinement without any odometry;
+- the same with an odometry that is wrong by `--wrong-deg` and `--wrong-m` at every scan, in random directions: the
+  truth's motions with these errors, given as an external odometry; how far it gets by itself is in a column too.
+
+Ours have the scans that were lost and degraded beside them. All of them run in the pipeline of `lidarslam run` with its
+defaults. Sources are whatever `lidarslam run` reads and has ground truth for; simulated recordings go straight from the
+simulator into memory.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.trajectory_metrics import TrajectoryErrors, evaluate_trajectory
+from lidarslam.config import Config, resolved
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.datasets.registry import open_recording
+from lidarslam.pipeline import Pipeline
+from lidarslam.run import in_order, make_localiser
+from lidarslam.simulation.carriers import CARRIERS
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensor_table import SENSORS
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from mapping.config import MappingConfig
+from odometry.config import KissConfig, OdometryConfig
+from odometry.registry import make_odometry
+
+# How far outside the truth's own stamps a scan may lie for the wrong odometry to be made there.
+_BEYOND_TRUTH_S = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recording in memory, so that every method has the same scans and none waits for them."""
+
+    name: str
+    scans: Sequence[Scan]
+    truth: Trajectory
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a method made of a recording; `refine_ms` is the median time of laying a scan on the map, if it did."""
+
+    ate_m: float
+    length_m: float
+    lost: int
+    degraded: int
+    refine_ms: float | None
+
+    def text(self) -> str:
+        """The ATE, and what went wrong on the way."""
+        return f"{self.ate_m:.3f} ({self.lost} lost, {self.degraded} degraded)"
+
+
+def read(source: Path) -> Recorded:
+    """A recording from disk.
+
+    Raises:
+        InputError: it cannot be read, or comes without ground truth.
+    """
+    recording = open_recording(source)
+    truth = recording.ground_truth
+    if truth is None:
+        raise InputError(f"{source}: has no ground truth to measure against")
+    return Recorded(recording.name, list(in_order(recording.scans())), truth)
+
+
+def simulate(world: str, motion: str, sensor: str, scans: int, seed: int) -> Recorded:
+    """A recording straight from the simulator."""
+    simulation = make_simulation(world, motion, sensor, scans, seed)
+    return Recorded(f"{world}, {motion}", list(simulation.scans()), simulation.ground_truth)
+
+
+def make_simulation(world: str, motion: str, sensor: str, scans: int, seed: int) -> Simulation:
+    """An upright sensor going round a world's route."""
+    place = build_world(world, seed)
+    carried = motion_along_route(motion, place, seed)
+    return Simulation(place, find_sensor(sensor), carried, mount_pose("upright", carried.sensor_height_m), scans, seed)
+
+
+def wrong_odometry(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int) -> Trajectory:
+    """The truth at the scans' stamps, every motion changed by a rotation and a translation in random directions."""
+    rng = np.random.default_rng(seed)
+    stamps = np.array([scan.stamp for scan in recorded.scans])
+    truth = Trajectory(stamps, recorded.truth.at(stamps, _BEYOND_TRUTH_S))
+    errors = rng.normal(size=(len(stamps) - 1, 2, 3))
+    errors *= np.array([np.deg2rad(wrong_deg), wrong_m])[:, None] / np.linalg.norm(errors, axis=2, keepdims=True)
+    wrong = truth.relative_motions() @ exp(errors.reshape(-1, 6))
+    return Trajectory(stamps, chain(truth.T_world_lidar[0], wrong))
+
+
+def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> Outcome:
+    """Take a recording through the pipeline of `lidarslam run`."""
+    config = resolved(config)
+    odometry = make_odometry(config.odometry, prior)
+    try:
+        results = list(Pipeline(odometry, make_localiser(config), config.global_map).run(recorded.scans))
+    finally:
+        odometry.close()
+    stamps = np.array([result.stamp for result in results])
+    errors = errors_of(Trajectory(stamps, np.array([result.T_world_lidar for result in results])), recorded)
+    statuses = [result.status for result in results]
+    refine_ms = [result.stage_ms["refine"] for result in results if "refine" in result.stage_ms]
+    return Outcome(
+        ate_m=errors.ate_rmse_m,
+        length_m=errors.length_m,
+        lost=statuses.count(Status.LOST),
+        degraded=statuses.count(Status.DEGRADED),
+        refine_ms=float(np.median(refine_ms)) if refine_ms else None,
+    )
+
+
+def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
+    """How far a trajectory is from a recording's truth."""
+    return evaluate_trajectory(estimate, recorded.truth).errors
+
+
+def with_odometry(mapping: MappingConfig) -> Config:
+    """The configuration for an external odometry in front of scan-to-map refinement."""
+    return Config(odometry=OdometryConfig(method="external"), mapping=mapping)
+
+
+def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
+    """KISS-ICP alone."""
+    odometry = OdometryConfig(method="kiss-icp", kiss_icp=kiss)
+    return localise(recorded, Config(odometry=odometry, mapping=MappingConfig(enabled=False)))
+
+
+def tune_kiss(recorded: Recorded, voxels: Sequence[float]) -> tuple[float, Outcome]:
+    """The voxel size with the smallest ATE, and what came of it."""
+    outcomes = {voxel_m: run_kiss(recorded, KissConfig(voxel_size_m=voxel_m)) for voxel_m in voxels}
+    return min(outcomes.items(), key=lambda item: item[1].ate_m)
+
+
+def row(recorded: Recorded, voxels: Sequence[float], wrong_deg: float, wrong_m: float, seed: int) -> list[str]:
+    """The cells of one recording."""
+    kiss = run_kiss(recorded, KissConfig())
+    voxel_m, tuned = tune_kiss(recorded, voxels)
+    prior = wrong_odometry(recorded, wrong_deg, wrong_m, seed)
+    alone = localise(recorded, Config())
+    helped = localise(recorded, with_odometry(MappingConfig()), prior)
+    percents = [100.0 * outcome.ate_m / outcome.length_m for outcome in (alone, helped)]
+    return [
+        recorded.name,
+        str(len(recorded.scans)),
+        f"{kiss.length_m:.0f}",
+        f"{kiss.ate_m:.3f}",
+        f"{tuned.ate_m:.3f} (at {voxel_m:g} m)",
+        alone.text(),
+        f"{errors_of(prior, recorded).ate_rmse_m:.1f}",
+        helped.text(),
+        " / ".join(f"{percent:.2f}" for percent in percents),
+    ]
+
+
+def main() -> None:
+    """Parse the command line and print the table, row by row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
+    add_simulation_arguments(parser)
+    parser.add_argument("--voxels", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0], help="metres, for KISS-ICP")
+    parser.add_argument("--wrong-deg", type=float, default=2.0)
+    parser.add_argument("--wrong-m", type=float, default=0.1)
+    arguments = parser.parse_args()
+    if not arguments.sources and not arguments.worlds:
+        parser.error("give recordings, or worlds to simulate some in with --worlds")
+    wrong = f"{arguments.wrong_deg:g} deg, {arguments.wrong_m:g} m a scan"
+    header = ["recording", "scans", "path, m", "KISS-ICP", "KISS-ICP, best voxel", "ours, no odometry"]
+    header += [f"odometry wrong by {wrong}", "ours with it", "ours, % of the path: without / with it"]
+    print_row(header)
+    print_row(["---"] * len(header))
+    for recorded in _recordings(arguments):
+        print_row(row(recorded, arguments.voxels, arguments.wrong_deg, arguments.wrong_m, arguments.seed))
+
+
+def add_simulation_arguments(
+    parser: argparse.ArgumentParser, worlds: Sequence[str] = (), motions: Sequence[str] = tuple(CARRIERS)
+) -> None:
+    """Which recordings are simulated."""
+    parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=worlds)
+    parser.add_argument("--motions", nargs="+", choices=list(CARRIERS), default=motions)
+    parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
+    parser.add_argument("--scans", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def simulated_recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
+    """Every world with every motion, one in memory at a time."""
+    for world in arguments.worlds:
+        for motion in arguments.motions:
+            yield simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed)
+
+
+def _recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
+    for source in arguments.sources:
+        yield read(source)
+    yield from simulated_recordings(arguments)
+
+
+def print_row(cells: Sequence[str]) -> None:
+    """One row of a Markdown table."""
+    print(f"| {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""How long scan-to-map refinement takes a scan, stage by stage, beside KISS-ICP's `register_frame` on the same scans.
+
+    python benchmarks/mapping_speed.py KITTI/sequences/04
+    python benchmarks/mapping_speed.py --simulate hdl-64e:street:car os1-128:street:car --scans 60
+
+Everything runs in one process, one scan after the other, without reading and without the pipeline's two threads: ours
+(without odometry, from `Mapper.process` to the pose and the updated map) with planes alone, KISS-ICP with its defaults,
+ours with edges too, KISS-ICP again; and so on for `--rounds` rounds, each from an empty map, so that whatever else
+the machine does meets all of them. The first `--warm-up` scans of every pass do not count. Wall time and CPU time
+(of all threads) of every scan; median and 95th percentile over all passes; the ratio is that of the medians of
+passes next to each other, its median, smallest and largest.
+
+Ours runs with BLAS on one thread, as `lidarslam run` has it; KISS-ICP uses as many threads as it likes. A stage's time
+is without the stages inside it:
+
+- features: LOAM's edges, when they are used;
+- thin: choosing the points of the scan;
+- registration: finding the surfaces and solving for the pose;
+- fit: holding the result against the map;
+- map update: adding the scan, forgetting what is far;
+- rest: prediction and judgement, and the search when a scan is lost.
+"""
+
+import argparse
+import functools
+import itertools
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from mapping_accuracy import make_simulation, print_row
+from threadpoolctl import threadpool_limits
+
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.datasets.registry import open_recording
+from lidarslam.run import in_order
+from mapping import mapper, placement, sampling
+from mapping.config import MappingConfig
+from mapping.local_map import LocalMap
+from mapping.mapper import Mapper
+from mapping.prediction import Prior
+
+# Stage -> what is timed for it: the object that holds the function, and its name there.
+_STAGES: dict[str, tuple[Any, str]] = {
+    "features": (sampling.Sampler, "_edges"),
+    "thin": (sampling.Sampler, "sample"),
+    "registration": (placement, "refine"),
+    "fit": (placement, "measure_fit"),
+    "map update": (LocalMap, "add"),
+    "rest": (mapper.Mapper, "process"),
+}
+_OURS = {"planes": MappingConfig(edges=False), "planes and edges": MappingConfig(edges=True)}
+
+
+@dataclass
+class _Stopwatch:
+    """Wall and CPU seconds of each stage, without the stages that ran inside it."""
+
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(lambda: [0.0, 0.0]))
+    _inside: list[list[float]] = field(default_factory=list)
+
+    @contextmanager
+    def measure(self, stage: str) -> Iterator[None]:
+        """Count the time within for the stage."""
+        self._inside.append([0.0, 0.0])
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            taken = (time.perf_counter() - wall, time.process_time() - cpu)
+            inside = self._inside.pop()
+            for kind in range(2):
+                self.seconds[stage][kind] += taken[kind] - inside[kind]
+                if self._inside:
+                    self._inside[-1][kind] += taken[kind]
+
+    def wrap(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, timed."""
+
+        @functools.wraps(function)
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            with self.measure(stage):
+                return function(*args, **kwargs)
+
+        return timed
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """One method over all scans: milliseconds of each scan, wall and CPU (N, 2), in all and stage by stage."""
+
+    total_ms: np.ndarray[Any, np.dtype[np.float64]]
+    stage_ms: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = field(default_factory=dict)
+    bad: int = 0
+
+
+def run_ours(scans: Sequence[Scan], config: MappingConfig, warm_up: int) -> _Pass:
+    """Scan-to-map refinement without odometry."""
+    ours = Mapper(config)
+    watches, bad = [], 0
+    with threadpool_limits(1, "blas"):
+        for scan in scans:
+            watch = _Stopwatch()
+            with ExitStack() as stack:
+                for stage, (owner, name) in _STAGES.items():
+                    stack.enter_context(patch.object(owner, name, watch.wrap(stage, getattr(owner, name))))
+                mapped = ours.process(scan, Prior())
+            watches.append(watch.seconds)
+            bad += mapped.status is not Status.OK
+    stage_ms = {
+        stage: 1e3 * np.array([seconds.get(stage, (0.0, 0.0)) for seconds in watches[warm_up:]]) for stage in _STAGES
+    }
+    return _Pass(np.sum(list(stage_ms.values()), axis=0), stage_ms, bad)
+
+
+def run_kiss(scans: Sequence[Scan], warm_up: int) -> _Pass:
+    """KISS-ICP with its defaults."""
+    from kiss_icp.config.parser import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    kiss = KissICP(load_config(None))
+    seconds = []
+    for scan in scans:
+        times = np.empty(0) if scan.time_offsets is None else scan.time_offsets
+        wall, cpu = time.perf_counter(), time.process_time()
+        kiss.register_frame(scan.points, times)
+        seconds.append((time.perf_counter() - wall, time.process_time() - cpu))
+    return _Pass(1e3 * np.array(seconds[warm_up:]))
+
+
+def compare(name: str, scans: Sequence[Scan], rounds: int, warm_up: int) -> None:
+    """Run all in turn, and print what they took."""
+    ours: dict[str, list[_Pass]] = {label: [] for label in _OURS}
+    kiss: dict[str, list[_Pass]] = {label: [] for label in _OURS}
+    for _, (label, config) in itertools.product(range(rounds), _OURS.items()):
+        ours[label].append(run_ours(scans, config, warm_up))
+        kiss[label].append(run_kiss(scans, warm_up))
+    points = np.median([len(scan) for scan in scans])
+    print(f"\n{name}: {len(scans)} scans of {points:,.0f} points, {rounds} rounds; milliseconds a scan\n")
+    print_row(["", "wall median", "wall p95", "CPU median", "CPU p95", "Hz", "wall / KISS-ICP's", "CPU / KISS-ICP's"])
+    print_row(["---"] * 8)
+    for label, passes in ours.items():
+        beside = [_ratio(passes, kiss[label], kind) for kind in range(2)]
+        print_row([f"ours, {label}", *_times([one.total_ms for one in passes]), *beside])
+    everything = [one.total_ms for passes in kiss.values() for one in passes]
+    print_row(["KISS-ICP", *_times(everything), "1", "1"])
+    for label, passes in ours.items():
+        _print_stages(label, passes)
+
+
+def _print_stages(label: str, passes: Sequence[_Pass]) -> None:
+    print(f"\nStages, {label} ({passes[-1].bad} scans degraded or lost):\n")
+    print_row(["stage", "wall median", "wall p95", "CPU median", "CPU p95"])
+    print_row(["---"] * 5)
+    for stage in _STAGES:
+        print_row([stage, *_times([one.stage_ms[stage] for one in passes])[:4]])
+
+
+def _times(passes: Sequence[Any]) -> list[str]:
+    """Cells: median and 95th percentile of wall and CPU time, and the rate that the median of wall time makes."""
+    wall, cpu = np.concatenate(passes).T
+    cells = [f"{value:.1f}" for kind in (wall, cpu) for value in (np.median(kind), np.percentile(kind, 95.0))]
+    return [*cells, f"{1e3 / max(float(np.median(wall)), 1e-6):.0f}"]
+
+
+def _ratio(ours: Sequence[_Pass], kiss: Sequence[_Pass], kind: int) -> str:
+    pairs = zip(ours, kiss, strict=True)
+    ratios = [np.median(one.total_ms[:, kind]) / np.median(other.total_ms[:, kind]) for one, other in pairs]
+    return f"{np.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]"
+
+
+def main() -> None:
+    """Parse the command line, and compare on every recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings")
+    parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
+    parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--warm-up", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    if not arguments.sources and not arguments.simulate:
+        parser.error("give recordings, or some to simulate with --simulate")
+    for source in arguments.sources:
+        recording = open_recording(source)
+        scans = list(in_order(recording.scans(0, arguments.scans)))
+        compare(recording.name, scans, arguments.rounds, arguments.warm_up)
+    for wanted in arguments.simulate:
+        sensor, world, motion = wanted.split(":")
+        simulation = make_simulation(world, motion, sensor, arguments.scans, arguments.seed)
+        compare(f"{sensor}, {world}, {motion}", list(simulation.scans()), arguments.rounds, arguments.warm_up)
+
+
+if __name__ == "__main__":
+    main()

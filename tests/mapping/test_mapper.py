@@ -1,0 +1,318 @@
+"""Sweeps of known truth through the mapper: accuracy, what is kept out of the map, and the way back."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from mapping.config import MappingConfig, TrackingConfig
+from mapping.mapper import MappedScan, Mapper
+from mapping.prediction import Prior
+
+Path = Callable[[FloatArray], FloatArray]
+VELOCITY = np.array([0.0, 0.01, 0.3, 0.8, 0.05, 0.0])  # of the drive
+NOTHING = Prior()
+
+
+def process(mapper: Mapper, scans: list[Scan], priors: list[Prior] | None = None) -> list[MappedScan]:
+    return [mapper.process(scan, prior) for scan, prior in zip(scans, priors or [NOTHING] * len(scans), strict=True)]
+
+
+def errors(results: list[MappedScan], T_room_lidar: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (N,) in metres and angles (N,) in degrees from the truth, whose world is the first scan's frame."""
+    truth = inverse(T_room_lidar[0]) @ T_room_lidar[: len(results)]
+    error = inverse(truth) @ np.array([result.state.T_world_lidar for result in results])
+    return np.linalg.norm(error[:, :3, 3], axis=1), np.rad2deg(rotation_angle(error))
+
+
+def assert_true(results: list[MappedScan], T_room_lidar: FloatArray, metres: float, degrees: float) -> None:
+    distance, angle = errors(results, T_room_lidar)
+    assert distance.max() < metres
+    assert angle.max() < degrees
+    assert [result.status for result in results] == [Status.OK] * len(results)
+
+
+def wrong_motions(truth: Trajectory, seed: int, degrees: float = 2.0, metres: float = 0.1) -> list[Prior]:
+    """The true motions, each turned and shifted by so much in some direction."""
+    axes = np.random.default_rng(seed).normal(size=(len(truth), 2, 3))
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    off = exp(np.concatenate([np.deg2rad(degrees) * axes[:, 0], metres * axes[:, 1]], axis=1))
+    relative = np.concatenate([np.eye(4)[None], truth.relative_motions()])
+    return [Prior(T_prev_curr) for T_prev_curr in relative @ off]
+
+
+def garbage(stamp: float, seed: int = 0, count: int = 5_000) -> Scan:
+    """Points that lie on nothing."""
+    return Scan(np.random.default_rng(seed).uniform(-6.0, 6.0, (count, 3)), stamp, np.linspace(0.0, 0.1, count))
+
+
+def empty(stamp: float) -> Scan:
+    return Scan(np.empty((0, 3)), stamp, np.empty(0))
+
+
+def snapshot(room: Any, T_room_lidar: FloatArray, stamp: float, seed: int) -> Scan:
+    """A scan of an instant, without times."""
+    still = room.sweep(lambda time: np.broadcast_to(T_room_lidar, (*np.shape(time), 4, 4)), 0.001 * seed)
+    return Scan(still.points, stamp)
+
+
+@pytest.fixture(scope="session")
+def from_rest(drive: Path) -> Path:
+    """The drive, but the first sweep of `room_scans` is taken at rest."""
+    return lambda time: drive(np.maximum(0.15, np.asarray(time)))
+
+
+@pytest.fixture(scope="session")
+def rest_scans(room: Any, from_rest: Path, room_truth: Trajectory) -> list[Scan]:
+    return [room.sweep(from_rest, float(stamp)) for stamp in room_truth.stamps]
+
+
+@pytest.fixture(scope="session")
+def rest_truth(from_rest: Path, room_truth: Trajectory) -> Trajectory:
+    return Trajectory(room_truth.stamps, from_rest(room_truth.stamps))
+
+
+@pytest.fixture
+def mapper() -> Mapper:
+    return Mapper(MappingConfig())
+
+
+@pytest.fixture
+def settled(rest_scans: list[Scan]) -> Mapper:
+    """A mapper that has followed the first fifteen scans."""
+    mapper = Mapper(MappingConfig())
+    process(mapper, rest_scans[:15])
+    return mapper
+
+
+def size(mapper: Mapper) -> int:
+    assert mapper.local_map is not None
+    return len(mapper.local_map)
+
+
+def test_the_first_scan_is_the_world(mapper: Mapper, room_scans: list[Scan]) -> None:
+    first = mapper.process(room_scans[0], NOTHING)
+    np.testing.assert_array_equal(first.state.T_world_lidar, np.eye(4))
+    assert first.status is Status.OK
+    assert not first.registered
+    assert first.fit is None
+
+
+def test_poses_are_true_without_any_prior(mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory) -> None:
+    assert_true(process(mapper, rest_scans), rest_truth.T_world_lidar, 0.005, 0.05)
+
+
+def test_velocities_are_true_without_any_prior(mapper: Mapper, rest_scans: list[Scan]) -> None:
+    for result in process(mapper, rest_scans)[3:]:
+        np.testing.assert_allclose(result.state.velocity[:3], VELOCITY[:3], atol=np.deg2rad(2.0))
+        np.testing.assert_allclose(result.state.velocity[3:], VELOCITY[3:], atol=0.1)
+
+
+def test_a_sensor_that_moves_already_has_true_poses(
+    mapper: Mapper, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    assert_true(process(mapper, room_scans), room_truth.T_world_lidar, 0.008, 0.2)
+
+
+def test_a_sensor_that_moves_already_is_seen_to_move(mapper: Mapper, room_scans: list[Scan]) -> None:
+    """The first sweep is bent by a motion that nobody knows; what it has drawn must not hide the motion for ever."""
+    last = process(mapper, room_scans)[-1]
+    np.testing.assert_allclose(last.state.velocity[:3], VELOCITY[:3], atol=np.deg2rad(3.0))
+    np.testing.assert_allclose(last.state.velocity[3:], VELOCITY[3:], atol=0.15)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_are_true_from_wrong_priors(
+    mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory, seed: int
+) -> None:
+    """Each is wrong by two degrees and ten centimetres."""
+    results = process(mapper, rest_scans, wrong_motions(rest_truth, seed))
+    assert_true(results, rest_truth.T_world_lidar, 0.006, 0.06)
+
+
+def test_poses_are_true_with_the_true_motion(
+    mapper: Mapper, room_scans: list[Scan], room_truth: Trajectory
+) -> None:
+    relative = [np.eye(4), *room_truth.relative_motions()]
+    results = process(mapper, room_scans, [Prior(T_prev_curr, VELOCITY) for T_prev_curr in relative])
+    assert_true(results, room_truth.T_world_lidar, 0.002, 0.03)
+
+
+def test_compensating_twice_is_nearly_as_good_as_estimating_the_velocity(
+    rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    results = process(Mapper(MappingConfig(continuous_time=False)), rest_scans)
+    assert_true(results, rest_truth.T_world_lidar, 0.015, 0.3)
+
+
+def test_scans_without_times_are_registered_as_they_are(room: Any, drive: Path, mapper: Mapper) -> None:
+    stamps = 0.1 * np.arange(1, 21)
+    truth = drive(stamps)
+    scans = [snapshot(room, T, float(stamp), k) for k, (T, stamp) in enumerate(zip(truth, stamps, strict=True))]
+    assert_true(process(mapper, scans), truth, 0.004, 0.04)
+
+
+def test_a_sensor_upside_down_is_as_good(
+    mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    T_lidar_mounted = np.diag([1.0, -1.0, -1.0, 1.0])
+    scans = [replace(scan, points=scan.points @ T_lidar_mounted[:3, :3]) for scan in rest_scans]
+    assert_true(process(mapper, scans), rest_truth.T_world_lidar @ T_lidar_mounted, 0.005, 0.05)
+
+
+def test_the_covariance_of_registered_scans_is_proper(mapper: Mapper, room_scans: list[Scan]) -> None:
+    for result in process(mapper, room_scans[:5])[1:]:
+        assert result.registered
+        covariance = result.state.covariance
+        assert covariance.shape == (12, 12)
+        assert np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() > 0.0
+        assert np.sqrt(np.diag(covariance)[3:6]).max() < 0.05
+
+
+def test_the_pose_does_not_drift_while_nothing_moves(mapper: Mapper, room: Any, drive: Path) -> None:
+    """Fifty times the very same scan."""
+    scan = snapshot(room, drive(np.array([0.5]))[0], 0.0, 1)
+    results = process(mapper, [replace(scan, stamp=0.1 * k) for k in range(51)])
+    poses = np.array([result.state.T_world_lidar for result in results])
+    assert np.linalg.norm(poses[:, :3, 3], axis=1).max() < 1e-3
+    assert np.rad2deg(rotation_angle(poses)).max() < 0.01
+
+
+def test_the_map_stops_growing_while_nothing_moves(mapper: Mapper, room: Any, drive: Path) -> None:
+    scan = snapshot(room, drive(np.array([0.5]))[0], 0.0, 1)
+    process(mapper, [replace(scan, stamp=0.1 * k) for k in range(5)])
+    before = size(mapper)
+    process(mapper, [replace(scan, stamp=0.1 * k) for k in range(5, 30)])
+    assert size(mapper) < 1.01 * before
+
+
+def test_a_first_scan_of_nothing_is_lost_and_the_next_begins_the_map(
+    mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    first = mapper.process(empty(0.0), NOTHING)
+    assert first.status is Status.LOST
+    assert first.message == "there is no point within range"
+    assert mapper.local_map is None
+    assert_true(process(mapper, rest_scans), rest_truth.T_world_lidar, 0.006, 0.06)
+
+
+def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothing(
+    settled: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    held = size(settled)
+    lost = settled.process(empty(rest_scans[15].stamp), NOTHING)
+    assert lost.status is Status.LOST
+    assert lost.message == "only 0 % of the scan meets the map"
+    assert not lost.registered
+    assert size(settled) == held
+    np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_expected)
+    truth = inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar
+    assert np.linalg.norm(lost.state.T_world_lidar[:3, 3] - truth[15, :3, 3]) < 0.02, "it goes on as it did"
+
+
+def test_the_scan_after_one_of_nothing_is_fine(
+    settled: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    settled.process(empty(rest_scans[15].stamp), NOTHING)
+    after = settled.process(rest_scans[16], NOTHING)
+    assert after.status is Status.OK
+    distance, angle = errors([*[after] * 17], rest_truth.T_world_lidar)
+    assert distance[16] < 0.006
+    assert angle[16] < 0.06
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_scan_of_another_place_is_lost_and_stays_out_of_the_map(
+    settled: Mapper, rest_scans: list[Scan], seed: int
+) -> None:
+    held = size(settled)
+    lost = settled.process(garbage(rest_scans[15].stamp, seed), NOTHING)
+    assert lost.status is Status.LOST
+    assert "% of the scan" in lost.message
+    assert size(settled) == held
+
+
+def test_the_way_goes_on_after_a_scan_of_another_place(
+    settled: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    settled.process(garbage(rest_scans[15].stamp), NOTHING)
+    results = process(settled, rest_scans[16:])
+    assert [result.status for result in results] == [Status.OK] * 4
+    distance, _ = errors([results[-1]] * 20, rest_truth.T_world_lidar)
+    assert distance[19] < 0.006
+
+
+@pytest.mark.parametrize("turned_deg", [100.0, -100.0, 180.0])
+def test_turned_on_the_spot_it_finds_its_way_back(
+    settled: Mapper, room: Any, rest_truth: Trajectory, turned_deg: float
+) -> None:
+    T_turned = rest_truth.T_world_lidar[14] @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
+    found = settled.process(snapshot(room, T_turned, float(rest_truth.stamps[15]), 7), NOTHING)
+    truth = inverse(rest_truth.T_world_lidar[0]) @ T_turned
+    error = inverse(truth) @ found.state.T_world_lidar
+    assert np.linalg.norm(error[:3, 3]) < 0.01
+    assert np.rad2deg(rotation_angle(error)) < 0.1
+    assert found.status is Status.DEGRADED
+    assert "from where it was expected" in found.message
+
+
+def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans: list[Scan]) -> None:
+    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=3)))
+    process(mapper, rest_scans[:10])
+    stamps = rest_scans[9].stamp + 0.1 * np.arange(1, 4)
+    lost = [mapper.process(garbage(float(stamp), seed), NOTHING) for seed, stamp in enumerate(stamps)]
+    assert [result.status for result in lost] == [Status.LOST] * 3
+    assert ["a new map is begun here" in result.message for result in lost] == [False, False, True]
+
+
+def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(
+    rest_scans: list[Scan], rest_truth: Trajectory
+) -> None:
+    """Two covered scans, then the room again, which fits the new map and not what came between."""
+    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=1)))
+    process(mapper, [garbage(0.0)])
+    restarted = mapper.process(rest_scans[0], NOTHING)
+    assert "a new map is begun here" in restarted.message
+    results = process(mapper, rest_scans[1:])
+    assert [result.status for result in results] == [Status.OK] * 19
+    relative = inverse(restarted.state.T_world_lidar) @ results[-1].state.T_world_lidar
+    truth = inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar[-1]
+    assert np.linalg.norm(relative[:3, 3] - truth[:3, 3]) < 0.01
+
+
+def test_scans_of_nothing_never_begin_a_new_map(rest_scans: list[Scan], rest_truth: Trajectory) -> None:
+    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=2)))
+    process(mapper, rest_scans[:10])
+    held = size(mapper)
+    process(mapper, [empty(rest_scans[9].stamp + 0.01 * k) for k in range(1, 6)])
+    assert size(mapper) == held
+    assert mapper.process(rest_scans[10], NOTHING).status is not Status.LOST
+
+
+def indoors(seed: int, stamp: float, outdoors: int) -> Scan:
+    """A box of 8 x 6 x 3 m seen from its middle, and so many points twelve metres away, as through windows."""
+    rng = np.random.default_rng(seed)
+    half = np.array([4.0, 3.0, 1.5])
+    points = rng.uniform(-1.0, 1.0, (4_000, 3)) * half
+    axis = rng.integers(0, 3, 4_000)
+    points[np.arange(4_000), axis] = rng.choice([-1.0, 1.0], 4_000) * half[axis]
+    away = rng.normal(size=(outdoors, 3))
+    away *= 12.0 / np.linalg.norm(away, axis=1, keepdims=True)
+    return Scan(np.concatenate([points, away]), stamp)
+
+
+def test_scans_still_fit_when_the_cells_become_smaller(mapper: Mapper) -> None:
+    """Windows are behind the sensor now: the scene has shrunk to a third."""
+    process(mapper, [indoors(k, 0.1 * k, outdoors=8_000) for k in range(4)])
+    assert mapper.local_map is not None
+    cell_m = mapper.local_map.cell_m
+    results = process(mapper, [indoors(k, 0.1 * k, outdoors=0) for k in range(4, 36)])
+    assert mapper.local_map.cell_m < 0.6 * cell_m
+    assert [result.status for result in results] == [Status.OK] * len(results)
+    assert np.linalg.norm(results[-1].state.T_world_lidar[:3, 3]) < 0.02
