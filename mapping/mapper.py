@@ -14,7 +14,7 @@ from mapping.config import MappingConfig
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
 from mapping.placement import Placed, place, search
-from mapping.prediction import Prediction, Prior, State, predict
+from mapping.prediction import Carrier, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
 
@@ -63,8 +63,10 @@ class Mapper:
         self._sampler = Sampler(config)
         self._map: LocalMap | None = None
         self._state: State | None = None
+        self._carrier = Carrier()
         self._expected_error_m = _UNKNOWN_M
         self._lost_in_a_row = 0
+        self._has_velocity = False  # no change of velocity is seen from one that was made up
 
     @property
     def local_map(self) -> LocalMap | None:
@@ -75,7 +77,7 @@ class Mapper:
         """Lay the next scan on the map, and add it."""
         sampled = self._sampler.sample(scan)
         last = self._state or State.first(scan.stamp, prior.velocity)
-        prediction = predict(last, scan.stamp, prior, self._config)
+        prediction = predict(last, scan.stamp, prior, self._carrier, self._config)
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
         else:
@@ -107,6 +109,9 @@ class Mapper:
                 return self._miss(sampled, prediction, placed.fit)
             placed = found
         assert placed.refined is not None
+        if interval_s > 0.0 and self._has_velocity:
+            self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
+        self._has_velocity = True
         return self._accept(sampled, prediction, placed, placed.refined, local_map)
 
     def _accept(
@@ -137,6 +142,7 @@ class Mapper:
         """A scan that fits nowhere stays where it was expected, out of the map."""
         T_world_lidar, message = prediction.T_world_lidar, fit.explain(self._config.tracking)
         self._lost_in_a_row += 1
+        self._has_velocity = False
         self._expected_error_m = _UNKNOWN_M
         if self._lost_in_a_row >= self._config.tracking.give_up_after and len(sampled):
             self._map = LocalMap(sampled.cell_m, self._config.radius_m)

@@ -20,6 +20,7 @@ _SAME_TRANSLATION_M = 0.01
 # A search may end anywhere, but must then have found much of what the scan sees.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
 _OVERLAP_TO_RETURN = 0.4
+_PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +66,11 @@ def search(
     up, step_deg = local_map.vertical(), config.tracking.search_yaw_step_deg
     places = (prediction.T_world_lidar, last.T_world_lidar)
     starts = np.concatenate([start_poses(T_world_lidar, up, step_deg) for T_world_lidar in places])
+    patient = config.model_copy(update={"refinement": config.refinement.model_copy(update=_PATIENCE)})
     best: Placed | None = None
     for start in best_starts(points, starts, local_map):
         free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
-        placed = _place_once(sweep, free, last, interval_s, local_map, config, coarse_first=True)
+        placed = _place_once(sweep, free, last, interval_s, local_map, patient, coarse_first=True)
         if placed.status(config) is not Status.OK or placed.fit.overlap < _OVERLAP_TO_RETURN:
             continue
         if best is None or placed.fit.inlier_share > best.fit.inlier_share:

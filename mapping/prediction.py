@@ -7,8 +7,14 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, skew
 from mapping.config import MappingConfig
 
-# Accelerations that carriers reach, one standard deviation: rotation about each axis, translation along it.
-_ACCELERATION = np.array([np.deg2rad(600.0)] * 3 + [10.0] * 3)
+# Accelerations of carriers, one standard deviation, rotation about each axis and translation along it: what is
+# supposed at first, and the least and most that is ever supposed.
+_USUAL = (np.deg2rad(1000.0), 15.0)
+_CALMEST = (np.deg2rad(150.0), 3.0)
+_WILDEST = (np.deg2rad(4000.0), 60.0)
+# How fast the supposition follows what is seen, and how much more than that it stays: surprises come in bursts.
+_FOLLOWING = 0.1
+_CAUTION = 1.5
 # What is known of a sensor before its first scans, and after it was lost.
 _ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
 _ASTRAY = np.array([np.deg2rad(20.0)] * 3 + [1.0] * 3)
@@ -61,6 +67,36 @@ class State:
         return cls(stamp, T_world_lidar, velocity, np.diag(sigmas**2))
 
 
+@dataclass(frozen=True)
+class Carrier:
+    """How much a carrier shakes its sensor: standard deviations of its accelerations.
+
+    Attributes:
+        rotation: about each axis, rad/s^2.
+        translation: along each axis, m/s^2.
+    """
+
+    rotation: float = _USUAL[0]
+    translation: float = _USUAL[1]
+
+    @property
+    def acceleration(self) -> FloatArray:
+        """(6,) rotation first."""
+        return np.array([self.rotation] * 3 + [self.translation] * 3)
+
+    def seen(self, change: FloatArray, interval_s: float) -> "Carrier":
+        """The carrier after its velocity was seen to change by (6,) in a time."""
+        seen = change / interval_s
+        squared = (float(np.mean(seen[:3] ** 2)), float(np.mean(seen[3:] ** 2)))
+        followed = [
+            float(np.clip(np.sqrt((1.0 - _FOLLOWING) * old**2 + _FOLLOWING * _CAUTION**2 * new), least, most))
+            for old, new, least, most in zip(
+                (self.rotation, self.translation), squared, _CALMEST, _WILDEST, strict=True
+            )
+        ]
+        return Carrier(*followed)
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """Where a scan is expected before it is held against the map.
@@ -78,7 +114,7 @@ class Prediction:
     velocity_covariance: FloatArray
 
 
-def predict(state: State, stamp: float, prior: Prior, config: MappingConfig) -> Prediction:
+def predict(state: State, stamp: float, prior: Prior, carrier: Carrier, config: MappingConfig) -> Prediction:
     """Go on from the last scan's state with its velocity, and correct that by what the odometry says.
 
     A sweep's velocity was seen from its first point to its last. Where stamps stand at the start of sweeps, the next
@@ -91,9 +127,9 @@ def predict(state: State, stamp: float, prior: Prior, config: MappingConfig) -> 
     F[:6, 6:] = interval_s * np.eye(6)
     covariance = F @ state.covariance @ F.T
     unseen_s = max(0.0, interval_s - state.seen_until_s)
-    drift = _ACCELERATION * (interval_s**2 / 8.0 + unseen_s * interval_s)
+    drift = carrier.acceleration * (interval_s**2 / 8.0 + unseen_s * interval_s)
     pose_covariance = covariance[:6, :6] + np.diag(drift**2 + _LEAST_SIGMA**2)
-    velocity_covariance = covariance[6:, 6:] + np.diag((_ACCELERATION * interval_s) ** 2)
+    velocity_covariance = covariance[6:, 6:] + np.diag((carrier.acceleration * interval_s) ** 2)
     T_world_lidar, velocity = state.T_world_lidar @ T_moved, state.velocity
     sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
     if prior.T_prev_curr is not None:

@@ -101,9 +101,7 @@ def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanResult], Pipeli
     return list(pipeline.run(scans)), pipeline
 
 
-def check_poses_and_map(
-    results: list[ScanResult], pipeline: Pipeline, room: Any, room_truth: Trajectory
-) -> None:
+def check_poses_and_map(results: list[ScanResult], pipeline: Pipeline, room: Any, room_truth: Trajectory) -> None:
     truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
     errors = inverse(truth) @ np.array([result.T_world_lidar for result in results])
     assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.01
@@ -123,9 +121,7 @@ def test_true_odometry_through_the_map_gives_true_poses_and_a_true_map(
     check_poses_and_map(results, pipeline, room, room_truth)
 
 
-def test_a_drifting_odometry_is_corrected_by_the_map(
-    room: Any, room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_a_drifting_odometry_is_corrected_by_the_map(room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
     """Five centimetres and a degree a scan to one side: one metre and twenty degrees at the end."""
     step = exp([0.0, 0.0, np.deg2rad(1.0), 0.0, 0.05, 0.0])
     motions = room_truth.relative_motions() @ step

@@ -136,9 +136,7 @@ def test_poses_are_true_from_wrong_priors(
     assert_true(results, rest_truth.T_world_lidar, 0.006, 0.06)
 
 
-def test_poses_are_true_with_the_true_motion(
-    mapper: Mapper, room_scans: list[Scan], room_truth: Trajectory
-) -> None:
+def test_poses_are_true_with_the_true_motion(mapper: Mapper, room_scans: list[Scan], room_truth: Trajectory) -> None:
     relative = [np.eye(4), *room_truth.relative_motions()]
     results = process(mapper, room_scans, [Prior(T_prev_curr, VELOCITY) for T_prev_curr in relative])
     assert_true(results, room_truth.T_world_lidar, 0.002, 0.03)
@@ -158,9 +156,7 @@ def test_scans_without_times_are_registered_as_they_are(room: Any, drive: Path, 
     assert_true(process(mapper, scans), truth, 0.004, 0.04)
 
 
-def test_a_sensor_upside_down_is_as_good(
-    mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
-) -> None:
+def test_a_sensor_upside_down_is_as_good(mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory) -> None:
     T_lidar_mounted = np.diag([1.0, -1.0, -1.0, 1.0])
     scans = [replace(scan, points=scan.points @ T_lidar_mounted[:3, :3]) for scan in rest_scans]
     assert_true(process(mapper, scans), rest_truth.T_world_lidar @ T_lidar_mounted, 0.005, 0.05)
@@ -216,9 +212,7 @@ def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothi
     assert np.linalg.norm(lost.state.T_world_lidar[:3, 3] - truth[15, :3, 3]) < 0.02, "it goes on as it did"
 
 
-def test_the_scan_after_one_of_nothing_is_fine(
-    settled: Mapper, rest_scans: list[Scan], rest_truth: Trajectory
-) -> None:
+def test_the_scan_after_one_of_nothing_is_fine(settled: Mapper, rest_scans: list[Scan], rest_truth: Trajectory) -> None:
     settled.process(empty(rest_scans[15].stamp), NOTHING)
     after = settled.process(rest_scans[16], NOTHING)
     assert after.status is Status.OK
@@ -271,9 +265,7 @@ def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans: list[Scan]) -> 
     assert ["a new map is begun here" in result.message for result in lost] == [False, False, True]
 
 
-def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(
-    rest_scans: list[Scan], rest_truth: Trajectory
-) -> None:
+def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(rest_scans: list[Scan], rest_truth: Trajectory) -> None:
     """Two covered scans, then the room again, which fits the new map and not what came between."""
     mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=1)))
     process(mapper, [garbage(0.0)])

@@ -19,9 +19,7 @@ NOTHING = np.empty((0, 3))
 T_TRUE = exp([0.02, -0.03, 0.5, 0.6, -0.4, 0.1])
 TURNING = np.concatenate([np.deg2rad([0.0, 0.0, 120.0]), [1.5, 0.0, 0.0]])
 # Twelve edges: along each axis at the four combinations of the others' sides.
-EDGES = [
-    (axis, *signs) for axis in range(3) for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
-]
+EDGES = [(axis, *signs) for axis in range(3) for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))]
 
 
 def sides(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2), margin: float = 0.0) -> FloatArray:

@@ -1,0 +1,83 @@
+"""What each part of scan-to-map refinement contributes: the same recordings with parts of it switched off.
+
+    python benchmarks/mapping_ablation.py
+
+Every row of the Markdown table is a variant: with or without edges, with the velocity of the sweep estimated
+(continuous time) or taken from the pose before, and then compensated again or not (second deskew); each without any
+odometry, and with one that is wrong by `--wrong-deg` and `--wrong-m` at every scan (see `mapping_accuracy.py`). The
+columns are the ATE of each recording in metres after SE(3) alignment, lost scans in brackets, the mean, and the median
+time of a scan's registration and map update. All variants have the same scans; what each recording gives goes to
+standard error as it comes, as the table needs them all.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+from mapping_accuracy import (
+    Outcome,
+    Recorded,
+    add_simulation_arguments,
+    localise,
+    print_row,
+    simulated_recordings,
+    with_odometry,
+    wrong_odometry,
+)
+
+from lidarslam.config import Config
+from mapping.config import MappingConfig
+
+_PARTS: dict[str, dict[str, bool]] = {
+    "continuous time": {"edges": False, "continuous_time": True},
+    "continuous time, edges": {"edges": True, "continuous_time": True},
+    "second deskew": {"edges": False, "continuous_time": False, "second_deskew": True},
+    "one deskew": {"edges": False, "continuous_time": False, "second_deskew": False},
+}
+
+
+def run_variants(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int) -> list[Outcome]:
+    """One recording through all variants, without odometry and with the wrong one."""
+    prior = wrong_odometry(recorded, wrong_deg, wrong_m, seed)
+    mappings = [MappingConfig(**parts) for parts in _PARTS.values()]
+    alone = [localise(recorded, Config(mapping=mapping)) for mapping in mappings]
+    return alone + [localise(recorded, with_odometry(mapping), prior) for mapping in mappings]
+
+
+def _labels() -> list[str]:
+    """Variants in the order of `run_variants`; what the defaults are is marked."""
+    default = MappingConfig()
+    names = [f"{name} (default)" if MappingConfig(**parts) == default else name for name, parts in _PARTS.items()]
+    return [f"{name} | {odometry}" for odometry in ("none", "wrong") for name in names]
+
+
+def _cells(outcomes: Sequence[Outcome]) -> list[str]:
+    ates = [f"{outcome.ate_m:.3f}" + (f" ({outcome.lost})" if outcome.lost else "") for outcome in outcomes]
+    refine_ms = [outcome.refine_ms for outcome in outcomes if outcome.refine_ms is not None]
+    return [*ates, f"{np.mean([outcome.ate_m for outcome in outcomes]):.3f}", f"{np.median(refine_ms):.1f}"]
+
+
+def main() -> None:
+    """Parse the command line, run everything, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_simulation_arguments(parser, ("office", "tunnel", "hall"), ("handheld", "legged", "tracked"))
+    parser.add_argument("--wrong-deg", type=float, default=2.0)
+    parser.add_argument("--wrong-m", type=float, default=0.1)
+    arguments = parser.parse_args()
+    names: list[str] = []
+    columns: list[list[Outcome]] = []
+    for recorded in simulated_recordings(arguments):
+        names.append(recorded.name)
+        columns.append(run_variants(recorded, arguments.wrong_deg, arguments.wrong_m, arguments.seed))
+        ates = " ".join(f"{outcome.ate_m:.3f}" for outcome in columns[-1])
+        print(f"{recorded.name}: {ates}", file=sys.stderr, flush=True)
+    header = ["variant", "odometry", *names, "mean", "ms a scan"]
+    print_row(header)
+    print_row(["---"] * len(header))
+    for label, outcomes in zip(_labels(), zip(*columns, strict=True), strict=True):
+        print_row([label, *_cells(outcomes)])
+
+
+if __name__ == "__main__":
+    main()
