@@ -17,6 +17,8 @@ LEVELS = (1, 2, 4)
 # by, being seen at a flatter angle than asin of the first, counts only when the rays differ in height by the second.
 _LEAST_SINE = 0.17
 _LEAST_HEIGHT_M = 0.05
+# A patch of three cells filled evenly has a standard deviation of 0.8 cells along each axis.
+_SHORT = 0.5
 # Memory is bounded by forgetting what is far away, now and then rather than at every scan.
 _FORGET_AFTER = 0.1
 # A sensor is tilted by less than this from the vertical, as a cosine, when it first looks.
@@ -118,7 +120,7 @@ class LocalMap:
             waiting = waiting[still]
         if bodies is not None:
             left = np.flatnonzero(np.isin(bodies[0], waiting, assume_unique=True))
-            parts.append(_pull_to_bodies(bodies[0][left], bodies[1].select(left)))
+            parts.append(_pull_to_bodies(bodies[0][left], bodies[1].select(left), self._planes[first_level].cell_m))
         return Matches.join(parts)
 
     def match_lines(self, points: FloatArray) -> Matches:
@@ -165,17 +167,19 @@ def _are_bodies(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(bodies, dtype=np.bool_)
 
 
-def _pull_to_bodies(index: NDArray[np.intp], patches: PatchTable) -> Matches:
-    """Towards the middle of the patch along each of its axes, the more firmly the thinner it is."""
+def _pull_to_bodies(index: NDArray[np.intp], patches: PatchTable, cell_m: float) -> Matches:
+    """Towards the middle of the patch along those of its axes that it is short along.
+
+    Where the surface goes on beyond the patch, as grass does, the patch's middle is no place on it.
+    """
     spreads = patches.spreads_m
-    across = np.cross(patches.directions, patches.normals)
-    return Matches(
-        np.concatenate([index, index, index]),
-        np.concatenate([patches.points] * 3),
-        np.concatenate([patches.normals, across, patches.directions]),
-        np.concatenate([spreads[:, 0], spreads[:, 1], spreads[:, 2]]),
-        np.zeros(3 * len(index)),
-    )
+    axes = (patches.normals, np.cross(patches.directions, patches.normals), patches.directions)
+    parts = []
+    for column, axis in enumerate(axes):
+        short = np.flatnonzero(spreads[:, column] < _SHORT * cell_m)
+        thickness_m = spreads[short, column]
+        parts.append(Matches(index[short], patches.points[short], axis[short], thickness_m, np.zeros(len(short))))
+    return Matches.join(parts)
 
 
 def _pull_to_planes(index: NDArray[np.intp], patches: PatchTable) -> Matches:

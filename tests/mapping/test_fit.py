@@ -47,7 +47,7 @@ def test_a_scan_in_its_place_fits_entirely(box_map: LocalMap, scan_points: Float
 
 
 def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map: LocalMap, scan_points: FloatArray) -> None:
-    elsewhere = scan_points + [0.0, 0.0, 50.0]
+    elsewhere = scan_points + np.array([0.0, 0.0, 50.0])
     fit = measure_fit(np.concatenate([scan_points, elsewhere]), T_WORLD_LIDAR, box_map, CONFIG)
     assert fit.overlap == pytest.approx(0.5)
     assert fit.inlier_ratio == 1.0

@@ -87,7 +87,7 @@ def test_coarse_grids_reach_farther(rng: np.random.Generator, first_level: int) 
     cell_m = CELL * LEVELS[first_level]
     above = floor_points(rng, 100, half_size=1.0, z=0.9 * cell_m)
     assert len(local_map.match_planes(above, np.array([0.0, 0.0, 5.0]), first_level)) == 100
-    beyond = above + [0.0, 0.0, 3.0 * CELL * LEVELS[-1]]
+    beyond = above + np.array([0.0, 0.0, 3.0 * CELL * LEVELS[-1]])
     assert len(local_map.match_planes(beyond, np.array([0.0, 0.0, 9.0]), first_level)) == 0
 
 
@@ -143,7 +143,7 @@ def test_a_point_beside_a_line_is_pulled_across_it_both_ways(rng: np.random.Gene
     line = [1.0, 2.0, 0.0] + rng.uniform(-3.0, 3.0, (600, 1)) * direction
     local_map = map_of(floor_points(rng, 100), edges=line)
     foot = np.array([1.0, 2.0, 0.0]) + 0.3 * direction
-    point = foot + [0.0, 0.07, 0.0]
+    point = foot + np.array([0.0, 0.07, 0.0])
     matches = local_map.match_lines(point[None])
     assert matches.index.tolist() == [0, 0]
     np.testing.assert_allclose(matches.normals @ direction, 0.0, atol=1e-4)
@@ -173,7 +173,7 @@ def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
     local_map = LocalMap(CELL, 20.0)
     floor = floor_points(rng, 20_000, half_size=3.0)
     local_map.add(floor, elevations_of(floor), NO_EDGES, HERE)
-    away = floor + [30.0, 0.0, 0.0]
+    away = floor + np.array([30.0, 0.0, 0.0])
     local_map.add(away, elevations_of(floor), NO_EDGES, np.array([30.0, 0.0, 0.0]))
     assert len(local_map.match_planes(floor[:200], HERE)) == 0
     assert len(local_map.match_planes(away[:200], np.array([30.0, 0.0, 0.0]))) == 200

@@ -47,7 +47,7 @@ def wrong_motions(truth: Trajectory, seed: int, degrees: float = 2.0, metres: fl
     return [Prior(T_prev_curr) for T_prev_curr in relative @ off]
 
 
-def garbage(stamp: float, seed: int = 0, count: int = 5_000) -> Scan:
+def garbage(stamp: float, seed: int = 0, count: int = 2_000) -> Scan:
     """Points that lie on nothing."""
     return Scan(np.random.default_rng(seed).uniform(-6.0, 6.0, (count, 3)), stamp, np.linspace(0.0, 0.1, count))
 
@@ -105,7 +105,7 @@ def test_the_first_scan_is_the_world(mapper: Mapper, room_scans: list[Scan]) -> 
 
 
 def test_poses_are_true_without_any_prior(mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory) -> None:
-    assert_true(process(mapper, rest_scans), rest_truth.T_world_lidar, 0.005, 0.05)
+    assert_true(process(mapper, rest_scans), rest_truth.T_world_lidar, 0.0025, 0.03)
 
 
 def test_velocities_are_true_without_any_prior(mapper: Mapper, rest_scans: list[Scan]) -> None:
@@ -133,7 +133,7 @@ def test_poses_are_true_from_wrong_priors(
 ) -> None:
     """Each is wrong by two degrees and ten centimetres."""
     results = process(mapper, rest_scans, wrong_motions(rest_truth, seed))
-    assert_true(results, rest_truth.T_world_lidar, 0.006, 0.06)
+    assert_true(results, rest_truth.T_world_lidar, 0.003, 0.04)
 
 
 def test_poses_are_true_with_the_true_motion(mapper: Mapper, room_scans: list[Scan], room_truth: Trajectory) -> None:
@@ -146,7 +146,7 @@ def test_compensating_twice_is_nearly_as_good_as_estimating_the_velocity(
     rest_scans: list[Scan], rest_truth: Trajectory
 ) -> None:
     results = process(Mapper(MappingConfig(continuous_time=False)), rest_scans)
-    assert_true(results, rest_truth.T_world_lidar, 0.015, 0.3)
+    assert_true(results, rest_truth.T_world_lidar, 0.009, 0.18)
 
 
 def test_scans_without_times_are_registered_as_they_are(room: Any, drive: Path, mapper: Mapper) -> None:
@@ -159,7 +159,7 @@ def test_scans_without_times_are_registered_as_they_are(room: Any, drive: Path, 
 def test_a_sensor_upside_down_is_as_good(mapper: Mapper, rest_scans: list[Scan], rest_truth: Trajectory) -> None:
     T_lidar_mounted = np.diag([1.0, -1.0, -1.0, 1.0])
     scans = [replace(scan, points=scan.points @ T_lidar_mounted[:3, :3]) for scan in rest_scans]
-    assert_true(process(mapper, scans), rest_truth.T_world_lidar @ T_lidar_mounted, 0.005, 0.05)
+    assert_true(process(mapper, scans), rest_truth.T_world_lidar @ T_lidar_mounted, 0.0025, 0.03)
 
 
 def test_the_covariance_of_registered_scans_is_proper(mapper: Mapper, room_scans: list[Scan]) -> None:
@@ -230,6 +230,20 @@ def test_a_scan_of_another_place_is_lost_and_stays_out_of_the_map(
     assert lost.status is Status.LOST
     assert "% of the scan" in lost.message
     assert size(settled) == held
+
+
+def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_the_map(rest_scans: list[Scan]) -> None:
+    mapper = Mapper(MappingConfig(tracking=TrackingConfig(degraded_below=1.0)))
+    process(mapper, rest_scans[:1])
+    held = size(mapper)
+    # A quarter of its points stand before the walls, as people do.
+    crowded = rest_scans[1].points.copy()
+    crowded[::4] *= 0.8
+    placed = mapper.process(replace(rest_scans[1], points=crowded), NOTHING)
+    assert placed.registered
+    assert placed.status is Status.DEGRADED
+    assert "lies on the map" in placed.message
+    assert size(mapper) == held
 
 
 def test_the_way_goes_on_after_a_scan_of_another_place(

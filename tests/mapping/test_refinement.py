@@ -183,6 +183,17 @@ def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(
     assert refined.degeneracy.names == ("x",)
 
 
+def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng: np.random.Generator) -> None:
+    """Their normals are off by a little, and each would pull along the corridor a little."""
+    noisy = sides(rng, 60_000, axes=(1, 2))
+    local_map = map_of(noisy + rng.normal(0.0, 0.02, noisy.shape))
+    sweep = snapshot(rng, axes=(1, 2))
+    sweep = replace(sweep, planes=sweep.planes + rng.normal(0.0, 0.02, sweep.planes.shape))
+    refined = register(sweep, predicted(T_TRUE, metres=20.0), local_map)
+    assert refined.degeneracy.names == ("x",)
+    assert refined.T_world_lidar[0, 3] == pytest.approx(T_TRUE[0, 3], abs=2e-3)
+
+
 def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(
     corridor_map: LocalMap, rng: np.random.Generator
 ) -> None:

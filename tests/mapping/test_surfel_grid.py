@@ -193,7 +193,7 @@ def test_a_cell_that_has_seen_enough_moves_no_more(rng: np.random.Generator) -> 
     wall = np.column_stack([np.full(9_000, 0.25), rng.uniform(-1, 1, (9_000, 2))])
     grid = grid_of(wall)
     before = grid.patches(grid.look_up(wall)).values
-    drifted = wall + [0.1, 0.0, 0.0]
+    drifted = wall + np.array([0.1, 0.0, 0.0])
     grid.add(drifted, np.zeros(len(wall)))
     np.testing.assert_array_equal(grid.patches(grid.look_up(wall)).values, before)
 
