@@ -140,7 +140,8 @@ class Mapper:
 
     def _miss(self, sampled: SampledScan, prediction: Prediction, fit: Fit) -> MappedScan:
         """A scan that fits nowhere stays where it was expected, out of the map."""
-        T_world_lidar, message = prediction.T_world_lidar, fit.explain(self._config.tracking)
+        T_world_lidar = prediction.T_world_lidar
+        message = fit.explain(self._config.tracking) if len(sampled) else "there is no point within range"
         self._lost_in_a_row += 1
         self._has_velocity = False
         self._expected_error_m = _UNKNOWN_M

@@ -14,7 +14,7 @@ _CALMEST = (np.deg2rad(150.0), 3.0)
 _WILDEST = (np.deg2rad(4000.0), 60.0)
 # How fast the supposition follows what is seen, and how much more than that it stays: surprises come in bursts.
 _FOLLOWING = 0.1
-_CAUTION = 1.5
+_CAUTION = 4.0
 # What is known of a sensor before its first scans, and after it was lost.
 _ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
 _ASTRAY = np.array([np.deg2rad(20.0)] * 3 + [1.0] * 3)
