@@ -31,8 +31,14 @@ class Degeneracy:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The axis nearest to each direction, in the LiDAR frame."""
-        return tuple(_NAMES[int(np.abs(direction).argmax())] for direction in self.directions)
+        """The axes nearest to the directions, each but once, in the LiDAR frame."""
+        left = self.directions.T @ self.directions  # the same for any basis of the directions
+        axes = []
+        for _ in self.directions:
+            axis = int(left.diagonal().argmax())
+            left = left - np.outer(left[:, axis], left[axis]) / left[axis, axis]
+            axes.append(axis)
+        return tuple(_NAMES[axis] for axis in sorted(axes))
 
     def projector(self) -> FloatArray:
         """(6, 6): the part of a motion (rotation first, radians and metres), in metres, along the directions."""

@@ -141,14 +141,13 @@ class LocalMap:
         return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
 
     def resized(self, cell_m: float) -> "LocalMap":
-        """The same map in cells of another size, from the mean points of these."""
+        """The same map in cells of another size, made of the surfaces in the finest of these."""
         other = LocalMap(cell_m, self._radius_m)
         other._centre = self._centre
-        for grid, source in zip(other._planes, self._planes, strict=True):
-            means = source.means()
-            grid.add(means, np.zeros(len(means)))
-        means = self._lines.means()
-        other._lines.add(means, np.zeros(len(means)))
+        points, elevations = self._planes[0].samples()
+        for grid in other._planes:
+            grid.add(points, elevations)
+        other._lines.add(*self._lines.samples())
         return other
 
 

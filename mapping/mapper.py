@@ -3,7 +3,7 @@
 LOAM's mapping (Zhang and Singh, RSS 2014), with any odometry before it or none.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from lidarslam.core.geometry import FloatArray, inverse, log, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
+from mapping.deskew import body_velocity
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
 from mapping.placement import Placed, place, search
@@ -29,6 +30,8 @@ _MOST_SIGMAS = 5.0
 _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
 # Nothing goes on as it did for ever: while lost, the velocity fades by this from scan to scan.
 _FADING = 0.7
+# How often the first sweep is drawn anew when the second has shown how it moved.
+_BEGINNINGS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +69,7 @@ class Mapper:
         self._carrier = Carrier()
         self._expected_error_m = _UNKNOWN_M
         self._lost_in_a_row = 0
+        self._first: SampledScan | None = None  # while the map is one sweep whose motion was made up
         self._has_velocity = False  # no change of velocity is seen from one that was made up
 
     @property
@@ -80,6 +84,11 @@ class Mapper:
         prediction = predict(last, scan.stamp, prior, self._carrier, self._config)
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
+            made_up = prior.velocity is None and sampled.times is not None and self._config.continuous_time
+            self._first = sampled if made_up else None
+        elif self._first is not None:
+            mapped = self._lay_second(sampled, prior, last, self._first, self._map)
+            self._first = None
         else:
             mapped = self._lay(sampled, prediction, last, self._map)
         self._state = mapped.state
@@ -95,6 +104,43 @@ class Mapper:
         self._add(sampled, T_world_lidar, prediction.velocity, self._map)
         first = State(sampled.stamp, T_world_lidar, prediction.velocity, last.covariance, sampled.seen_until_s)
         return MappedScan(first, T_world_lidar, False, Status.OK)
+
+    def _lay_second(
+        self, sampled: SampledScan, prior: Prior, last: State, first: SampledScan, local_map: LocalMap
+    ) -> MappedScan:
+        """Register the second scan; when the first turns out to have been moving, draw that anew, and register again.
+
+        Two sweeps bent alike fit one another, and hide a motion that both have in common; the way between their poses
+        does not.
+        """
+        carrier = self._carrier
+        prediction = predict(last, sampled.stamp, prior, carrier, self._config)
+        mapped = self._lay(sampled, prediction, last, local_map)
+        for _ in range(_BEGINNINGS):
+            way = log(inverse(last.T_world_lidar) @ mapped.state.T_world_lidar)
+            way_m = float(np.linalg.norm(way[3:]) + sampled.range_m * np.linalg.norm(way[:3]))
+            if not mapped.registered or way_m < local_map.cell_m:
+                break
+            last = self._begin_again(first, last, mapped.state)
+            self._carrier, self._has_velocity = carrier, False
+            prediction = predict(last, sampled.stamp, prior, carrier, self._config)
+            assert self._map is not None
+            mapped = self._lay(sampled, prediction, last, self._map)
+        return mapped
+
+    def _begin_again(self, first: SampledScan, last: State, curr: State) -> State:
+        """Draw the first sweep with the motion that the second has shown.
+
+        The way between the two poses is gone partly with the one's velocity and partly with the other's.
+        """
+        interval_s = curr.stamp - last.stamp
+        share = min(1.0, last.seen_until_s / interval_s)
+        seen = share * last.velocity + (1.0 - share) * curr.velocity
+        hidden = body_velocity(inverse(last.T_world_lidar) @ curr.T_world_lidar, interval_s) - seen
+        last = replace(last, velocity=last.velocity + hidden)
+        self._map = LocalMap(first.cell_m, self._config.radius_m)
+        self._add(first, last.T_world_lidar, last.velocity, self._map)
+        return last
 
     def _lay(self, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap) -> MappedScan:
         """Register a scan to the map; when it fits nowhere near, search; when it fits nowhere, keep it out."""
@@ -112,23 +158,27 @@ class Mapper:
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
         self._has_velocity = True
-        return self._accept(sampled, prediction, placed, placed.refined, local_map)
+        return self._accept(sampled, prediction, last, placed, placed.refined)
 
     def _accept(
-        self, sampled: SampledScan, prediction: Prediction, placed: Placed, refined: Refined, local_map: LocalMap
+        self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined
     ) -> MappedScan:
-        """A scan that lies on the map becomes part of it, unless it lies there badly."""
+        """A scan that lies on the map where it was expected becomes part of it."""
         self._lost_in_a_row = 0
         correction = log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
         moved_m = float(np.linalg.norm(correction[3:]) + sampled.range_m * np.linalg.norm(correction[:3]))
         self._expected_error_m = max(_CAUTION * self._expected_error_m, moved_m)
-        status, message = self._judge(placed, refined, correction, prediction)
-        if placed.status(self._config) is Status.OK:
-            self._add(sampled, refined.T_world_lidar, refined.velocity, local_map)
+        state = State(sampled.stamp, refined.T_world_lidar, refined.velocity, refined.covariance, sampled.seen_until_s)
+        jumped = _has_jumped(correction, prediction)
+        if jumped:  # the last sweep or this one was bent by a wrong velocity: go on with the way between their poses
+            way = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, sampled.stamp - last.stamp)
+            state = State.astray(sampled.stamp, refined.T_world_lidar, way)
+        elif placed.status(self._config) is Status.OK:
+            assert self._map is not None
+            self._add(sampled, refined.T_world_lidar, refined.velocity, self._map)
+        status, message = self._judge(placed, refined, correction, jumped)
         return MappedScan(
-            state=State(
-                sampled.stamp, refined.T_world_lidar, refined.velocity, refined.covariance, sampled.seen_until_s
-            ),
+            state=state,
             T_world_expected=prediction.T_world_lidar,
             registered=True,
             status=status,
@@ -153,15 +203,12 @@ class Mapper:
         lost = State.astray(sampled.stamp, T_world_lidar, _FADING * prediction.velocity)
         return MappedScan(lost, T_world_lidar, False, Status.LOST, message, fit)
 
-    def _judge(
-        self, placed: Placed, refined: Refined, correction: FloatArray, prediction: Prediction
-    ) -> tuple[Status, str]:
+    def _judge(self, placed: Placed, refined: Refined, correction: FloatArray, jumped: bool) -> tuple[Status, str]:
         """The fit decides; one that fits far from where it was expected is degraded, and one that the prior holds."""
         status = placed.status(self._config)
         if status is not Status.OK:
             return status, placed.fit.explain(self._config.tracking)
-        usual = np.maximum(_MOST_SIGMAS * np.sqrt(np.diag(prediction.pose_covariance)), _LEAST_JUMP)
-        if bool((np.abs(correction) > usual).any()):
+        if jumped:
             angle_deg, distance_m = np.rad2deg(np.linalg.norm(correction[:3])), np.linalg.norm(correction[3:])
             return Status.DEGRADED, f"{angle_deg:.0f} deg and {distance_m:.2f} m from where it was expected"
         if len(refined.degeneracy):
@@ -178,3 +225,9 @@ class Mapper:
             edges=transform_points(T_world_lidar, edges),
             sensor=T_world_lidar[:3, 3],
         )
+
+
+def _has_jumped(correction: FloatArray, prediction: Prediction) -> bool:
+    """Whether a pose lies farther from where it was expected than any carrier explains."""
+    usual = np.maximum(_MOST_SIGMAS * np.sqrt(np.diag(prediction.pose_covariance)), _LEAST_JUMP)
+    return bool((np.abs(correction) > usual).any())

@@ -29,6 +29,8 @@ _AROUND = np.argsort((_NEIGHBOURS**2).sum(axis=1), kind="stable")[1:]
 
 # A cell that has seen so many points knows its surface; it is left as it is, and drift does not smear it.
 _MOST_POINTS = 60.0
+# A cell is handed on to another grid as so many points.
+_SAMPLES = 6
 # A patch is worked out again when its cell has this many times the points it had.
 _GROWTH = 1.3
 
@@ -104,6 +106,29 @@ class SurfelGrid:
         count = len(self._table)
         means = key_cells(self._keys[:count]) + 0.5 + self._sums[:count, _FIRST] / self._sums[:count, _COUNT, None]
         return np.asarray(means * self.cell_m, dtype=np.float64)
+
+    def samples(self) -> tuple[FloatArray, FloatArray]:
+        """Points (S, 3) of the world and their elevations (S,) with the moments of the cells: six a cell, two along
+        each axis of its own points, or the mean alone where it has fewer than six."""
+        count = len(self._table)
+        sums = self._sums[:count].astype(np.float64)
+        counts = sums[:, _COUNT]
+        mean = sums[:, _FIRST] / counts[:, None]
+        covariance = np.empty((count, 3, 3))
+        for column, (i, j) in enumerate(SYMMETRIC, _SECOND.start):
+            covariance[:, i, j] = covariance[:, j, i] = sums[:, column] / counts - mean[:, i] * mean[:, j]
+        values, axes = np.linalg.eigh(covariance)
+        # Three times the variance, as only one pair in three lies along each axis; and no farther than the cell goes.
+        reach = np.minimum(np.sqrt(3.0 * np.maximum(values, 0.0)), 0.5)
+        reach[counts < _SAMPLES] = 0.0
+        arms = np.swapaxes(axes, 1, 2) * reach[:, :, None]
+        offsets = np.concatenate([arms, -arms], axis=1)
+        spread = _spread(counts, sums[:, _ELEVATION])[:, None] * np.repeat([1.0, -1.0], 3)
+        elevations = sums[:, _ELEVATION.start, None] / counts[:, None] + spread
+        points = (key_cells(self._keys[:count]) + 0.5 + mean)[:, None] + offsets
+        several = np.ones((count, _SAMPLES), dtype=np.bool_)
+        several[counts < _SAMPLES, 1:] = False
+        return points[several] * self.cell_m, elevations[several]
 
     def forget_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the cells farther than `radius_m` from `centre` (3,)."""

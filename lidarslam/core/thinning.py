@@ -24,7 +24,7 @@ def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     scaled *= np.float32(1.0 / cell_m)
     cells = np.floor(scaled, out=scaled).astype(np.int32)
     cells *= _PRIMES  # wraps around, as a hash may
-    slots = cells[:, 0] ^ cells[:, 1] ^ cells[:, 2]
+    slots = cells[:, 0] + cells[:, 1] + cells[:, 2]
     slots &= _SLOTS - 1
     order = np.arange(len(points), dtype=np.int32)
     last_comer = np.empty(_SLOTS, dtype=np.int32)
