@@ -56,7 +56,7 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     for setting in settings:
         _apply(tree, setting)
     try:
-        return resolved(Config.model_validate(tree))
+        return Config.model_validate(tree)
     except ValidationError as error:
         raise ConfigError(_explain(error, _origin(path, settings))) from None
 

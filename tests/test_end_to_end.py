@@ -14,15 +14,21 @@ import pytest
 
 from lidarslam.config import load_config
 from lidarslam.core.errors import InputError, OutputError
-from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
 from lidarslam.pipeline import ScanResult
 from lidarslam.run import RunRequest, execute, in_order
 
-INDOOR = ["odometry.kiss_icp.voxel_size_m=0.2", "odometry.kiss_icp.max_range_m=30", "global_map.voxel_size_m=0.1"]
+KISS_ICP = [
+    "mapping.enabled=false",
+    "odometry.kiss_icp.voxel_size_m=0.2",
+    "odometry.kiss_icp.max_range_m=30",
+    "global_map.voxel_size_m=0.1",
+]
+MAPPING = ["global_map.voxel_size_m=0.1"]
 
 
 def quiet(number: int, total: int, result: ScanResult) -> None:
@@ -49,7 +55,7 @@ def test_a_run_writes_what_the_contract_names(
     recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
 ) -> None:
     out = tmp_path / "run"
-    outcome = execute(RunRequest(recording, out, load_config(None, INDOOR), pcd=True), quiet)
+    outcome = execute(RunRequest(recording, out, load_config(None, KISS_ICP), pcd=True), quiet)
 
     trajectory = read_tum(out / "trajectory.tum")
     np.testing.assert_allclose(trajectory.stamps, room_truth.stamps, atol=1e-9)
@@ -72,7 +78,7 @@ def test_a_run_writes_what_the_contract_names(
     assert summary["length_m"] == pytest.approx(room_truth.length_m, rel=0.02)
     assert summary["map_points"] == len(cloud.points)
     assert summary["map_voxel_size_m"] == 0.1
-    assert set(summary["ms_per_scan"]) == {"total", "read", "odometry", "deskew", "check", "map"}
+    assert set(summary["ms_per_scan"]) == {"total", "read", "odometry", "refine", "check", "deskew", "map"}
     assert summary["ms_per_scan"]["total"]["p95"] >= summary["ms_per_scan"]["total"]["median"] > 0.0
     assert summary["peak_rss_mb"] > 50.0
 
@@ -89,7 +95,7 @@ def test_a_run_writes_what_the_contract_names(
 
 
 def test_what_config_yaml_says_gives_the_same_run_again(recording: Path, tmp_path: Path) -> None:
-    execute(RunRequest(recording, tmp_path / "a", load_config(None, INDOOR), start=2, stop=9, step=2), quiet)
+    execute(RunRequest(recording, tmp_path / "a", load_config(None, KISS_ICP), start=2, stop=9, step=2), quiet)
     again = load_config(tmp_path / "a" / "config.yaml")
     execute(RunRequest(recording, tmp_path / "b", again, start=2, stop=9, step=2), quiet)
     first = read_tum(tmp_path / "a" / "trajectory.tum")
@@ -99,10 +105,43 @@ def test_what_config_yaml_says_gives_the_same_run_again(recording: Path, tmp_pat
     np.testing.assert_allclose(first.T_world_lidar, second.T_world_lidar, atol=1e-6)
 
 
+def test_scans_are_laid_on_the_map_by_default(
+    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
+) -> None:
+    out = tmp_path / "run"
+    outcome = execute(RunRequest(recording, out, load_config(None, MAPPING)), quiet)
+    assert outcome.metrics is not None
+    assert outcome.metrics.errors.ate_rmse_m < 0.005
+    assert outcome.summary.lost_scans == 0
+    cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
+    distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))
+    assert np.percentile(distance, 95) < 0.02
+    assert "method: constant-velocity" in (out / "config.yaml").read_text()
+    with (out / "scans.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert all(float(row["ms_refine"]) > 0.0 for row in rows)
+    assert all(row["degenerate_directions"] == "" for row in rows)
+
+
+def test_a_wrong_odometry_is_corrected_by_the_map(recording: Path, tmp_path: Path, room_truth: Trajectory) -> None:
+    rng = np.random.default_rng(5)
+    slips = np.concatenate(
+        [np.deg2rad(1.0) * rng.standard_normal((19, 3)), 0.05 * rng.standard_normal((19, 3))], axis=1
+    )
+    wrong = Trajectory(room_truth.stamps, chain(np.eye(4), room_truth.relative_motions() @ exp(slips)))
+    write_tum(tmp_path / "wheels.tum", wrong)
+    config = load_config(None, [*MAPPING, "odometry.method=external"])
+    outcome = execute(RunRequest(recording, tmp_path / "run", config, prior=tmp_path / "wheels.tum"), quiet)
+    assert outcome.metrics is not None
+    assert outcome.metrics.errors.ate_rmse_m < 0.01
+    odometry = read_tum(tmp_path / "run" / "odometry.tum")
+    np.testing.assert_allclose(odometry.relative_motions(), wrong.relative_motions(), atol=1e-6)
+
+
 def test_an_external_trajectory_builds_an_exact_map(
     recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
 ) -> None:
-    config = load_config(None, ["odometry.method=external", "global_map.voxel_size_m=0.1"])
+    config = load_config(None, ["odometry.method=external", "mapping.enabled=false", "global_map.voxel_size_m=0.1"])
     prior = recording / "ground_truth.tum"
     execute(RunRequest(recording, tmp_path / "run", config, prior=prior), quiet)
     cloud = o3d.io.read_point_cloud(str(tmp_path / "run" / "map.ply"))
@@ -117,7 +156,7 @@ def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -
         table["x"] = np.nan
         np.save(recording / f"{index:06d}.npy", table)
     seen: list[Status] = []
-    request = RunRequest(recording, tmp_path / "run", load_config(None, INDOOR))
+    request = RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP))
     outcome = execute(request, lambda _number, _total, result: seen.append(result.status))
     (stretch,) = outcome.summary.lost
     assert (stretch.first, stretch.last) == (9, 10)
@@ -144,14 +183,14 @@ def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch
             yield replace(scan, stamp=scan.stamp - 0.2) if index in (4, 5) else scan
 
     monkeypatch.setattr(ScanFolderRecording, "scans", stuttering)
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR), stop=9), quiet)
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP), stop=9), quiet)
     assert outcome.summary.scans == 7
     assert any(warning.startswith("2 scans were left out") for warning in outcome.summary.warnings)
 
 
 def test_a_damaged_scan_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:
     (recording / "000012.npy").write_bytes(b"not an array")
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR)), quiet)
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
     assert outcome.stopped is not None
     assert "000012.npy" in outcome.stopped
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -166,14 +205,14 @@ def test_an_interruption_ends_the_run_with_what_there_is(recording: Path, tmp_pa
         if number == 7:
             raise KeyboardInterrupt
 
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR)), interrupt)
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), interrupt)
     assert outcome.stopped == "interrupted"
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 7
 
 
 def test_a_damaged_truth_costs_the_metrics_not_the_run(recording: Path, tmp_path: Path) -> None:
     (recording / "ground_truth.tum").write_text("1 2 3\n")
-    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR), stop=4), quiet)
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP), stop=4), quiet)
     assert outcome.metrics is None
     assert any("ground_truth.tum:1" in warning for warning in outcome.summary.warnings)
     assert not (tmp_path / "run" / "metrics.json").exists()
@@ -182,7 +221,7 @@ def test_a_damaged_truth_costs_the_metrics_not_the_run(recording: Path, tmp_path
 def test_a_recording_is_not_written_into(recording: Path) -> None:
     before = sorted(recording.iterdir())
     with pytest.raises(OutputError, match="is the recording itself"):
-        execute(RunRequest(recording, recording, load_config(None, INDOOR), overwrite=True), quiet)
+        execute(RunRequest(recording, recording, load_config(None, KISS_ICP), overwrite=True), quiet)
     assert sorted(recording.iterdir()) == before
 
 
@@ -190,12 +229,12 @@ def test_a_run_that_cannot_start_leaves_nothing_behind(recording: Path, tmp_path
     for scan in recording.glob("*.npy"):
         scan.write_bytes(b"not an array")
     with pytest.raises(InputError, match=r"\.npy"):
-        execute(RunRequest(recording, tmp_path / "run", load_config(None, INDOOR)), quiet)
+        execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
     assert not (tmp_path / "run").exists()
 
 
 def test_points_beyond_the_maps_range_still_tell_whether_it_is_lost(recording: Path, tmp_path: Path) -> None:
-    config = load_config(None, [*INDOOR, "global_map.max_range_m=1.0"])
+    config = load_config(None, [*KISS_ICP, "global_map.max_range_m=1.0"])
     outcome = execute(RunRequest(recording, tmp_path / "run", config), quiet)
     assert outcome.summary.lost_scans == 0
 
@@ -204,7 +243,7 @@ def test_a_rerun_recording_holds_the_run(recording: Path, tmp_path: Path) -> Non
     from rerun.chunk import RrdReader
 
     out = tmp_path / "run"
-    config = load_config(None, [*INDOOR, "viewer.map_every=5"])
+    config = load_config(None, [*KISS_ICP, "viewer.map_every=5"])
     execute(RunRequest(recording, out, config, rerun="save", stop=11), quiet)
     reader = RrdReader(out / "recording.rrd")
     rows: Counter[str] = Counter()
