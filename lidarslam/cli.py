@@ -163,10 +163,10 @@ def _quoted(value: str) -> str:
 @click.option("--out", type=_PATH, default=Path("demo"), show_default=True, metavar="DIR", help="Where it all goes.")
 @click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:
-    """Record an indoor run in a simulated office, run on it, and say how it went."""
+    """Record an indoor run in a simulated office, map it, and compare that with KISS-ICP and the truth."""
     from lidarslam.demo import format_demo, run_demo
 
-    click.echo(format_demo(out, run_demo(out, scans)))
+    click.echo(format_demo(run_demo(out, scans, tell=_tell)))
 
 
 @main.command(epilog="lidarslam info recordings/2011_09_26_drive_0005_sync")
@@ -478,7 +478,7 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
 
 
 @main.command(
-    epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods kiss-icp,kiss-icp@0.5
+    epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods constant-velocity+map,kiss-icp
     lidarslam compare office.mcap --out compared --methods kiss-icp,prior --prior wheel_odometry.tum
     lidarslam compare --benchmark configs/benchmarks/kitti.yaml --data KITTI --out compared"""
 )
@@ -487,8 +487,8 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
 @click.option(
     "--methods",
     metavar="NAME,...",
-    help="BASE[@VOXEL][+map][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  [default: kiss-icp,"
-    "kiss-icp@0.5, or the benchmark's]",
+    help="BASE[@VOXEL][+map][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  "
+    "[default: constant-velocity+map,kiss-icp, or the benchmark's]",
 )
 @click.option("--benchmark", type=_FILE, metavar="FILE", help="Recordings, methods and tables as the file has them.")
 @click.option("--data", type=_PATH, metavar="DIR", help="Folder that the benchmark's paths are relative to.")

@@ -18,7 +18,7 @@ from lidarslam.methods import parse_methods
 from lidarslam.progress import show_count
 from lidarslam.supervised import Limits
 
-DEFAULT_METHODS = "kiss-icp,kiss-icp@0.5"
+DEFAULT_METHODS = "constant-velocity+map,kiss-icp"
 
 Say = Callable[[str], None]
 

@@ -133,7 +133,9 @@ def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
             f"{log.points_dropped} invalid points (NaN, at the origin, out of range) were left out, {share:.0f} a scan"
         )
     if degraded := log.statuses.count(Status.DEGRADED):
-        warnings.append(f"{degraded} scans fit the scan before badly (status degraded in scans.csv)")
+        warnings.append(
+            f"{degraded} scans are to be believed only in part (status degraded in scans.csv, which says why)"
+        )
     return tuple(warnings)
 
 
