@@ -14,12 +14,14 @@ class LostStretch:
     Attributes:
         first, last: rows of the method's trajectory, both inclusive.
         begin_s, end_s: their stamps.
+        reason: why.
     """
 
     first: int
     last: int
     begin_s: float
     end_s: float
+    reason: str
 
     @property
     def scans(self) -> int:
@@ -33,7 +35,9 @@ def lost_stretches(method: MethodResult) -> list[LostStretch]:
         return []
     edges = np.flatnonzero(np.diff(np.r_[False, method.lost, False]))
     stamps = method.trajectory.stamps
+    bounds = list(zip(edges[::2], edges[1::2], strict=True))
+    reasons = method.lost_reasons if len(method.lost_reasons) == len(bounds) else [method.message] * len(bounds)
     return [
-        LostStretch(int(first), int(past) - 1, float(stamps[first]), float(stamps[past - 1]))
-        for first, past in zip(edges[::2], edges[1::2], strict=True)
+        LostStretch(int(first), int(past) - 1, float(stamps[first]), float(stamps[past - 1]), reason)
+        for (first, past), reason in zip(bounds, reasons, strict=True)
     ]

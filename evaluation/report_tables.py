@@ -182,6 +182,6 @@ def _lost_row(method: MethodResult, stretch: LostStretch) -> Row:
     begin_s = 0.0 if method.trajectory is None else float(method.trajectory.stamps[0])
     numbers = [stretch.scans, stretch.first, stretch.last, stretch.begin_s - begin_s, stretch.end_s - begin_s]
     return Row(
-        [Cell(method.name), Cell(method.status), *(Cell(number) for number in numbers), Cell(method.message)],
+        [Cell(method.name), Cell(method.status), *(Cell(number) for number in numbers), Cell(stretch.reason)],
         method.name,
     )

@@ -133,9 +133,7 @@ def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
             f"{log.points_dropped} invalid points (NaN, at the origin, out of range) were left out, {share:.0f} a scan"
         )
     if degraded := log.statuses.count(Status.DEGRADED):
-        warnings.append(
-            f"{degraded} scans are to be believed only in part (status degraded in scans.csv, which says why)"
-        )
+        warnings.append(f"{degraded} scans are believed only in part (status degraded; scans.csv says why)")
     return tuple(warnings)
 
 
