@@ -55,7 +55,7 @@ class Fit:
 def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, config: TrackingConfig) -> Fit:
     """Hold compensated points (N, 3) of the LiDAR frame at a pose against the map."""
     world = transform_points(T_world_lidar, points)
-    matches = local_map.match_planes(world, T_world_lidar[:3, 3]).one_each()
+    matches = local_map.match_planes(world, T_world_lidar).one_each()
     if not len(matches):
         return Fit(0, 0.0, None, None)
     distances = plane_distances(world, matches)

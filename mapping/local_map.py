@@ -19,6 +19,7 @@ _LEAST_SINE = 0.17
 _LEAST_HEIGHT_M = 0.05
 # A patch of three cells filled evenly has a standard deviation of 0.8 cells along each axis.
 _SHORT = 0.5
+_MOST_ACROSS = 0.5
 # Memory is bounded by forgetting what is far away, now and then rather than at every scan.
 _FORGET_AFTER = 0.1
 # A sensor is tilted by less than this from the vertical, as a cosine, when it first looks.
@@ -96,14 +97,15 @@ class LocalMap:
             for grid in (*self._planes, self._lines):
                 grid.forget_beyond(sensor, self._radius_m)
 
-    def match_planes(self, points: FloatArray, sensor: FloatArray, first_level: int = 0) -> Matches:
-        """For points (N, 3) of the world, seen from `sensor` (3,), the plane in the finest grid that shows one.
+    def match_planes(self, points: FloatArray, T_world_lidar: FloatArray, first_level: int = 0) -> Matches:
+        """For points (N, 3) of the world, seen from a pose (4, 4), the plane in the finest grid that shows one.
 
         Grids finer than `first_level` are left out, for points that are not yet where they belong.
         """
+        sensor, spin_axis = T_world_lidar[:3, 3], T_world_lidar[:3, 2]
         waiting = np.arange(len(points))
         parts = []
-        bodies: tuple[NDArray[np.intp], PatchTable] | None = None
+        bodies: tuple[NDArray[np.intp], PatchTable, FloatArray] | None = None
         for grid in self._planes[first_level:]:
             there = points.take(waiting, axis=0)
             rows = grid.look_up(there)
@@ -114,13 +116,15 @@ class LocalMap:
             parts.append(_pull_to_planes(waiting[occupied[chosen]], patches.select(chosen)))
             if bodies is None:
                 body = np.flatnonzero(_are_bodies(patches, views))
-                bodies = waiting[occupied[body]], patches.select(body)
+                bodies = waiting[occupied[body]], patches.select(body), views.take(body, axis=0)
             still = np.ones(len(waiting), dtype=np.bool_)
             still[occupied[chosen]] = False
             waiting = waiting[still]
         if bodies is not None:
             left = np.flatnonzero(np.isin(bodies[0], waiting, assume_unique=True))
-            parts.append(_pull_to_bodies(bodies[0][left], bodies[1].select(left), self._planes[first_level].cell_m))
+            across_rings = _across_rings(bodies[2].take(left, axis=0), spin_axis)
+            short_m = _SHORT * self._planes[first_level].cell_m
+            parts.append(_pull_to_bodies(bodies[0][left], bodies[1].select(left), across_rings, short_m))
         return Matches.join(parts)
 
     def match_lines(self, points: FloatArray) -> Matches:
@@ -166,16 +170,27 @@ def _are_bodies(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(bodies, dtype=np.bool_)
 
 
-def _pull_to_bodies(index: NDArray[np.intp], patches: PatchTable, cell_m: float) -> Matches:
+def _across_rings(views: FloatArray, spin_axis: FloatArray) -> FloatArray:
+    """Unit directions (N, 3) from one ring to the next at points seen along `views` (N, 3)."""
+    u = views / np.maximum(np.sqrt(np.einsum("ij,ij->i", views, views)), 1e-9)[:, None]
+    across = spin_axis - (u @ spin_axis)[:, None] * u
+    return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None], dtype=np.float64)
+
+
+def _pull_to_bodies(
+    index: NDArray[np.intp], patches: PatchTable, across_rings: FloatArray, short_m: float
+) -> Matches:
     """Towards the middle of the patch along those of its axes that it is short along.
 
-    Where the surface goes on beyond the patch, as grass does, the patch's middle is no place on it.
+    Where the surface goes on beyond the patch, as grass does, the patch's middle is no place on it. Across the rings,
+    a patch is as short as the few rings on it are close, wherever the sensor is: the map would follow the sensor.
     """
     spreads = patches.spreads_m
     axes = (patches.normals, np.cross(patches.directions, patches.normals), patches.directions)
     parts = []
     for column, axis in enumerate(axes):
-        short = np.flatnonzero(spreads[:, column] < _SHORT * cell_m)
+        along_rings = np.abs(np.einsum("ij,ij->i", axis, across_rings)) < _MOST_ACROSS
+        short = np.flatnonzero((spreads[:, column] < short_m) & along_rings)
         thickness_m = spreads[short, column]
         parts.append(Matches(index[short], patches.points[short], axis[short], thickness_m, np.zeros(len(short))))
     return Matches.join(parts)

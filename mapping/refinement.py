@@ -122,7 +122,7 @@ def _match(
 ) -> tuple[FloatArray, Matches]:
     """The compensated points (N + E, 3), planes first, and what they are pulled to."""
     planes = compensated(sweep.planes, sweep.plane_times, velocity)
-    matches = local_map.match_planes(transform_points(T_world_lidar, planes), T_world_lidar[:3, 3], first_level=level)
+    matches = local_map.match_planes(transform_points(T_world_lidar, planes), T_world_lidar, first_level=level)
     if not len(sweep.edges):
         return planes, matches
     edges = compensated(sweep.edges, sweep.edge_times, velocity)
