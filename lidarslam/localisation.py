@@ -73,6 +73,7 @@ class Localised:
         covariance: (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none.
         motion: during the sweep.
         status, message: whether to believe the pose, and why not.
+        belongs_in_map: whether the pose is good enough to draw with.
         points_used: how many the pose rests on.
         residual_m, inlier_ratio: how the scan lies on what it was held against; None when that cannot be told.
         degenerate: names of the directions of motion that the scan says nothing about.
@@ -85,6 +86,7 @@ class Localised:
     motion: SweepMotion
     status: Status
     message: str
+    belongs_in_map: bool
     points_used: int
     residual_m: float | None
     inlier_ratio: float | None
@@ -121,6 +123,7 @@ class OdometryAlone:
             motion=sweep,
             status=status,
             message=message,
+            belongs_in_map=status is not Status.LOST,
             points_used=motion.points_used,
             residual_m=fit.residual_m,
             inlier_ratio=fit.inlier_ratio,
@@ -154,6 +157,7 @@ class ScanToMap:
             motion=SweepMotion(mapped.state.velocity, mapped.state.velocity),
             status=mapped.status,
             message=mapped.message,
+            belongs_in_map=mapped.added,
             points_used=mapped.fit.matched if mapped.fit else 0,
             residual_m=mapped.fit.residual_m if mapped.fit else None,
             inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,

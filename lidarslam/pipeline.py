@@ -143,7 +143,7 @@ class Pipeline:
         points = localised.motion.compensate(thinned)
         compensated = time.perf_counter()
         self._add_waiting(localised.status)
-        if localised.status is not Status.LOST:  # a pose that is not believed must not draw walls
+        if localised.belongs_in_map:  # a pose that is not believed must not draw walls
             self._waiting = _Compensated(thinned, localised.motion, points, localised.T_world_lidar)
         followed_ms = {"deskew": _ms(found, compensated), "map": _ms(compensated, time.perf_counter())}
         return _result(scan, localised, points, timed.stage_ms | localised.stage_ms | followed_ms)

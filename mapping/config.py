@@ -35,15 +35,17 @@ class RefinementConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_iterations: int = Field(20, ge=1, description="steps, the surfaces looked up anew before each")
-    coarse_iterations: int = Field(3, ge=0, description="of them on coarser cells, when the prediction may be far off")
+    max_iterations: int = Field(
+        20, ge=1, description="steps, the surfaces looked up anew before each; at least one a size of cells"
+    )
+    coarse_iterations: int = Field(3, ge=0, description="at most so many of them on each coarser size of cells")
     converged_rotation_deg: float = Field(0.02, gt=0.0, description="smaller steps end the iteration")
     converged_translation_m: float = Field(0.001, gt=0.0, description="likewise")
     min_matches: int = Field(60, ge=12, description="fewer points on surfaces do not make a pose")
 
 
 class TrackingConfig(BaseModel):
-    """When a scan laid on the map is believed; see `mapping.tracking_state`."""
+    """When a scan laid on the map is believed; see `mapping.fit`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -52,8 +54,16 @@ class TrackingConfig(BaseModel):
     gate_min_m: float = Field(0.05, gt=0.0, description="likewise, the least it can be")
     degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
     lost_below: float = Field(0.45, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
-    search_yaw_step_deg: float = Field(15.0, gt=0.0, description="start rotations around gravity when lost")
+    search_yaw_step_deg: float = Field(15.0, ge=1.0, le=360.0, description="start rotations around gravity when lost")
     give_up_after: int = Field(20, ge=1, description="lost scans in a row after which a new map is begun")
+
+    @model_validator(mode="after")
+    def _lost_is_worse_than_degraded(self) -> Self:
+        if self.lost_below > self.degraded_below:
+            raise ValueError(
+                f"lost_below={self.lost_below:g} must not be more than degraded_below={self.degraded_below:g}"
+            )
+        return self
 
 
 class MappingConfig(BaseModel):
@@ -63,7 +73,7 @@ class MappingConfig(BaseModel):
 
     enabled: bool = Field(True, description="correct the odometry against the local map")
     cell_m: float | None = Field(
-        None, gt=0.0, description="edge of the map's finest cells; null: follows the median range of the scene"
+        None, ge=0.01, description="edge of the map's finest cells; null: follows the median range of the scene"
     )
     cells_per_range: float = Field(30.0, gt=0.0, description="how many cells make the median range")
     radius_m: float = Field(100.0, gt=0.0, description="the map is forgotten beyond")
@@ -84,3 +94,17 @@ class MappingConfig(BaseModel):
     features: FeatureConfig = FeatureConfig()
     refinement: RefinementConfig = RefinementConfig()
     tracking: TrackingConfig = TrackingConfig()
+
+    @model_validator(mode="after")
+    def _something_is_registered(self) -> Self:
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(
+                f"min_range_m={self.min_range_m:g} must be less than max_range_m={self.max_range_m:g},"
+                " or no point is left"
+            )
+        if self.refinement.min_matches > self.keypoints:
+            raise ValueError(
+                f"refinement.min_matches={self.refinement.min_matches} must not be more than"
+                f" keypoints={self.keypoints}, or every scan is lost"
+            )
+        return self

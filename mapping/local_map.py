@@ -177,9 +177,7 @@ def _across_rings(views: FloatArray, spin_axis: FloatArray) -> FloatArray:
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None], dtype=np.float64)
 
 
-def _pull_to_bodies(
-    index: NDArray[np.intp], patches: PatchTable, across_rings: FloatArray, short_m: float
-) -> Matches:
+def _pull_to_bodies(index: NDArray[np.intp], patches: PatchTable, across_rings: FloatArray, short_m: float) -> Matches:
     """Towards the middle of the patch along those of its axes that it is short along.
 
     Where the surface goes on beyond the patch, as grass does, the patch's middle is no place on it. Across the rings,

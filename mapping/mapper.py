@@ -46,6 +46,7 @@ class MappedScan:
         fit: how it lies on the map; None when it was not held against one.
         degenerate: names of the directions along which the expected pose was kept.
         iterations: how many the registration took.
+        added: whether the scan became part of the map.
     """
 
     state: State
@@ -56,6 +57,7 @@ class MappedScan:
     fit: Fit | None = None
     degenerate: tuple[str, ...] = ()
     iterations: int = 0
+    added: bool = False
 
 
 class Mapper:
@@ -103,7 +105,7 @@ class Mapper:
         self._map = LocalMap(sampled.cell_m, self._config.radius_m)
         self._add(sampled, T_world_lidar, prediction.velocity, self._map)
         first = State(sampled.stamp, T_world_lidar, prediction.velocity, last.covariance, sampled.seen_until_s)
-        return MappedScan(first, T_world_lidar, False, Status.OK)
+        return MappedScan(first, T_world_lidar, False, Status.OK, added=True)
 
     def _lay_second(
         self, sampled: SampledScan, prior: Prior, last: State, first: SampledScan, local_map: LocalMap
@@ -116,6 +118,8 @@ class Mapper:
         carrier = self._carrier
         prediction = predict(last, sampled.stamp, prior, carrier, self._config)
         mapped = self._lay(sampled, prediction, last, local_map)
+        if sampled.stamp <= last.stamp:  # no time went by, and no velocity shows
+            return mapped
         for _ in range(_BEGINNINGS):
             way = log(inverse(last.T_world_lidar) @ mapped.state.T_world_lidar)
             way_m = float(np.linalg.norm(way[3:]) + sampled.range_m * np.linalg.norm(way[:3]))
@@ -149,7 +153,8 @@ class Mapper:
         sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
         coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
         placed = place(sweep, prediction, last, interval_s, local_map, self._config, coarse_first)
-        if placed.status(self._config) is Status.LOST:
+        doubtful = self._lost_in_a_row > 0 and not placed.is_certain
+        if doubtful or placed.status(self._config) is Status.LOST:
             found = search(sweep, prediction, last, interval_s, local_map, self._config)
             if found is None:
                 return self._miss(sampled, prediction, placed.fit)
@@ -164,15 +169,19 @@ class Mapper:
         self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined
     ) -> MappedScan:
         """A scan that lies on the map where it was expected becomes part of it."""
-        self._lost_in_a_row = 0
+        was_lost, self._lost_in_a_row = self._lost_in_a_row > 0, 0
+        interval_s = sampled.stamp - last.stamp
         correction = log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
         moved_m = float(np.linalg.norm(correction[3:]) + sampled.range_m * np.linalg.norm(correction[:3]))
         self._expected_error_m = max(_CAUTION * self._expected_error_m, moved_m)
         state = State(sampled.stamp, refined.T_world_lidar, refined.velocity, refined.covariance, sampled.seen_until_s)
         jumped = _has_jumped(correction, prediction)
-        if jumped:  # the last sweep or this one was bent by a wrong velocity: go on with the way between their poses
-            way = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, sampled.stamp - last.stamp)
+        if jumped:
+            way = np.zeros(6)  # found again: where the last scan was is not known
+            if not was_lost and interval_s > 0.0:  # one of the two sweeps was bent by a wrong velocity: go on with
+                way = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)  # the way between
             state = State.astray(sampled.stamp, refined.T_world_lidar, way)
+            self._has_velocity = False
         elif placed.status(self._config) is Status.OK:
             assert self._map is not None
             self._add(sampled, refined.T_world_lidar, refined.velocity, self._map)
@@ -186,6 +195,7 @@ class Mapper:
             fit=placed.fit,
             degenerate=refined.degeneracy.names,
             iterations=refined.iterations,
+            added=not jumped and placed.status(self._config) is Status.OK,
         )
 
     def _miss(self, sampled: SampledScan, prediction: Prediction, fit: Fit) -> MappedScan:

@@ -17,9 +17,9 @@ from mapping.refinement import Refined, Sweep, compensated, refine
 # A sweep compensated with a motion that turns out to be this different is compensated again.
 _SAME_ROTATION = np.deg2rad(0.1)
 _SAME_TRANSLATION_M = 0.01
-# A search may end anywhere, but must then have found much of what the scan sees.
+# A search may end anywhere, but most of what the scan sees must then lie on the map.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
-_OVERLAP_TO_RETURN = 0.4
+_SHARE_TO_RETURN = 0.5
 _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
 
@@ -29,6 +29,11 @@ class Placed:
 
     refined: Refined | None
     fit: Fit
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it lies on the map so well that it need not have been near there before."""
+        return self.fit.inlier_share > _SHARE_TO_RETURN
 
     def status(self, config: MappingConfig) -> Status:
         """What the fit means."""
@@ -71,7 +76,7 @@ def search(
     for start in best_starts(points, starts, local_map):
         free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
         placed = _place_once(sweep, free, last, interval_s, local_map, patient, coarse_first=True)
-        if placed.status(config) is not Status.OK or placed.fit.overlap < _OVERLAP_TO_RETURN:
+        if placed.status(config) is not Status.OK or not placed.is_certain:
             continue
         if best is None or placed.fit.inlier_share > best.fit.inlier_share:
             best = placed

@@ -102,7 +102,10 @@ def refine(
             return None
         system = _Linearised.at(T_world_lidar, points, matches, schedule.cell_m)
         times = _times(sweep, matches) if rolling else None
-        solution = _solve(system, times, prediction, T_world_lidar, velocity)
+        try:
+            solution = _solve(system, times, prediction, T_world_lidar, velocity)
+        except np.linalg.LinAlgError:  # nothing holds the pose, not even the prediction
+            return None
         T_world_lidar = T_world_lidar @ exp(solution.pose_step)
         velocity = velocity + solution.velocity_step
         if schedule.is_done_after(solution.pose_step, system.lever_m):
@@ -145,7 +148,7 @@ class _Schedule:
     def __init__(self, config: RefinementConfig, finest_m: float, coarse_first: bool) -> None:
         self._config = config
         self._finest_m = finest_m
-        self.level = len(LEVELS) - 1 if coarse_first else 0
+        self.level = len(LEVELS) - 1 if coarse_first and config.coarse_iterations else 0
         self._steps_at_level = 0
         self.iterations = 0
 
@@ -234,9 +237,9 @@ def _solve(
     pose_information = np.linalg.inv(prediction.pose_covariance)
     velocity_information = np.linalg.inv(prediction.velocity_covariance)
     JW = J * (system.weights / _CORRELATION)[:, None]
-    H, b = np.zeros((12, 12)), np.zeros(12)
-    H[:6, :6] = JW.T @ J + pose_information
-    H[6:, 6:] = velocity_information
+    matched, prior, b = np.zeros((12, 12)), np.zeros((12, 12)), np.zeros(12)
+    matched[:6, :6] = JW.T @ J
+    prior[:6, :6], prior[6:, 6:] = pose_information, velocity_information
     b[:6] = -(JW.T @ r) - (pose_information + held) @ log(inverse(prediction.T_world_lidar) @ T_world_lidar)
     b[6:] = -velocity_information @ (velocity - prediction.velocity)
     holding = np.zeros((12, 12))
@@ -244,24 +247,21 @@ def _solve(
     if times is not None:
         Jt = J * times[:, None]
         JWt = JW * times[:, None]
-        H[:6, 6:] = JW.T @ Jt
-        H[6:, :6] = H[:6, 6:].T
-        H[6:, 6:] += JWt.T @ Jt
+        matched[:6, 6:] = JW.T @ Jt
+        matched[6:, :6] = matched[:6, 6:].T
+        matched[6:, 6:] = JWt.T @ Jt
         holding[6:, 6:] = held * float(np.mean(times**2))
         b[6:] -= JWt.T @ r + holding[6:, 6:] @ (velocity - prediction.velocity)
-    step: FloatArray = np.asarray(np.linalg.solve(H + holding, b), dtype=np.float64)
-    return _Solution(step[:6], step[6:], _covariance(H, prediction, degeneracy), degeneracy)
+    step: FloatArray = np.asarray(np.linalg.solve(matched + prior + holding, b), dtype=np.float64)
+    return _Solution(step[:6], step[6:], _covariance(matched, prior, degeneracy), degeneracy)
 
 
-def _covariance(H: FloatArray, prediction: Prediction, degeneracy: Degeneracy) -> FloatArray:
-    """The inverse of the information, with the prediction's variance where that was kept."""
-    covariance: FloatArray = np.array(np.linalg.inv(H))
+def _covariance(matched: FloatArray, prior: FloatArray, degeneracy: Degeneracy) -> FloatArray:
+    """The inverse of the information; along directions that were kept, the matches' share of it does not count."""
     scale = np.array([degeneracy.lever_m] * 3 + [1.0] * 3)
-    for direction in degeneracy.directions:
-        along, measure = direction / scale, direction * scale
-        covariance[:6, :6] += float(measure @ prediction.pose_covariance @ measure) * np.outer(along, along)
-        covariance[6:, 6:] += float(measure @ prediction.velocity_covariance @ measure) * np.outer(along, along)
-    return covariance
+    D = degeneracy.directions
+    held_by_matches = np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
+    return np.asarray(np.linalg.inv(held_by_matches.T @ matched @ held_by_matches + prior), dtype=np.float64)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ Keys = NDArray[np.int64]
 Rows = NDArray[np.int32]
 
 # Three signed cell coordinates share one 64-bit key. It is linear in them: a neighbour's key is the cell's plus a
-# constant.
-_BITS = 20
+# constant. 21 bits reach 52 km at cells of 5 cm.
+_BITS = 21
 _OFFSET = 1 << (_BITS - 1)
 _STRIDES = np.array([1 << (2 * _BITS), 1 << _BITS, 1], dtype=np.int64)
 _ORIGIN = int(_OFFSET * _STRIDES.sum())

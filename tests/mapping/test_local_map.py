@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.geometry import FloatArray, exp, make_transform
 from mapping.local_map import LEVELS, LocalMap, Matches
 
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
-HERE = np.zeros(3)
+ORIGIN = np.zeros(3)
+HERE = np.eye(4)
 NO_EDGES = np.empty((0, 3))
 
 
@@ -18,7 +19,7 @@ def elevations_of(points: FloatArray) -> FloatArray:
 
 def map_of(points: FloatArray, edges: FloatArray = NO_EDGES, cell_m: float = CELL) -> LocalMap:
     local_map = LocalMap(cell_m, 100.0)
-    local_map.add(points, elevations_of(points), edges, HERE)
+    local_map.add(points, elevations_of(points), edges, ORIGIN)
     return local_map
 
 
@@ -86,9 +87,9 @@ def test_coarse_grids_reach_farther(rng: np.random.Generator, first_level: int) 
     local_map = map_of(floor_points(rng, 40_000, z=-0.01))
     cell_m = CELL * LEVELS[first_level]
     above = floor_points(rng, 100, half_size=1.0, z=0.9 * cell_m)
-    assert len(local_map.match_planes(above, np.array([0.0, 0.0, 5.0]), first_level)) == 100
+    assert len(local_map.match_planes(above, make_transform(np.eye(3), [0.0, 0.0, 5.0]), first_level)) == 100
     beyond = above + np.array([0.0, 0.0, 3.0 * CELL * LEVELS[-1]])
-    assert len(local_map.match_planes(beyond, np.array([0.0, 0.0, 9.0]), first_level)) == 0
+    assert len(local_map.match_planes(beyond, make_transform(np.eye(3), [0.0, 0.0, 9.0]), first_level)) == 0
 
 
 def test_finer_grids_are_left_out_on_request(rng: np.random.Generator) -> None:
@@ -153,7 +154,7 @@ def test_a_point_beside_a_line_is_pulled_across_it_both_ways(rng: np.random.Gene
 
 def test_edges_are_no_planes_and_planes_no_edges(rng: np.random.Generator) -> None:
     line = np.column_stack([rng.uniform(-3.0, 3.0, 600), np.zeros((600, 2))])
-    assert len(map_of(np.empty((0, 3)), edges=line).match_planes(line, np.array([0.0, 0.0, 3.0]))) == 0
+    assert len(map_of(np.empty((0, 3)), edges=line).match_planes(line, make_transform(np.eye(3), [0.0, 0.0, 3.0]))) == 0
     assert len(map_of(line).match_lines(line)) == 0
 
 
@@ -172,11 +173,11 @@ def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
 def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
     local_map = LocalMap(CELL, 20.0)
     floor = floor_points(rng, 20_000, half_size=3.0)
-    local_map.add(floor, elevations_of(floor), NO_EDGES, HERE)
+    local_map.add(floor, elevations_of(floor), NO_EDGES, ORIGIN)
     away = floor + np.array([30.0, 0.0, 0.0])
     local_map.add(away, elevations_of(floor), NO_EDGES, np.array([30.0, 0.0, 0.0]))
     assert len(local_map.match_planes(floor[:200], HERE)) == 0
-    assert len(local_map.match_planes(away[:200], np.array([30.0, 0.0, 0.0]))) == 200
+    assert len(local_map.match_planes(away[:200], make_transform(np.eye(3), [30.0, 0.0, 0.0]))) == 200
 
 
 @pytest.mark.parametrize("factor", [0.45, 0.5, 0.8, 1.5, 2.0, 2.2])
