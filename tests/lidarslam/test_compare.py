@@ -203,6 +203,7 @@ def test_one_that_hangs_is_timed_out(recording: Path, tmp_path: Path, told: Told
     assert (row.status, row.message) == ("timed out", "took more than 1 s")
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_the_method_at_work_and_writes_what_there_is(
     recording: Path, tmp_path: Path, told: Told, faults: tuple[str, ...]
 ) -> None:

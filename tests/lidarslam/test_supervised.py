@@ -81,6 +81,7 @@ def test_one_that_eats_memory_is_ended(run: Run) -> None:
     assert 150.0 < ending.peak_rss_mb < 2000.0
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interruption_is_passed_on_and_waited_for(run: Run, tmp_path: Path) -> None:
     mark = tmp_path / "written"
     code = f"""
