@@ -71,6 +71,7 @@ class Mapper:
         self._carrier = Carrier()
         self._expected_error_m = _UNKNOWN_M
         self._lost_in_a_row = 0
+        self._degraded_in_a_row = 0  # a second scan that lies badly is reason to look around
         self._first: SampledScan | None = None  # while the map is one sweep whose motion was made up
         self._has_velocity = False  # no change of velocity is seen from one that was made up
 
@@ -159,6 +160,10 @@ class Mapper:
             if found is None:
                 return self._miss(sampled, prediction, placed.fit)
             placed = found
+        elif placed.status(self._config) is Status.DEGRADED and self._degraded_in_a_row > 0:
+            placed = search(sweep, prediction, last, interval_s, local_map, self._config) or placed
+        is_degraded = placed.status(self._config) is Status.DEGRADED
+        self._degraded_in_a_row = self._degraded_in_a_row + 1 if is_degraded else 0
         assert placed.refined is not None
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
