@@ -18,7 +18,12 @@ _VIRIDIS = np.array(
 
 
 def error_colours(distances_m: FloatArray, clip_m: float = DEFAULT_CLIP_M) -> NDArray[np.uint8]:
-    """Colours (N, 3) of distances (N,): dark violet at 0, over blue and green to yellow at `clip_m` and beyond."""
+    """Colours (N, 3) of distances (N,), from the darkest at 0 to the brightest at `clip_m` and beyond."""
     level = np.clip(np.nan_to_num(distances_m, nan=clip_m, posinf=clip_m) / clip_m, 0.0, 1.0)
+    return viridis(level)
+
+
+def viridis(level: FloatArray) -> NDArray[np.uint8]:
+    """Colours (N, 3) of levels (N,): dark violet at 0, over blue and green to yellow at 1."""
     stops = np.linspace(0.0, 1.0, len(_VIRIDIS))
     return np.stack([np.interp(level, stops, column) for column in _VIRIDIS.T], axis=1).round().astype(np.uint8)

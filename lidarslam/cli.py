@@ -137,10 +137,9 @@ _reader_options = _options(
 
 def _resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
     """The configuration, with the options that have a name of their own applied last."""
-    from lidarslam.config import load_config
+    from lidarslam.config import load_config, reader_settings
 
-    named = [f"reader.{key}={_quoted(value)}" for key, value in reader.items() if value is not None]
-    return load_config(config_file, [*settings, *named])
+    return load_config(config_file, [*settings, *reader_settings(**reader)])
 
 
 def _warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
@@ -152,11 +151,6 @@ def _warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequen
         click.echo(f"lidarslam: --topic {topic} is ignored; {source} is no bag ({chosen})", err=True)
     if sequence is not None and chosen != "kitti-odometry":
         click.echo(f"lidarslam: --sequence {sequence} is ignored; {source} is no KITTI odometry ({chosen})", err=True)
-
-
-def _quoted(value: str) -> str:
-    """As YAML text, so that sequence 04 stays 04."""
-    return "'" + value.replace("'", "''") + "'"
 
 
 @main.command(epilog="lidarslam demo --out demo")

@@ -13,6 +13,7 @@ from lidarslam.benchmark_request import fill_request, make_recordings
 from lidarslam.compare import Narrator, compare
 from lidarslam.compare_request import CompareRequest, RecordingEntry
 from lidarslam.compare_text import format_comparison
+from lidarslam.config import reader_settings
 from lidarslam.core.errors import ConfigError
 from lidarslam.methods import parse_methods
 from lidarslam.progress import show_count
@@ -74,12 +75,13 @@ def _request(options: CompareOptions) -> CompareRequest:
     names = options.methods or (DEFAULT_METHODS if options.benchmark is None else None)
     if options.reuse and options.overwrite:
         raise ConfigError("--reuse keeps what --overwrite replaces; choose one")
+    reader = reader_settings(name=options.reader, topic=options.topic, sequence=options.sequence)
     return CompareRequest(
         out=options.out,
         recordings=tuple(_entry(source, options) for source in options.sources),
         methods=() if names is None else parse_methods(names),
         config_file=options.config_file,
-        settings=(*options.settings, *_reader_settings(options)),
+        settings=(*options.settings, *reader),
         limits=Limits(options.memory_limit_mb, options.timeout_s),
         overwrite=options.overwrite,
         reuse=options.reuse,
@@ -97,15 +99,6 @@ def _entry(source: Path, options: CompareOptions) -> RecordingEntry:
         reference=options.reference,
         reference_map=options.reference_map,
     )
-
-
-def _reader_settings(options: CompareOptions) -> Iterator[str]:
-    """The reader's options as settings; quoted as YAML text, so that sequence 04 stays 04."""
-    named = {"name": options.reader, "topic": options.topic, "sequence": options.sequence}
-    for key, value in named.items():
-        if value is not None:
-            quoted = value.replace("'", "''")
-            yield f"reader.{key}='{quoted}'"
 
 
 @contextmanager

@@ -61,6 +61,12 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
         raise ConfigError(_explain(error, _origin(path, settings))) from None
 
 
+def reader_settings(**options: str | None) -> list[str]:
+    """The reader's options that were given, as settings; quoted as YAML text, so that sequence 04 stays 04."""
+    quoted = {key: value.replace("'", "''") for key, value in options.items() if value is not None}
+    return [f"reader.{key}='{value}'" for key, value in quoted.items()]
+
+
 def resolved(config: Config) -> Config:
     """The configuration with what depends on other choices filled in."""
     if config.odometry.method is not None:

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.error_colours import viridis
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
 
-# Viridis at five stops: even in lightness, readable under every colour blindness.
-_PALETTE = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)
 _BACKGROUND = (255, 255, 255)
 # How far away the camera stands, in diameters of the cloud: near enough for perspective.
 _DISTANCE = 1.2
@@ -50,9 +49,7 @@ def height_colours(points: FloatArray) -> NDArray[np.uint8]:
     if not len(points):
         return np.empty((0, 3), dtype=np.uint8)
     low, high = np.percentile(points[:, 2], [2.0, 98.0])
-    level = np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0)
-    stops = np.linspace(0.0, 1.0, len(_PALETTE))
-    return np.stack([np.interp(level, stops, _PALETTE[:, c]) for c in range(3)], axis=1).astype(np.uint8)
+    return viridis(np.clip((points[:, 2] - low) / max(high - low, 1e-6), 0.0, 1.0))
 
 
 def draw(

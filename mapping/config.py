@@ -4,6 +4,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lidarslam.core.limits import require_lost_worse, require_range_left
 from mapping.feature_config import FeatureConfig
 
 
@@ -22,11 +23,7 @@ class GlobalMapConfig(BaseModel):
 
     @model_validator(mode="after")
     def _ranges_leave_something(self) -> Self:
-        if self.min_range_m >= self.max_range_m:
-            raise ValueError(
-                f"min_range_m={self.min_range_m:g} must be less than max_range_m={self.max_range_m:g},"
-                " or no point is left"
-            )
+        require_range_left(self.min_range_m, self.max_range_m)
         return self
 
 
@@ -59,10 +56,7 @@ class TrackingConfig(BaseModel):
 
     @model_validator(mode="after")
     def _lost_is_worse_than_degraded(self) -> Self:
-        if self.lost_below > self.degraded_below:
-            raise ValueError(
-                f"lost_below={self.lost_below:g} must not be more than degraded_below={self.degraded_below:g}"
-            )
+        require_lost_worse(self.lost_below, self.degraded_below)
         return self
 
 
@@ -97,11 +91,7 @@ class MappingConfig(BaseModel):
 
     @model_validator(mode="after")
     def _something_is_registered(self) -> Self:
-        if self.min_range_m >= self.max_range_m:
-            raise ValueError(
-                f"min_range_m={self.min_range_m:g} must be less than max_range_m={self.max_range_m:g},"
-                " or no point is left"
-            )
+        require_range_left(self.min_range_m, self.max_range_m)
         if self.refinement.min_matches > self.keypoints:
             raise ValueError(
                 f"refinement.min_matches={self.refinement.min_matches} must not be more than"

@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.tracking import Status
 from mapping.config import TrackingConfig
-from mapping.local_map import LocalMap, Matches
+from mapping.local_map import LocalMap
 
 # Fewer surfaces facing one way are not counted apart.
 _FEWEST_FACING = 30
@@ -58,7 +58,7 @@ def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
     matches = local_map.match_planes(world, T_world_lidar).one_each()
     if not len(matches):
         return Fit(0, 0.0, None, None)
-    distances = plane_distances(world, matches)
+    distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
     ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
     nearest = max(config.gate_min_m, config.gate_cells * local_map.cell_m)
     inlier = distances < np.maximum(nearest, config.gate_ratio * ranges)
@@ -70,9 +70,3 @@ def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
         residual_m=float(np.median(distances)),
         inlier_ratio=min(shares, default=float(inlier.mean())),
     )
-
-
-def plane_distances(world: FloatArray, matches: Matches) -> FloatArray:
-    """How far (M,) the matched points of the world are from their surfaces."""
-    offsets = world.take(matches.index, axis=0) - matches.points
-    return np.asarray(np.abs(np.einsum("ij,ij->i", offsets, matches.normals)), dtype=np.float64)

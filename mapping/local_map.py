@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from mapping.patches import PatchTable
+from mapping.patches import FEWEST_POINTS, PatchTable
 from mapping.surfel_grid import SurfelGrid
 from mapping.voxel_table import ABSENT
 
@@ -46,6 +46,10 @@ class Matches:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def residuals(self, world: FloatArray) -> FloatArray:
+        """How far (M,) the matched points, at (M, 3) of the world, lie off their surfaces, signed."""
+        return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
 
     def one_each(self) -> "Matches":
         """The first pull of every point, that across its surface."""
@@ -112,10 +116,12 @@ class LocalMap:
             occupied = np.flatnonzero(rows != ABSENT)
             patches = grid.patches(rows[occupied])
             views = there.take(occupied, axis=0) - sensor
-            chosen = np.flatnonzero(patches.is_plane & _are_resolved(patches, views))
+            ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
+            several_rings = patches.elevation_spreads * ranges > _LEAST_HEIGHT_M
+            chosen = np.flatnonzero(patches.is_plane & (several_rings | _are_faced(patches, views, ranges)))
             parts.append(_pull_to_planes(waiting[occupied[chosen]], patches.select(chosen)))
             if bodies is None:
-                body = np.flatnonzero(_are_bodies(patches, views))
+                body = np.flatnonzero(~patches.is_plane & several_rings & (patches.counts >= FEWEST_POINTS))
                 bodies = waiting[occupied[body]], patches.select(body), views.take(body, axis=0)
             still = np.ones(len(waiting), dtype=np.bool_)
             still[occupied[chosen]] = False
@@ -155,19 +161,10 @@ class LocalMap:
         return other
 
 
-def _are_resolved(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
-    """Which patches (N,), seen along `views` (N, 3), are surfaces rather than the trace of a single ring."""
-    ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
+def _are_faced(patches: PatchTable, views: FloatArray, ranges: FloatArray) -> NDArray[np.bool_]:
+    """Which patches (N,), seen along `views` (N, 3) of lengths `ranges` (N,), do not hold the rays they are seen by."""
     facing = np.abs(np.einsum("ij,ij->i", views, patches.normals))
-    resolved = (facing > _LEAST_SINE * ranges) | (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
-    return np.asarray(resolved, dtype=np.bool_)
-
-
-def _are_bodies(patches: PatchTable, views: FloatArray) -> NDArray[np.bool_]:
-    """Which patches (N,), seen along `views` (N, 3), are neither planes nor the trace of a single ring."""
-    ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
-    bodies = ~patches.is_plane & (patches.counts >= 6) & (patches.elevation_spreads * ranges > _LEAST_HEIGHT_M)
-    return np.asarray(bodies, dtype=np.bool_)
+    return np.asarray(facing > _LEAST_SINE * ranges, dtype=np.bool_)
 
 
 def _across_rings(views: FloatArray, spin_axis: FloatArray) -> FloatArray:

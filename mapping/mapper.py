@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse, log, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
@@ -71,7 +71,7 @@ class Mapper:
         self._carrier = Carrier()
         self._expected_error_m = _UNKNOWN_M
         self._lost_in_a_row = 0
-        self._degraded_in_a_row = 0  # a second scan that lies badly is reason to look around
+        self._was_degraded = False  # a second scan that lies badly is reason to look around
         self._first: SampledScan | None = None  # while the map is one sweep whose motion was made up
         self._has_velocity = False  # no change of velocity is seen from one that was made up
 
@@ -90,7 +90,7 @@ class Mapper:
             made_up = prior.velocity is None and sampled.times is not None and self._config.continuous_time
             self._first = sampled if made_up else None
         elif self._first is not None:
-            mapped = self._lay_second(sampled, prior, last, self._first, self._map)
+            mapped = self._lay_second(sampled, prior, prediction, last, self._first, self._map)
             self._first = None
         else:
             mapped = self._lay(sampled, prediction, last, self._map)
@@ -109,22 +109,21 @@ class Mapper:
         return MappedScan(first, T_world_lidar, False, Status.OK, added=True)
 
     def _lay_second(
-        self, sampled: SampledScan, prior: Prior, last: State, first: SampledScan, local_map: LocalMap
-    ) -> MappedScan:
+        self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, first: SampledScan,
+        local_map: LocalMap,
+    ) -> MappedScan:  # fmt: skip
         """Register the second scan; when the first turns out to have been moving, draw that anew, and register again.
 
         Two sweeps bent alike fit one another, and hide a motion that both have in common; the way between their poses
         does not.
         """
         carrier = self._carrier
-        prediction = predict(last, sampled.stamp, prior, carrier, self._config)
         mapped = self._lay(sampled, prediction, last, local_map)
         if sampled.stamp <= last.stamp:  # no time went by, and no velocity shows
             return mapped
         for _ in range(_BEGINNINGS):
             way = log(inverse(last.T_world_lidar) @ mapped.state.T_world_lidar)
-            way_m = float(np.linalg.norm(way[3:]) + sampled.range_m * np.linalg.norm(way[:3]))
-            if not mapped.registered or way_m < local_map.cell_m:
+            if not mapped.registered or displacement_m(way, sampled.range_m) < local_map.cell_m:
                 break
             last = self._begin_again(first, last, mapped.state)
             self._carrier, self._has_velocity = carrier, False
@@ -151,20 +150,19 @@ class Mapper:
         """Register a scan to the map; when it fits nowhere near, search; when it fits nowhere, keep it out."""
         if sampled.cell_m != local_map.cell_m:
             local_map = self._map = local_map.resized(sampled.cell_m)
-        sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
         coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
-        placed = place(sweep, prediction, last, interval_s, local_map, self._config, coarse_first)
+        placed = place(sampled, prediction, last, local_map, self._config, coarse_first)
         doubtful = self._lost_in_a_row > 0 and not placed.is_certain
-        if doubtful or placed.status(self._config) is Status.LOST:
-            found = search(sweep, prediction, last, interval_s, local_map, self._config)
+        if doubtful or placed.status is Status.LOST:
+            found = search(sampled, prediction, last, local_map, self._config)
             if found is None:
                 return self._miss(sampled, prediction, placed.fit)
             placed = found
-        elif placed.status(self._config) is Status.DEGRADED and self._degraded_in_a_row > 0:
-            placed = search(sweep, prediction, last, interval_s, local_map, self._config) or placed
-        is_degraded = placed.status(self._config) is Status.DEGRADED
-        self._degraded_in_a_row = self._degraded_in_a_row + 1 if is_degraded else 0
+        elif placed.status is Status.DEGRADED and self._was_degraded:
+            placed = search(sampled, prediction, last, local_map, self._config) or placed
+        self._was_degraded = placed.status is Status.DEGRADED
         assert placed.refined is not None
+        interval_s = sampled.stamp - last.stamp
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
         self._has_velocity = True
@@ -177,17 +175,17 @@ class Mapper:
         was_lost, self._lost_in_a_row = self._lost_in_a_row > 0, 0
         interval_s = sampled.stamp - last.stamp
         correction = log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
-        moved_m = float(np.linalg.norm(correction[3:]) + sampled.range_m * np.linalg.norm(correction[:3]))
-        self._expected_error_m = max(_CAUTION * self._expected_error_m, moved_m)
+        self._expected_error_m = max(_CAUTION * self._expected_error_m, displacement_m(correction, sampled.range_m))
         state = State(sampled.stamp, refined.T_world_lidar, refined.velocity, refined.covariance, sampled.seen_until_s)
         jumped = _has_jumped(correction, prediction)
+        added = placed.status is Status.OK and not jumped
         if jumped:
             way = np.zeros(6)  # found again: where the last scan was is not known
             if not was_lost and interval_s > 0.0:  # one of the two sweeps was bent by a wrong velocity: go on with
                 way = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)  # the way between
             state = State.astray(sampled.stamp, refined.T_world_lidar, way)
             self._has_velocity = False
-        elif placed.status(self._config) is Status.OK:
+        elif added:
             assert self._map is not None
             self._add(sampled, refined.T_world_lidar, refined.velocity, self._map)
         status, message = self._judge(placed, refined, correction, jumped)
@@ -200,7 +198,7 @@ class Mapper:
             fit=placed.fit,
             degenerate=refined.degeneracy.names,
             iterations=refined.iterations,
-            added=not jumped and placed.status(self._config) is Status.OK,
+            added=added,
         )
 
     def _miss(self, sampled: SampledScan, prediction: Prediction, fit: Fit) -> MappedScan:
@@ -220,9 +218,8 @@ class Mapper:
 
     def _judge(self, placed: Placed, refined: Refined, correction: FloatArray, jumped: bool) -> tuple[Status, str]:
         """The fit decides; one that fits far from where it was expected is degraded, and one that the prior holds."""
-        status = placed.status(self._config)
-        if status is not Status.OK:
-            return status, placed.fit.explain(self._config.tracking)
+        if placed.status is not Status.OK:
+            return placed.status, placed.fit.explain(self._config.tracking)
         if jumped:
             angle_deg, distance_m = np.rad2deg(np.linalg.norm(correction[:3])), np.linalg.norm(correction[3:])
             return Status.DEGRADED, f"{angle_deg:.0f} deg and {distance_m:.2f} m from where it was expected"

@@ -11,7 +11,8 @@ PATCH_COLUMNS = 16
 _POINT, _NORMAL, _DIRECTION, _SPREADS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _ELEVATION, _COUNT, _IS_PLANE, _IS_LINE = 12, 13, 14, 15
 
-_FEWEST_POINTS = 6
+# Fewer points show nothing.
+FEWEST_POINTS = 6
 # Spreads are standard deviations along the principal axes. A plane is thin beside its width, and no line; a line is
 # long beside its width: LOAM asks for a largest eigenvalue of three times the next.
 _MOST_THICKNESS = 0.4
@@ -53,7 +54,7 @@ class PatchTable:
         values[:, _POINT], values[:, _NORMAL], values[:, _DIRECTION] = points, normals, directions
         values[:, _SPREADS], values[:, _ELEVATION], values[:, _COUNT] = spreads_m, elevation_spreads, counts
         thickness, width, length = spreads_m.T
-        enough = counts >= _FEWEST_POINTS
+        enough = counts >= FEWEST_POINTS
         values[:, _IS_PLANE] = enough & (thickness < _MOST_THICKNESS * width) & (width > _LEAST_WIDTH * length)
         values[:, _IS_LINE] = enough & (length > _LEAST_LENGTH * width)
         return cls(values)

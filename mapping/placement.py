@@ -13,6 +13,7 @@ from mapping.local_map import LocalMap
 from mapping.prediction import Prediction, State
 from mapping.recovery import best_starts, start_poses
 from mapping.refinement import Refined, Sweep, compensated, refine
+from mapping.sampling import SampledScan
 
 # A sweep compensated with a motion that turns out to be this different is compensated again.
 _SAME_ROTATION = np.deg2rad(0.1)
@@ -29,42 +30,40 @@ class Placed:
 
     refined: Refined | None
     fit: Fit
+    status: Status
 
     @property
     def is_certain(self) -> bool:
         """Whether it lies on the map so well that it need not have been near there before."""
         return self.fit.inlier_share > _SHARE_TO_RETURN
 
-    def status(self, config: MappingConfig) -> Status:
-        """What the fit means."""
-        return Status.LOST if self.refined is None else self.fit.status(config.tracking)
-
 
 def place(
-    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig,
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
     coarse_first: bool,
 ) -> Placed:  # fmt: skip
-    """Lay a sweep on the map from where it is expected; where it does not fit there, by way of coarser cells.
+    """Lay a scan on the map from where it is expected; where it does not fit there, by way of coarser cells.
 
     Args:
-        sweep: the points.
+        sampled: the points.
         prediction: where the scan is expected.
-        last: the scan before, and `interval_s` since its stamp.
+        last: the scan before.
         local_map: what is laid on.
         config: how.
         coarse_first: whether to begin with coarser cells at once.
     """
-    placed = _place_once(sweep, prediction, last, interval_s, local_map, config, coarse_first)
-    if coarse_first or placed.status(config) is Status.OK:
+    placed = _place_once(sampled, prediction, last, local_map, config, coarse_first)
+    if coarse_first or placed.status is Status.OK:
         return placed
-    again = _place_once(sweep, prediction, last, interval_s, local_map, config, coarse_first=True)
+    again = _place_once(sampled, prediction, last, local_map, config, coarse_first=True)
     return again if again.fit.inlier_share > placed.fit.inlier_share else placed
 
 
 def search(
-    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
 ) -> Placed | None:
     """Try a scan turned all around, where it is expected and where the last one was; None when nothing fits well."""
+    sweep = sampled.sweep
     points = compensated(sweep.planes, sweep.plane_times, prediction.velocity)
     if not len(points):
         return None
@@ -75,8 +74,8 @@ def search(
     best: Placed | None = None
     for start in best_starts(points, starts, local_map):
         free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
-        placed = _place_once(sweep, free, last, interval_s, local_map, patient, coarse_first=True)
-        if placed.status(config) is not Status.OK or not placed.is_certain:
+        placed = _place_once(sampled, free, last, local_map, patient, coarse_first=True)
+        if placed.status is not Status.OK or not placed.is_certain:
             continue
         if best is None or placed.fit.inlier_share > best.fit.inlier_share:
             best = placed
@@ -84,16 +83,18 @@ def search(
 
 
 def _place_once(
-    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig,
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
     coarse_first: bool,
 ) -> Placed:  # fmt: skip
+    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
     refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
     if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
         refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
     if refined is None:
-        return Placed(None, Fit(0, 0.0, None, None))
+        return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
     points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
-    return Placed(refined, measure_fit(points, refined.T_world_lidar, local_map, config.tracking))
+    fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
+    return Placed(refined, fit, fit.status(config.tracking))
 
 
 def _with_own_motion(

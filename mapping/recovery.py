@@ -37,6 +37,5 @@ def best_starts(points: FloatArray, starts: FloatArray, local_map: LocalMap) -> 
 def _score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> float:
     world = transform_points(T_world_lidar, points)
     matches = local_map.match_planes(world, T_world_lidar, first_level=_COARSEST)
-    offsets = world.take(matches.index, axis=0) - matches.points
-    distances = np.einsum("ij,ij->i", offsets, matches.normals)
+    distances = matches.residuals(world.take(matches.index, axis=0))
     return float((1.0 / (1.0 + (distances / (_HALF_CELLS * local_map.cell_m)) ** 2)).sum())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, orthonormalize, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from mapping.config import RefinementConfig
 from mapping.degeneracy import Degeneracy, find_degeneracy
 from mapping.deskew import move
@@ -163,8 +163,8 @@ class _Schedule:
         self._steps_at_level += 1
         if self.level == 0:
             return self.iterations >= self._config.max_iterations or self._has_converged(step)
-        moved_m = float(np.linalg.norm(step[:3]) * lever_m + np.linalg.norm(step[3:]))
-        if self._steps_at_level >= self._config.coarse_iterations or moved_m < _SETTLED * self.cell_m:
+        has_settled = displacement_m(step, lever_m) < _SETTLED * self.cell_m
+        if self._steps_at_level >= self._config.coarse_iterations or has_settled:
             self.level -= 1
             self._steps_at_level = 0
         return False
@@ -189,8 +189,7 @@ class _Linearised:
     @classmethod
     def at(cls, T_world_lidar: FloatArray, points: FloatArray, matches: Matches, cell_m: float) -> "_Linearised":
         p = points.take(matches.index, axis=0)
-        offsets = transform_points(T_world_lidar, p) - matches.points
-        residuals = np.einsum("ij,ij->i", offsets, matches.normals)
+        residuals = matches.residuals(transform_points(T_world_lidar, p))
         normals = matches.normals @ T_world_lidar[:3, :3]
         lever_m = float(np.sqrt(np.einsum("ij,ij->", p, p) / max(len(p), 1)))
         return cls(

@@ -1,6 +1,7 @@
 """Which points of a scan go into the map, and which of those are registered to it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,7 @@ class SampledScan:
         """From the stamp to the last point; 0 when the scan is compensated already."""
         return 0.0 if self.times is None or not len(self) else max(0.0, float(self.times.max()))
 
-    @property
+    @cached_property
     def sweep(self) -> Sweep:
         """What is registered."""
         times = None if self.times is None else self.times.take(self.keys)

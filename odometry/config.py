@@ -4,6 +4,8 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lidarslam.core.limits import require_lost_worse, require_range_left
+
 OdometryName = Literal["kiss-icp", "constant-velocity", "external"]
 
 
@@ -26,11 +28,7 @@ class KissConfig(BaseModel):
 
     @model_validator(mode="after")
     def _ranges_leave_something(self) -> Self:
-        if self.min_range_m >= self.max_range_m:
-            raise ValueError(
-                f"min_range_m={self.min_range_m:g} must be less than max_range_m={self.max_range_m:g},"
-                " or no point is left"
-            )
+        require_range_left(self.min_range_m, self.max_range_m)
         return self
 
 
@@ -47,11 +45,7 @@ class ConsistencyConfig(BaseModel):
 
     @model_validator(mode="after")
     def _lost_is_worse_than_degraded(self) -> Self:
-        if self.lost_below > self.degraded_below:
-            raise ValueError(
-                f"lost_below={self.lost_below:g} must not exceed degraded_below={self.degraded_below:g},"
-                " as a lost scan is worse than a degraded one"
-            )
+        require_lost_worse(self.lost_below, self.degraded_below)
         return self
 
 

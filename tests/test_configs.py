@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.config import Config, dump_yaml, load_config
+from lidarslam.config import Config, dump_yaml, load_config, reader_settings
 from lidarslam.core.errors import ConfigError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -36,6 +36,12 @@ def test_what_is_dumped_loads_again_with_the_section_on_the_run(tmp_path: Path) 
     assert load_config(file) == config
 
 
+@pytest.mark.parametrize("text", ["04", "it's", "'", "null", "a: b"])
+def test_the_readers_options_stay_text(text: str) -> None:
+    config = load_config(None, reader_settings(name=None, topic=text, sequence=text))
+    assert (config.reader.name, config.reader.topic, config.reader.sequence) == (None, text, text)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -58,6 +64,8 @@ def test_what_is_dumped_loads_again_with_the_section_on_the_run(tmp_path: Path) 
             r"kiss_icp: min_range_m=6 must be less",
         ),
         (["odometry.consistency.lost_below=0.8"], r"consistency: lost_below=0\.8 must not exceed degraded_below=0\.7,"),
+        (["mapping.tracking.lost_below=0.8"], r"tracking: lost_below=0\.8 must not exceed degraded_below=0\.6,"),
+        (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),
     ],
 )
 def test_mistakes_are_named(settings: list[str], message: str) -> None:

@@ -93,6 +93,11 @@ def log(T: FloatArray) -> FloatArray:
     return np.concatenate([omega, (V_inv @ T[..., :3, 3:4])[..., 0]], axis=-1)
 
 
+def displacement_m(xi: FloatArray, range_m: float) -> float:
+    """How far, at most, a motion (6,) moves a point at this range."""
+    return float(np.linalg.norm(xi[3:]) + range_m * np.linalg.norm(xi[:3]))
+
+
 def interpolate(T_w_a: FloatArray, T_w_b: FloatArray, fraction: ArrayLike) -> FloatArray:
     """Move from `T_w_a` (fraction 0) to `T_w_b` (fraction 1) at constant body velocity; other fractions extrapolate.
 

@@ -172,3 +172,12 @@ def test_orthonormalize_returns_the_nearest_rotation(rng):
     np.testing.assert_allclose(mended, T, atol=2e-4)
     distance = np.linalg.norm(mended - rounded, axis=(1, 2))
     assert (distance <= np.linalg.norm(T - rounded, axis=(1, 2)) + 1e-12).all()
+
+
+def test_displacement_bounds_how_far_points_move_and_is_reached(rng):
+    xi = np.array([0.0, 0.0, 1e-4, 0.0, 0.02, 0.0])  # turning about z, moving the way the turn takes points on x
+    directions = rng.normal(size=(200, 3))
+    points = 7.0 * np.vstack([directions / np.linalg.norm(directions, axis=1)[:, None], [[1.0, 0.0, 0.0]]])
+    moved_m = np.linalg.norm(g.transform_points(g.exp(xi), points) - points, axis=1)
+    assert g.displacement_m(xi, 7.0) == pytest.approx(0.0207)
+    assert moved_m.max() == pytest.approx(0.0207, rel=1e-6)

@@ -1,0 +1,18 @@
+"""Limits among settings that must be in order; a breach is a ValueError that names both."""
+
+
+def require_range_left(min_range_m: float, max_range_m: float) -> None:
+    """The nearest range that counts must be less than the farthest."""
+    if min_range_m >= max_range_m:
+        raise ValueError(
+            f"min_range_m={min_range_m:g} must be less than max_range_m={max_range_m:g}, or no point is left"
+        )
+
+
+def require_lost_worse(lost_below: float, degraded_below: float) -> None:
+    """What is lost must not lie above what is degraded."""
+    if lost_below > degraded_below:
+        raise ValueError(
+            f"lost_below={lost_below:g} must not exceed degraded_below={degraded_below:g},"
+            " as a lost scan is worse than a degraded one"
+        )
