@@ -1,0 +1,21 @@
+"""Settings of the alignment of range images; light, so that reading a configuration imports no torch."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class AlignmentConfig(BaseModel):
+    """How images are laid on one another; see `odometry.alignment`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    iterations: int = Field(8, ge=0, description="Gauss-Newton steps at most; 0: the guess is the answer")
+    anneal_share: float = Field(0.5, gt=0.0, le=1.0, description="part of them in which the scale shrinks")
+    column_step: int = Field(2, ge=1, description="every so-manieth column's points take part")
+    coarse_m: float = Field(0.5, gt=0.0, description="scale of the robust weights in the first step")
+    fine_m: float = Field(0.05, gt=0.0, description="and in the last ones")
+    gate_m: float = Field(0.2, gt=0.0, description="distance of a point from its pixel's, at the sensor")
+    gate_share: float = Field(0.02, ge=0.0, description="what each metre of range adds to it")
+    least_cosine: float = Field(0.8, ge=-1.0, le=1.0, description="between the normals of a pair")
+    residual_m: float = Field(0.03, gt=0.0, description="standard deviation of points about their planes")
+    independent_share: float = Field(0.05, gt=0.0, le=1.0, description="of the points whose errors are independent")
+    largest_step: float = Field(0.3, gt=0.0, description="of one Gauss-Newton step, radians and metres")

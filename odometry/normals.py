@@ -1,0 +1,118 @@
+"""Surface normals of range images: planes fitted to each pixel's neighbourhood."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from odometry.normal_config import NormalConfig
+
+# A neighbourhood that is narrower than this share of its range is narrower than the rounding of its coordinates.
+_NARROWEST = 1e-5
+# Range noise spreads the points of a single ring over a plane that holds the rays themselves. Such a plane, 2.3
+# degrees or less from the ray, says nothing of the surface, and which of its sides faces the sensor is chance.
+_MOST_GRAZING = 0.04
+_TINY = 1e-30
+
+
+@torch.no_grad()
+def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
+    """Unit normals (B, 3, H, W) float32 that face the sensor, zero where the neighbourhood is no plane.
+
+    A principal component analysis of the points around each pixel whose ranges are close to its own, as in DeLORA
+    (Nubert et al. 2021). Neighbourhoods go on across the seam of azimuth; above and below the image nothing is.
+    No gradient flows through them.
+
+    Args:
+        images: (B, C, H, W), C at least 4: x, y, z and range in metres in the sensor's frame, zero where empty.
+        config: which neighbours count, and which neighbourhoods are planes.
+
+    Raises:
+        ValueError: images have another shape, or are narrower than the neighbourhood.
+    """
+    if images.ndim != 4 or images.shape[1] < 4:
+        raise ValueError(f"images must be (B, at least 4, H, W), got {tuple(images.shape)}")
+    if images.shape[3] < 2 * config.columns + 1:
+        raise ValueError(f"images of {images.shape[3]} columns are narrower than the neighbourhood")
+    images = images[:, :4].float()
+    count, covariance = _scatter(images, config)
+    size = covariance[0] + covariance[1] + covariance[2]
+    scaled = covariance / size.clamp(min=_TINY)
+    smallest, middle, largest = _eigenvalues(scaled)
+    normals = _null_vector(scaled, smallest)
+    planar = (smallest <= config.max_flatness * middle) & (middle >= config.min_spread * largest)
+    planar &= middle * size > count * (_NARROWEST * images[:, 3]).square()
+    planar &= (count >= config.min_neighbours) & (images[:, 3] > 0.0)
+    away = (normals * images[:, :3]).sum(dim=1)
+    planar &= away.abs() >= _MOST_GRAZING * images[:, 3]
+    return normals * torch.where(planar, -away.sign(), 0.0)[:, None]
+
+
+def _scatter(images: Tensor, config: NormalConfig) -> tuple[Tensor, Tensor]:
+    """Numbers of neighbours (B, H, W) and their scatter matrices (6, B, H, W): xx, yy, zz, xy, yz, xz about the mean.
+
+    Sums are of differences to the pixel itself: coordinates of tens of metres would leave no digits to float32.
+    """
+    height, width = images.shape[2:]
+    # (4, B, H, W), as all below treats channels alike
+    centre = images.transpose(0, 1).contiguous()
+    padded = functional.pad(images, (config.columns, config.columns, 0, 0), mode="circular")
+    padded = functional.pad(padded, (0, 0, config.rows, config.rows)).transpose(0, 1).contiguous()
+    # Nothing is near to infinity, so one comparison tests both the gate and whether there is a neighbour.
+    padded[3].masked_fill_(padded[3] <= 0.0, math.inf)
+    count = torch.zeros_like(centre[3])
+    sums, products = torch.zeros_like(centre[:3]), centre.new_zeros(6, *centre.shape[1:])
+    for down in range(2 * config.rows + 1):
+        for right in range(2 * config.columns + 1):
+            around = padded[:, :, down : down + height, right : right + width]
+            near = ((around[3] - centre[3]).abs_() <= config.gate_m).float()
+            offset = (around[:3] - centre[:3]).mul_(near)
+            count += near
+            sums += offset
+            products[:3].addcmul_(offset, offset)
+            products[3:5].addcmul_(offset[:2], offset[1:])
+            products[5].addcmul_(offset[0], offset[2])
+    mean = sums / count.clamp(min=1.0)
+    products[:3].addcmul_(sums, mean, value=-1.0)
+    products[3:5].addcmul_(sums[:2], mean[1:], value=-1.0)
+    products[5].addcmul_(sums[0], mean[2], value=-1.0)
+    return count, products
+
+
+def _eigenvalues(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Eigenvalues (...), ascending, of symmetric matrices (6, ...) of trace 1 or 0: xx, yy, zz, xy, yz, xz.
+
+    Smith, "Eigenvalues of a symmetric 3 x 3 matrix", 1961. Where the two larger ones are nearly equal their
+    difference is inexact, but not the smallest.
+    """
+    third = (matrices[0] + matrices[1] + matrices[2]) / 3.0
+    xx, yy, zz = (matrices[:3] - third).unbind()
+    xy, yz, xz = matrices[3:].unbind()
+    squares = xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + yz * yz + xz * xz)
+    radius = (squares / 6.0).sqrt()
+    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    cosine = determinant / (2.0 * radius.clamp(min=1e-9) ** 3)
+    angle = cosine.clamp(-1.0, 1.0).acos() / 3.0
+    largest = third + 2.0 * radius * angle.cos()
+    smallest = third + 2.0 * radius * (angle + 2.0 * math.pi / 3.0).cos()
+    return smallest, 3.0 * third - largest - smallest, largest
+
+
+def _null_vector(matrices: Tensor, eigenvalue: Tensor) -> Tensor:
+    """Unit vectors (B, 3, H, W) to an eigenvalue (B, H, W) of symmetric matrices (6, B, H, W); zero if it is double.
+
+    The rows of A - eigenvalue I are all at right angles to it, so it is the cross product of any two; the longest
+    of the three products is the most exact.
+    """
+    xx, yy, zz = (matrices[:3] - eigenvalue).unbind()
+    xy, yz, xz = matrices[3:].unbind()
+    # The three products are the columns of the adjugate, which is symmetric and of rank one.
+    off_xy, off_yz, off_xz = xz * yz - xy * zz, xy * xz - xx * yz, xy * yz - xz * yy
+    first = torch.stack([yy * zz - yz * yz, off_xy, off_xz], dim=1)
+    second = torch.stack([off_xy, xx * zz - xz * xz, off_yz], dim=1)
+    third = torch.stack([off_xz, off_yz, xx * yy - xy * xy], dim=1)
+    best = torch.where((first[:, 0] >= second[:, 1])[:, None], first, second)
+    best_on_diagonal = torch.maximum(first[:, 0], second[:, 1])
+    best = torch.where((best_on_diagonal >= third[:, 2])[:, None], best, third)
+    return best / best.square().sum(dim=1, keepdim=True).sqrt().clamp(min=_TINY)

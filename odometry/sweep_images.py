@@ -1,0 +1,56 @@
+"""From scans to the images that network and alignment work on."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lidarslam.core.scan import Scan
+from odometry.alignment import SweepImages
+from odometry.image_config import ImageConfig
+from odometry.normals import surface_normals
+from odometry.projection import ImageGrid, project
+
+
+class Imager:
+    """Makes images of one sensor's scans; the rows' elevations are those of the first scan that has points."""
+
+    def __init__(self, config: ImageConfig, device: torch.device | str = "cpu") -> None:
+        self._config = config
+        self._device = torch.device(device)
+        self._grid: ImageGrid | None = None
+
+    def images(self, scans: Sequence[Scan]) -> SweepImages:
+        """The scans as images, normals included."""
+        made = [self._image(scan) for scan in scans]
+        images = torch.stack([image for image, _ in made])  # (B, 4, H, W)
+        normals = surface_normals(images, self._config.normals)
+        grid = self._grid_of(torch.zeros(0, 3))
+        low, high = (images.new_full((len(made),), limit) for limit in (grid.elevation_low, grid.elevation_high))
+        return SweepImages(
+            images[:, :3].contiguous(), normals, torch.stack([offsets for _, offsets in made]), low, high
+        )
+
+    def _image(self, scan: Scan) -> tuple[Tensor, Tensor]:
+        """Range image (4, H, W) and seconds from the middle of the sweep (H, W)."""
+        points = torch.from_numpy(scan.points).to(self._device, torch.float32)
+        if len(points) and self._grid is None:
+            self._grid = self._grid_of(points)
+        by_ring = self._config.order == "ring" and scan.rings is not None
+        rings = torch.from_numpy(scan.rings).to(self._device) if by_ring and scan.rings is not None else None
+        projection = project(points, self._grid_of(points), rings=rings)
+        index = projection.index[0]
+        if scan.time_offsets is None or not len(scan):
+            return projection.images[0], points.new_zeros(index.shape)
+        offsets = torch.from_numpy(scan.time_offsets - middle_offset_s(scan)).to(self._device, torch.float32)
+        return projection.images[0], torch.where(index >= 0, offsets[index.clamp(min=0)], 0.0)
+
+    def _grid_of(self, points: Tensor) -> ImageGrid:
+        return self._grid or ImageGrid.around(points, self._config.rows, self._config.columns)
+
+
+def middle_offset_s(scan: Scan) -> float:
+    """Seconds from a scan's stamp to the middle of its sweep; 0 where points have no times."""
+    if scan.time_offsets is None or not len(scan):
+        return 0.0
+    return float(0.5 * (scan.time_offsets.min() + scan.time_offsets.max()))

@@ -1,0 +1,105 @@
+"""Training of a network, one step after another; whoever calls it chooses devices, writes files and draws curves."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor, nn
+
+from odometry.networks import PairNetwork
+from odometry.objective import Objective, motion_error, objective
+from odometry.pairs import PairBatch, pair_of
+from odometry.preparation import PreparedRecording
+from odometry.training_config import TrainingConfig
+
+_LEAST_RATE = 0.01  # of the learning rate, at the end
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How far a network is from the motions that alignment found on recordings it does not learn from.
+
+    Attributes:
+        rotation_rms_deg, translation_rms_m: over all believed pairs.
+        rotation_median_deg, translation_median_m: likewise.
+        covered_percent: of the errors that lie within one, two and three standard deviations.
+        pairs: how many.
+    """
+
+    rotation_rms_deg: float
+    translation_rms_m: float
+    rotation_median_deg: float
+    translation_median_m: float
+    covered_percent: tuple[float, float, float]
+    pairs: int
+
+
+def learning_rate(step: int, config: TrainingConfig) -> float:
+    """Rises linearly, then falls along half a cosine."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+
+def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
+    """AdamW; biases, scales and the like are not decayed."""
+    decayed = [p for p in network.parameters() if p.ndim > 1]
+    others = [p for p in network.parameters() if p.ndim <= 1]
+    groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.98))
+
+
+def loss_of(network: PairNetwork, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
+    """The loss of a network on a batch; both scans go through the encoder together."""
+    images = torch.cat([batch.previous, batch.current])
+    features = network.encode(images[:, :3], images[:, 3:])
+    estimate = network(*features.chunk(2))
+    return objective(estimate, batch, config, generator)
+
+
+@torch.no_grad()
+def validate(
+    network: PairNetwork, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
+) -> Validation:
+    """Every pair of consecutive scans, as it is."""
+    errors, sigmas = [], []
+    for recording in recordings:
+        error, sigma = _errors(network, recording, gap, device or torch.device("cpu"))
+        errors.append(error)
+        sigmas.append(sigma)
+    return summarise(torch.cat(errors), torch.cat(sigmas))
+
+
+def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
+    """Statistics of errors (N, 6) with standard deviations (N, 6)."""
+    rotation = torch.rad2deg(errors[:, :3].norm(dim=1))
+    translation = errors[:, 3:].norm(dim=1)
+    covered = [100.0 * float((errors.abs() <= k * sigmas).float().mean()) for k in (1, 2, 3)]
+    return Validation(
+        _rms(rotation), _rms(translation), float(rotation.median()), float(translation.median()),
+        (covered[0], covered[1], covered[2]), len(errors),
+    )  # fmt: skip
+
+
+def _errors(
+    network: PairNetwork, recording: PreparedRecording, gap: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    images = recording.images
+    features = torch.cat(
+        [
+            network.encode(points.to(device), normals.float().to(device))
+            for points, normals in zip(images.points.split(16), images.normals.split(16), strict=True)
+        ]
+    )
+    count = len(features) - gap
+    estimate = network(features[:count], features[gap:])
+    pairs = [pair_of(recording, first, first + gap, surfaces=False) for first in range(count)]
+    target = torch.cat([pair.T_prev_curr for pair in pairs]).to(device)
+    believed = torch.cat([pair.believed for pair in pairs]).to(device)
+    return motion_error(estimate.T_prev_curr, target)[believed].cpu(), estimate.log_sigma.exp()[believed].cpu()
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())

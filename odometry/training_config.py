@@ -1,0 +1,67 @@
+"""Settings of training; light, so that reading a configuration imports no torch."""
+
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from odometry.image_config import ImageConfig
+from odometry.loss_config import LossConfig
+from odometry.network_config import NetworkConfig
+
+Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
+
+
+class AugmentationConfig(BaseModel):
+    """How pairs are changed so that none is seen twice; probabilities unless said otherwise. See `odometry.pairs`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    max_gap: int = Field(3, ge=1, description="scans between the two of a pair, 1 to this many")
+    reverse: float = Field(0.5, ge=0.0, le=1.0, description="the later scan comes first")
+    roll: float = Field(0.8, ge=0.0, le=1.0, description="the current scan is turned about z by whole columns")
+    roll_deg: float = Field(12.0, ge=0.0, description="standard deviation of most of these turns")
+    any_roll: float = Field(
+        0.2, ge=0.0, le=1.0, description="the others, by any angle; a part of those that are turned"
+    )
+    mirror: float = Field(0.5, ge=0.0, le=1.0)
+    scale: float = Field(0.3, ge=0.0, lt=1.0, description="both scans grow or shrink by up to this part")
+    drop_beams: float = Field(0.3, ge=0.0, le=1.0, description="up to half of the rows are emptied")
+    drop_points: float = Field(0.2, ge=0.0, lt=1.0, description="up to this part of the points, of each scan anew")
+    hide_sector: float = Field(0.2, ge=0.0, le=1.0, description="up to a quarter of the turn is emptied in one scan")
+    range_noise_m: float = Field(0.02, ge=0.0, description="greatest standard deviation of noise on the ranges")
+
+
+class TrainingConfig(BaseModel):
+    """What is trained, on what, and for how long; see `odometry.training`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    network: NetworkConfig = NetworkConfig()
+    images: ImageConfig = ImageConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
+    geometric: LossConfig | None = Field(LossConfig(), description="the paper's losses; null: none")
+    geometric_weight: float = Field(1.0, ge=0.0)
+    geometric_points: int = Field(1024, ge=64, description="points of each scan that are looked up in the other")
+    alignment_weight: float = Field(1.0, ge=0.0, description="of the distance to the motion that alignment finds")
+    steps: int = Field(12_000, ge=1)
+    batch: int = Field(16, ge=1, description="pairs a step, of each process")
+    learning_rate: float = Field(1e-3, gt=0.0)
+    warmup_steps: int = Field(300, ge=0)
+    weight_decay: float = Field(1e-3, ge=0.0)
+    clip_gradient: float = Field(1.0, gt=0.0)
+    precision: Precision = "32-true"
+    seed: int = Field(0, ge=0)
+    hold_out: float = Field(0.1, ge=0.0, lt=1.0, description="part of the recordings that is kept for validation")
+    log_every: int = Field(50, ge=1)
+    validate_every: int = Field(500, ge=1)
+
+    @model_validator(mode="after")
+    def _something_is_minimised(self) -> Self:
+        if not self.alignment_weight and (self.geometric is None or not self.geometric_weight):
+            raise ValueError("geometric and alignment_weight are both off, which leaves no loss")
+        if self.network.correlation.rows != self.images.rows:
+            raise ValueError(
+                f"network.correlation.rows={self.network.correlation.rows} and images.rows={self.images.rows}"
+                " must be the same"
+            )
+        return self

@@ -1,0 +1,276 @@
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from odometry.loss_config import LossConfig
+from odometry.losses import Matched, Surfaces, geometric_loss, match, plane_to_plane, point_to_plane
+from odometry.projection import ImageGrid, project
+from odometry.torch_geometry import exp, inverse, log, rotate, transform_points
+
+EYE = torch.eye(4, dtype=torch.float64)[None]
+XI = torch.tensor([0.03, -0.04, 0.05, 0.12, -0.1, 0.08], dtype=torch.float64)
+PLAIN = LossConfig(gate_m=None, robust_m=None)
+
+
+def _room(batch: int = 1, count: int = 600, seed: int = 0) -> Surfaces:
+    """Points on the six sides of a box of 8 x 6 x 3 m around the origin, with normals inwards."""
+    g = torch.Generator().manual_seed(seed)
+    half = torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64)
+    points = (2.0 * torch.rand(batch, count, 3, generator=g, dtype=torch.float64) - 1.0) * half
+    side = torch.arange(count) % 6
+    axis, sign = (side % 3).expand(batch, -1)[..., None], torch.where(side < 3, 1.0, -1.0).double()
+    points.scatter_(2, axis, (sign[:, None] * half[side % 3][:, None]).expand(batch, -1, 1))
+    normals = torch.zeros_like(points).scatter_(2, axis, -sign[:, None].expand(batch, -1, 1))
+    return Surfaces(points, normals, torch.ones(batch, count, dtype=torch.bool))
+
+
+def _moved(surfaces: Surfaces, T: Tensor) -> Surfaces:
+    return Surfaces(transform_points(T, surfaces.points), rotate(T, surfaces.normals), surfaces.valid)
+
+
+def _select(surfaces: Surfaces, item: int) -> Surfaces:
+    return Surfaces(*(getattr(surfaces, f.name)[item, None] for f in fields(Surfaces)))
+
+
+def _floor(height: float) -> Surfaces:
+    x, y = torch.meshgrid(torch.arange(10.0).double(), torch.arange(10.0).double(), indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten(), torch.full((100,), height)], dim=-1)[None]
+    return Surfaces(
+        points, torch.tensor([0.0, 0.0, 1.0]).double().expand(1, 100, 3), torch.ones(1, 100, dtype=torch.bool)
+    )
+
+
+CONFIGS = pytest.mark.parametrize(
+    "config",
+    [
+        LossConfig(),
+        LossConfig.paper(),
+        LossConfig(plane_norm="linear"),
+        LossConfig(symmetric=True),
+        LossConfig(plane_to_plane=False),
+        LossConfig(point_to_plane=False),
+    ],
+)
+
+
+@CONFIGS
+def test_zero_at_the_truth_and_growing_away_from_it(config: LossConfig) -> None:
+    target, T_true = _room(), exp(XI)[None]
+    source = _moved(target, inverse(T_true))
+    at_truth = geometric_loss(T_true, source, target, config)
+    assert at_truth.total.item() == pytest.approx(0.0, abs=1e-12)
+    assert at_truth.matched_share.item() == 1.0
+    axis = torch.tensor([0.5, -0.3, 0.8, 0.4, 0.2, -0.6], dtype=torch.float64)
+    steps = (0.01, 0.03, 0.06, 0.1)
+    losses = [geometric_loss(T_true @ exp(s * axis), source, target, config).total.item() for s in steps]
+    assert losses[0] > 1e-6
+    assert losses == sorted(losses)
+
+
+@pytest.mark.parametrize("displacement", [0.02, -0.05, 0.3])
+def test_displaced_plane(displacement: float) -> None:
+    d, source, target = abs(displacement), _floor(displacement), _floor(0.0)
+    squared = geometric_loss(EYE, source, target, PLAIN)
+    assert squared.point_to_plane.item() == pytest.approx(d**2, abs=1e-12)
+    assert squared.plane_to_plane.item() == 0.0
+    weighted = geometric_loss(EYE, source, target, LossConfig(robust_m=None, point_to_plane_weight=7.0))
+    assert weighted.total.item() == pytest.approx(7.0 * d**2, abs=1e-12)
+    robust = geometric_loss(EYE, source, target, LossConfig(robust_m=0.1)).point_to_plane.item()
+    assert robust == pytest.approx(d**2 if d < 0.1 else 2 * 0.1 * d - 0.1**2, abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.1, 1.0, 3.0])
+def test_turned_normals(angle: float) -> None:
+    target = _floor(0.0)
+    turn = exp(torch.tensor([angle, 0, 0, 0, 0, 0]).double())[None]
+    source = replace(target, normals=rotate(turn, target.normals))
+    assert geometric_loss(EYE, source, target, PLAIN).total.item() == pytest.approx(2 - 2 * np.cos(angle), abs=1e-7)
+    linear = LossConfig(plane_norm="linear")
+    assert geometric_loss(EYE, source, target, linear).total.item() == pytest.approx(2 * np.sin(angle / 2), abs=2e-3)
+
+
+def test_paper_settings_are_the_papers_formulas() -> None:
+    rng = np.random.default_rng(9)
+    S, M = rng.normal(size=(80, 3)) * 5, rng.normal(size=(100, 3)) * 5
+    N_s, N_m = (rng.normal(size=(count, 3)) for count in (80, 100))
+    N_s, N_m = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (N_s, N_m))
+    has_s, has_m = rng.random(80) < 0.7, rng.random(100) < 0.6
+    T = exp(XI).numpy()
+    # The paper, line by line: move, look for the nearest of all points, omit pairs in which a normal is missing.
+    s_hat, n_hat = S @ T[:3, :3].T + T[:3, 3], N_s @ T[:3, :3].T
+    _, found = cKDTree(M).query(s_hat)
+    pairs = [(i, j) for i, j in enumerate(found) if has_s[i] and has_m[j]]
+    p2n = sum(np.dot(s_hat[i] - M[j], N_m[j]) ** 2 for i, j in pairs) / len(pairs)
+    n2n = sum(np.sum((n_hat[i] - N_m[j]) ** 2) for i, j in pairs) / len(pairs)
+
+    source, target = (Surfaces(*(torch.tensor(x)[None] for x in cloud)) for cloud in ((S, N_s, has_s), (M, N_m, has_m)))
+    loss = geometric_loss(exp(XI)[None], source, target, LossConfig.paper())
+    assert loss.point_to_plane.item() == pytest.approx(p2n, rel=1e-12)
+    assert loss.plane_to_plane.item() == pytest.approx(n2n, rel=1e-12)
+    assert loss.total.item() == pytest.approx(1.0 * p2n + n2n, rel=1e-12)
+    assert loss.matched_share.item() == pytest.approx(len(pairs) / has_s.sum())
+
+
+def test_target_points_without_a_normal_are_candidates_or_not() -> None:
+    source, target = _floor(0.1), _floor(0.0)
+    target.valid[0, 50:] = False
+    passed = match(EYE, source, target, LossConfig(gate_m=None))
+    assert passed.weight.all()
+    assert (passed.target_points[0, 55] == target.points[0, 45]).all()
+    omitted = match(EYE, source, target, LossConfig(gate_m=None, candidates="all"))
+    assert torch.equal(omitted.weight[0] > 0, torch.arange(100) < 50)
+    assert omitted.share.item() == 0.5
+
+
+def test_pixels_without_a_point_are_never_candidates() -> None:
+    source, target = _floor(1.0), _floor(1.0)
+    source.points[0, 0] = 0.01
+    target.points[0, 0], target.valid[0, 0] = 0.0, False
+    matched = match(EYE, source, target, LossConfig.paper())
+    assert matched.weight[0, 0] == 1.0
+    assert (matched.target_points[0, 0] != 0).any()
+
+
+def test_source_points_without_a_normal_are_left_out() -> None:
+    source, target = _floor(0.05), _floor(0.0)
+    source.points[0, :30, 2] = 0.9  # within the gate
+    source.valid[0, :30] = False
+    loss = geometric_loss(EYE, source, target, PLAIN)
+    assert loss.point_to_plane.item() == pytest.approx(0.05**2, abs=1e-12)
+    assert loss.matched_share.item() == 1.0
+
+
+def test_gate_leaves_out() -> None:
+    source, target = _floor(0.2), _floor(0.0)
+    source.points[0, :25, 2] = 0.7
+    open_loss = geometric_loss(EYE, source, target, PLAIN)
+    assert open_loss.point_to_plane.item() == pytest.approx(0.25 * 0.49 + 0.75 * 0.04)
+    gated = geometric_loss(EYE, source, target, LossConfig(gate_m=0.6, robust_m=None))
+    assert gated.point_to_plane.item() == pytest.approx(0.04)
+    assert gated.matched_share.item() == 0.75
+
+
+def test_normals_are_turned_and_not_shifted() -> None:
+    room = _room()
+    shift = EYE.clone()
+    shift[0, :3, 3] = torch.tensor([0.2, 0.3, -0.4])
+    matched = match(shift, room, room, PLAIN)
+    assert torch.equal(matched.source_normals, room.normals)
+    torch.testing.assert_close(matched.source_points, room.points + shift[0, :3, 3])
+    T = exp(XI)[None]
+    turned = match(T, room, room, PLAIN).source_normals
+    torch.testing.assert_close(turned[0, 7], T[0, :3, :3] @ room.normals[0, 7])
+
+
+@pytest.mark.parametrize("config", [LossConfig(), LossConfig(symmetric=True, gate_m=None, plane_norm="linear")])
+def test_descent_finds_the_motion(config: LossConfig) -> None:
+    target, T_true = _room(count=300), exp(XI)[None]
+    source = _moved(target, inverse(T_true))
+    xi = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([xi], lr=0.02)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.95)
+    for _ in range(160):
+        optimizer.zero_grad()
+        geometric_loss(exp(xi), source, target, config).total.sum().backward()
+        optimizer.step()
+        schedule.step()
+    error = log(inverse(T_true) @ exp(xi.detach())).abs().max().item()
+    assert XI.abs().max().item() > 0.1
+    assert error < 1e-3
+
+
+@pytest.mark.parametrize("config", [LossConfig(robust_m=None), LossConfig(), LossConfig(symmetric=True)])
+def test_gradient_agrees_with_finite_differences(config: LossConfig) -> None:
+    """While the correspondences stay, the loss is smooth, and its gradient that of the moved points and normals."""
+    target = _room(count=60)
+    source = _moved(target, inverse(exp(XI)[None]))
+    xi = (0.9 * XI)[None].requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: geometric_loss(exp(x), source, target, config).total, (xi,), atol=1e-6)
+
+
+@CONFIGS
+def test_items_of_a_batch_do_not_see_each_other(config: LossConfig) -> None:
+    target = _room(batch=3)
+    target.valid[1, ::2] = False
+    T_true = exp(torch.stack([XI, -XI, 2 * XI]))
+    source = _moved(target, inverse(T_true))
+    source.valid[2, ::3] = False
+    T = exp(torch.stack([0.5 * XI, 0.0 * XI, 1.5 * XI]))
+    together = geometric_loss(T, source, target, config)
+    for item in range(3):
+        alone = geometric_loss(T[item, None], _select(source, item), _select(target, item), config)
+        for name in ("total", "point_to_plane", "plane_to_plane", "matched_share"):
+            torch.testing.assert_close(getattr(together, name)[item, None], getattr(alone, name))
+    assert len(set(together.total.tolist())) == 3
+
+
+@CONFIGS
+def test_item_without_matches_is_zero_with_no_gradient(config: LossConfig) -> None:
+    target = _room(batch=2)
+    source = _moved(target, inverse(exp(XI)[None]))
+    target.valid[1] = False
+    xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
+    loss = geometric_loss(exp(xi), source, target, config)
+    assert loss.total[1] == loss.matched_share[1] == 0.0
+    (grad,) = torch.autograd.grad(loss.total.sum(), xi)
+    assert (grad[1] == 0).all()
+    assert grad[0].abs().min() > 1e-5
+    nothing = replace(source, valid=torch.zeros_like(source.valid))
+    assert (geometric_loss(exp(xi), nothing, target, config).matched_share == 0).all()
+
+
+def test_symmetric_is_the_mean_of_both_ways() -> None:
+    target, source = _room(seed=1, count=200), _room(seed=2, count=150)
+    T = exp(XI)[None]
+    one = geometric_loss(T, source, target, LossConfig())
+    other = geometric_loss(inverse(T), target, source, LossConfig())
+    both = geometric_loss(T, source, target, LossConfig(symmetric=True))
+    assert one.total.item() != pytest.approx(other.total.item(), rel=1e-3)
+    for name in ("total", "point_to_plane", "plane_to_plane", "matched_share"):
+        torch.testing.assert_close(getattr(both, name), 0.5 * (getattr(one, name) + getattr(other, name)))
+
+
+def test_by_projection_is_zero_at_the_truth_and_needs_its_grid() -> None:
+    config = LossConfig(correspondence="projection")
+    grid, room = ImageGrid(16, 64, -0.5, 0.5), _room(count=3000)
+    projection = project(room.points[0], grid)
+    index = projection.index.flatten()
+    shown, taken = index >= 0, index.clamp(min=0)
+    points, normals = (torch.where(shown[:, None], x[:, taken], 0.0) for x in (room.points, room.normals))
+    target = Surfaces(points, normals, shown[None])
+    T_true = exp(0.1 * XI)[None]
+    source = _moved(target, inverse(T_true))
+    assert geometric_loss(T_true, source, target, config, grid).matched_share.item() > 0.99
+    assert geometric_loss(T_true, source, target, config, grid).total.item() < 1e-3
+    away = geometric_loss(EYE, source, target, config, grid)
+    assert away.total.item() > geometric_loss(T_true, source, target, config, grid).total.item()
+    for wrong in (None, ImageGrid(8, 64, -0.5, 0.5)):
+        with pytest.raises(ValueError, match="need the grid"):
+            geometric_loss(T_true, source, target, config, wrong)
+
+
+def test_losses_of_pairs_are_weighted_means() -> None:
+    zero, up = torch.zeros(1, 3, 3), torch.tensor([0.0, 0.0, 1.0]).expand(1, 3, 3)
+    points = torch.tensor([[[5.0, 5.0, 1.0], [0.0, 0.0, 3.0], [0.0, 0.0, 100.0]]])
+    matched = Matched(points, -up, zero, up, torch.tensor([[1.0, 1.0, 0.0]]), torch.ones(1))
+    assert point_to_plane(matched, PLAIN).item() == pytest.approx((1 + 9) / 2)
+    assert plane_to_plane(matched, PLAIN).item() == pytest.approx(4.0)
+
+
+def test_settings() -> None:
+    paper = LossConfig.paper()
+    assert (paper.gate_m, paper.robust_m, paper.point_to_plane_weight) == (None, None, 1.0)
+    for wrong in (
+        {"point_to_plane": False, "plane_to_plane": False},
+        {"gate_m": 0.0},
+        {"robust_m": float("inf")},
+        {"plane_norm": "cubic"},
+        {"lambda": 1.0},
+    ):
+        with pytest.raises(ValidationError):
+            LossConfig.model_validate(wrong)

@@ -1,0 +1,243 @@
+"""Normals of range images of surfaces that are known in closed form."""
+
+import math
+
+import pytest
+import torch
+from pydantic import ValidationError
+from torch import Tensor
+
+from odometry.normal_config import NormalConfig
+from odometry.normals import _eigenvalues, _null_vector, surface_normals
+
+CONFIG = NormalConfig()
+ROWS, COLUMNS = 16, 360
+
+
+def rays(rows: int = ROWS, columns: int = COLUMNS, step_deg: float = 2.0) -> Tensor:
+    """Directions (3, H, W) through the centres of pixels, float64, about the horizon."""
+    elevation = torch.deg2rad((torch.arange(rows, dtype=torch.float64) - (rows - 1) / 2.0) * step_deg)[:, None]
+    azimuth = (torch.arange(columns, dtype=torch.float64) + 0.5) * (2.0 * math.pi / columns)
+    flat = elevation.cos().expand(rows, columns)
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), elevation.sin().expand(rows, columns)])
+
+
+def image_of(directions: Tensor, ranges: Tensor, noise_m: float = 0.0) -> Tensor:
+    """The image (1, 4, H, W) of ranges (H, W) along rays; where infinite or negative it is empty."""
+    noise = torch.randn(ranges.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    seen = ranges.isfinite() & (ranges > 0.0)
+    measured = torch.where(seen, ranges + noise_m * noise, 0.0)
+    return torch.cat([directions * measured, measured[None]])[None].float()
+
+
+def plane_ranges(directions: Tensor, normal: Tensor, distance: float) -> Tensor:
+    """Ranges to the plane that unit `normal` faces the sensor from, at this distance; cut off at 40 m."""
+    ranges = distance / -(directions * normal[:, None, None]).sum(dim=0)
+    return torch.where((ranges > 0.0) & (ranges < 40.0), ranges, math.inf)
+
+
+def room(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Ranges (H, W) in a room of 12 x 8 x 3 m, seen from its middle, and true normals (3, H, W)."""
+    half = torch.tensor([6.0, 4.0, 1.5], dtype=torch.float64)[:, None, None]
+    ranges, wall = (half / directions.abs()).min(dim=0)
+    normals = torch.zeros_like(directions).scatter(0, wall[None], 1.0)
+    return ranges, -normals * directions.sign()
+
+
+def errors_deg(normals: Tensor, truth: Tensor) -> Tensor:
+    """Angles (K,) between normals (1, 3, H, W), where there are any, and the true ones (3, H, W)."""
+    there = normals[0].norm(dim=0) > 0.0
+    estimated, expected = normals[0].double()[:, there], truth.expand(normals.shape[1:])[:, there]
+    cross = torch.linalg.cross(estimated, expected, dim=0).norm(dim=0)
+    return torch.rad2deg(torch.atan2(cross, (estimated * expected).sum(dim=0)))
+
+
+@pytest.mark.parametrize(
+    ("normal", "distance", "least_share"),
+    [
+        ([0.0, 0.0, 1.0], 0.5, 0.5),  # floor
+        ([-1.0, 0.0, 0.0], 5.0, 0.8),  # wall across the seam
+        ([0.0, 1.0, 0.0], 2.0, 0.7),  # wall to the right
+        ([-0.6, -0.64, 0.48], 4.0, 0.7),  # slope
+    ],
+)
+@pytest.mark.parametrize(("noise_m", "median_deg", "worst_deg"), [(0.0, 0.01, 0.1), (0.01, 4.0, 25.0)])
+def test_a_plane_gives_its_normal(
+    normal: list[float], distance: float, least_share: float, noise_m: float, median_deg: float, worst_deg: float
+) -> None:
+    truth = torch.tensor(normal, dtype=torch.float64)
+    image = image_of(rays(), plane_ranges(rays(), truth, distance), noise_m)
+    normals = surface_normals(image, CONFIG)
+    near = (image[0, 3] > 0.0) & (image[0, 3] < 4.0 * distance)
+    assert (normals[0].norm(dim=0) > 0.0)[near].float().mean() > least_share
+    errors = errors_deg(normals, truth[:, None, None])
+    assert errors.median() < median_deg
+    assert errors.max() < worst_deg
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.03])
+def test_normals_are_unit_or_zero_and_face_the_sensor(noise_m: float) -> None:
+    image = image_of(rays(), room(rays())[0], noise_m)
+    normals = surface_normals(image, CONFIG)
+    there = normals[0].norm(dim=0) > 0.0
+    assert there.float().mean() > 0.7
+    torch.testing.assert_close(normals[0].norm(dim=0), there.float(), rtol=0.0, atol=1e-5)
+    assert ((normals * image[:, :3]).sum(dim=1)[0][there] < 0.0).all()
+    assert normals.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "median_deg", "wrong_share"), [(0.0, 0.01, 0.1), (0.01, 2.0, 0.1), (0.03, 5.0, 0.2)]
+)
+def test_few_normals_in_a_room_are_wrong(noise_m: float, median_deg: float, wrong_share: float) -> None:
+    directions = rays(columns=720)
+    ranges, truth = room(directions)
+    normals = surface_normals(image_of(directions, ranges, noise_m), CONFIG)
+    errors = errors_deg(normals, truth)
+    assert len(errors) > 0.8 * ROWS * 720
+    assert errors.median() < median_deg
+    assert (errors > 10.0).float().mean() < wrong_share
+    assert errors.max() < 90.0
+
+
+def test_edges_are_left_out_where_the_neighbourhood_is_no_plane() -> None:
+    # In a corner of 90 degrees, 6 degrees wide, hardly any patch may pass for a plane that is neither wall.
+    directions = rays(columns=720)
+    normal_x, normal_y = torch.eye(3, dtype=torch.float64)[:2].neg()
+    ranges = torch.minimum(plane_ranges(directions, normal_x, 4.0), plane_ranges(directions, normal_y, 4.0))
+    image = image_of(directions, ranges)
+    edge = slice(720 // 8 - 2, 720 // 8 + 2)
+    corner = surface_normals(image, CONFIG)[0, :, :, edge].norm(dim=0)
+    lenient = surface_normals(image, NormalConfig(max_flatness=1.0))[0, :, :, edge].norm(dim=0)
+    assert (corner > 0.0).float().mean() < 0.1
+    assert (lenient > 0.0).float().mean() > 0.8
+
+
+def test_a_sphere_from_within_gives_its_radii() -> None:
+    # Off its centre, so that normals are not merely the rays reversed.
+    directions, centre, radius = rays(), torch.tensor([1.0, -0.5, 0.2], dtype=torch.float64)[:, None, None], 6.0
+    along = (directions * centre).sum(dim=0)
+    ranges = along + (along.square() - centre.square().sum() + radius**2).sqrt()
+    truth = (centre - directions * ranges) / radius
+    inner = surface_normals(image_of(directions, ranges), CONFIG)[:, :, 1:-1]
+    errors = errors_deg(inner, truth[:, 1:-1])
+    assert len(errors) == (ROWS - 2) * COLUMNS
+    assert errors.max() < 0.2
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.03])
+def test_one_ring_has_no_normals(noise_m: float) -> None:
+    directions = rays()
+    wall = plane_ranges(directions, torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), 5.0)
+    floor = plane_ranges(directions, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 1.0)
+    for ranges, ring in ((wall, 5), (wall, 7), (floor, 2)):
+        alone = torch.full_like(ranges, math.inf)
+        alone[ring] = ranges[ring]
+        image = image_of(directions, alone, noise_m)
+        assert (image[0, 3] > 0.0).sum() > 100
+        assert not surface_normals(image, CONFIG).any()
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.05, 3.0, 80.0])
+def test_points_that_are_all_the_same_have_no_normals(distance: float) -> None:
+    point = distance * torch.tensor([0.48, 0.64, 0.6])
+    image = torch.cat([point, torch.tensor([distance])])[None, :, None, None].repeat(1, 1, 8, 32)
+    assert not surface_normals(image, CONFIG).any()
+    # and neither have they with the rounding of a transformation
+    image[:, :3] *= 1.0 + 1e-7 * torch.randn(1, 3, 8, 32, generator=torch.Generator().manual_seed(0))
+    assert not surface_normals(image, CONFIG).any()
+
+
+def test_walls_a_step_apart_do_not_mix() -> None:
+    directions, truth = rays(columns=720), torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
+    near, far = plane_ranges(directions, truth, 4.0), plane_ranges(directions, truth, 5.0)
+    ranges = torch.where(torch.arange(720) < 20, near, far)
+    ranges = torch.where(directions[0] > 0.5, ranges, math.inf)
+    gated = surface_normals(image_of(directions, ranges), CONFIG)
+    assert (gated[0, :, :, 10:30].norm(dim=0) > 0.0).all()
+    assert errors_deg(gated, truth[:, None, None]).max() < 0.1
+    mixed = surface_normals(image_of(directions, ranges), NormalConfig(gate_m=5.0, max_flatness=1.0))
+    assert errors_deg(mixed, truth[:, None, None]).max() > 10.0
+
+
+@pytest.mark.parametrize("shift", [1, 4, 170])
+def test_neighbourhoods_go_on_across_the_seam(shift: int) -> None:
+    image = image_of(rays(), room(rays())[0], 0.01)
+    rolled = surface_normals(image.roll(shift, dims=3), CONFIG)
+    assert torch.equal(rolled, surface_normals(image, CONFIG).roll(shift, dims=3))
+
+
+def test_the_lowest_and_the_highest_row_are_no_neighbours() -> None:
+    # Two rows that would be a plane together, were the image to wrap from top to bottom.
+    image = image_of(rays(), torch.full((ROWS, COLUMNS), 5.0, dtype=torch.float64))
+    image[:, :, 1:-1] = 0.0
+    assert not surface_normals(image, CONFIG).any()
+    assert surface_normals(image.roll(1, dims=2), CONFIG)[:, :, :2].any()
+
+
+def test_a_batch_equals_single_images() -> None:
+    images = torch.cat([image_of(rays(), room(rays())[0] * scale, 0.01) for scale in (0.5, 1.0, 3.0)])
+    images[1, :, :, ::3] = 0.0
+    together = surface_normals(images, CONFIG)
+    for i in range(3):
+        assert torch.equal(together[i : i + 1], surface_normals(images[i : i + 1], CONFIG))
+
+
+def test_empty_pixels_have_no_normals_and_too_few_neighbours_neither() -> None:
+    image = image_of(rays(), room(rays())[0])
+    lost = torch.rand(ROWS, COLUMNS, generator=torch.Generator().manual_seed(0)) < 0.7
+    image[:, :, lost] = 0.0
+    normals = surface_normals(image, CONFIG)
+    assert not normals[:, :, lost].any()
+    counts = torch.nn.functional.avg_pool2d(
+        torch.nn.functional.pad((~lost).float()[None], (4, 4, 0, 0), mode="circular"), (3, 9), 1, divisor_override=1
+    )
+    assert not normals[0, :, 1:-1].norm(dim=0)[counts[0] < CONFIG.min_neighbours].any()
+    assert normals.any()
+
+
+def test_empty_pixels_are_no_neighbours_of_points_within_the_gate_of_the_origin() -> None:
+    truth = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
+    image = image_of(rays(), plane_ranges(rays(), truth, 0.3))
+    image[:, :, torch.rand(ROWS, COLUMNS, generator=torch.Generator().manual_seed(0)) < 0.3] = 0.0
+    errors = errors_deg(surface_normals(image, CONFIG), truth[:, None, None])
+    assert len(errors) > 1000
+    assert errors.max() < 0.1
+
+
+def test_eigenvectors_agree_with_lapack() -> None:
+    # Patches of points that are flat, within the thresholds' limits, at any attitude and of any size.
+    generator = torch.Generator().manual_seed(0)
+    axes = torch.linalg.qr(torch.randn(500, 3, 3, generator=generator, dtype=torch.float64)).Q
+    spread = torch.rand(500, 3, generator=generator, dtype=torch.float64)
+    middle = 0.02 + 0.98 * spread[:, 0]
+    values = torch.stack([0.1 * spread[:, 1] * middle, middle, torch.ones(500)], dim=1)
+    matrices = axes * values[:, None] @ axes.mT
+    matrices /= matrices.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None]
+    i, j = [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]
+    six = matrices[:, i, j].T.reshape(6, 1, 20, 25).float()
+    expected, vectors = torch.linalg.eigh(matrices)
+    found = torch.stack([v.flatten() for v in _eigenvalues(six)], dim=1)
+    torch.testing.assert_close(found[:, 0].double(), expected[:, 0], rtol=0.0, atol=2e-6)
+    torch.testing.assert_close(found.double()[:, 1:], expected[:, 1:], rtol=1e-3, atol=0.0)
+    normals = _null_vector(six, found[:, 0].reshape(1, 20, 25))[0].reshape(3, -1).T.double()
+    away = torch.linalg.cross(normals, vectors[:, :, 0]).norm(dim=1)
+    assert torch.rad2deg(away).max() < 0.02
+
+
+def test_normals_have_no_gradient() -> None:
+    image = image_of(rays(), room(rays())[0]).requires_grad_()
+    assert not surface_normals(image, CONFIG).requires_grad
+
+
+def test_images_of_another_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least 4"):
+        surface_normals(torch.zeros(1, 3, 8, 32), CONFIG)
+    with pytest.raises(ValueError, match="narrower"):
+        surface_normals(torch.zeros(1, 4, 8, 8), CONFIG)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for setting in ({"gate_m": 0.0}, {"min_neighbours": 2}, {"max_flatness": 1.5}, {"gate": 0.5}):
+        with pytest.raises(ValidationError):
+            NormalConfig.model_validate(setting)
