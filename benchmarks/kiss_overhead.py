@@ -70,13 +70,14 @@ def run_kiss(source: Path) -> dict[str, Any]:
 
 def run_ours(source: Path) -> dict[str, Any]:
     """Our run on the recording."""
-    from lidarslam.config import Config
+    from lidarslam.config import load_config
     from lidarslam.core.trajectory_io import read_tum
     from lidarslam.run import RunRequest, execute
 
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
-        outcome = execute(RunRequest(source, Path(folder) / "run", Config()), lambda *_: None)
+        config = load_config(None, ["odometry.method=kiss-icp", "mapping.enabled=false"])
+        outcome = execute(RunRequest(source, Path(folder) / "run", config), lambda *_: None)
         whole_s = time.perf_counter() - started
         trajectory = read_tum(Path(folder) / "run" / "trajectory.tum")
     loop_s = outcome.summary.elapsed_s

@@ -23,10 +23,10 @@ from mapping_accuracy import (
     print_row,
     simulated_recordings,
     with_odometry,
+    without_odometry,
     wrong_odometry,
 )
 
-from lidarslam.config import Config
 from mapping.config import MappingConfig
 
 _PARTS: dict[str, dict[str, bool]] = {
@@ -41,7 +41,7 @@ def run_variants(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int
     """One recording through all variants, without odometry and with the wrong one."""
     prior = wrong_odometry(recorded, wrong_deg, wrong_m, seed)
     mappings = [MappingConfig(**parts) for parts in _PARTS.values()]
-    alone = [localise(recorded, Config(mapping=mapping)) for mapping in mappings]
+    alone = [localise(recorded, without_odometry(mapping)) for mapping in mappings]
     return alone + [localise(recorded, with_odometry(mapping), prior) for mapping in mappings]
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.trajectory_metrics import TrajectoryErrors, evaluate_trajectory
-from lidarslam.config import Config, resolved
+from lidarslam.config import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
@@ -111,7 +111,6 @@ def wrong_odometry(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: i
 
 def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> Outcome:
     """Take a recording through the pipeline of `lidarslam run`."""
-    config = resolved(config)
     odometry = make_odometry(config.odometry, prior)
     try:
         results = list(Pipeline(odometry, make_localiser(config), config.global_map).run(recorded.scans))
@@ -133,6 +132,11 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
 def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
     """How far a trajectory is from a recording's truth."""
     return evaluate_trajectory(estimate, recorded.truth).errors
+
+
+def without_odometry(mapping: MappingConfig) -> Config:
+    """The configuration for scan-to-map refinement that goes on with the motion it saw last."""
+    return Config(odometry=OdometryConfig(method="constant-velocity"), mapping=mapping)
 
 
 def with_odometry(mapping: MappingConfig) -> Config:
@@ -157,7 +161,7 @@ def row(recorded: Recorded, voxels: Sequence[float], wrong_deg: float, wrong_m: 
     kiss = run_kiss(recorded, KissConfig())
     voxel_m, tuned = tune_kiss(recorded, voxels)
     prior = wrong_odometry(recorded, wrong_deg, wrong_m, seed)
-    alone = localise(recorded, Config())
+    alone = localise(recorded, without_odometry(MappingConfig()))
     helped = localise(recorded, with_odometry(MappingConfig()), prior)
     percents = [100.0 * outcome.ate_m / outcome.length_m for outcome in (alone, helped)]
     return [

@@ -18,9 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import make_simulation, print_row, without_odometry
 
-from lidarslam.config import Config, resolved
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.localisation import ScanToMap
@@ -30,6 +29,7 @@ from lidarslam.simulation.carriers import CARRIERS
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensor_table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
+from mapping.config import MappingConfig
 from mapping.mapper import Mapper
 from odometry.registry import make_odometry
 
@@ -46,7 +46,7 @@ class Sample:
 
 def watch(simulation: Simulation, every: int) -> list[Sample]:
     """Run, and print a row now and then."""
-    config = resolved(Config())
+    config = without_odometry(MappingConfig())
     mapper = Mapper(config.mapping)  # as `lidarslam run` makes it, but in reach
     pipeline = Pipeline(make_odometry(config.odometry), ScanToMap(mapper), config.global_map)
     samples: list[Sample] = []

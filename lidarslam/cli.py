@@ -192,9 +192,10 @@ def info(
 @click.option("--out", type=_PATH, required=True, metavar="RUN", help="Directory that the results are written to.")
 @click.option(
     "--odometry",
-    type=click.Choice(["kiss-icp", "constant-velocity"]),
-    help="Where the motion between scans comes from.  [default: constant-velocity; kiss-icp with --no-mapping]",
+    type=click.Choice(["learned", "kiss-icp", "constant-velocity"]),
+    help="Where the motion between scans comes from.  [default: learned]",
 )
+@click.option("--weights", type=_FILE, metavar="FILE", help="Of the learned odometry.  [default: those of the program]")
 @click.option("--prior", type=_FILE, metavar="TUM_FILE", help="A trajectory of another program as the odometry.")
 @click.option(
     "--mapping/--no-mapping", default=None, help="Lay every scan on the map of those before.  [default: mapping]"
@@ -224,7 +225,11 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     from lidarslam.summary_text import format_outcome
 
     settings = _method_settings(
-        options.pop("odometry"), options["prior"], options.pop("mapping"), options.pop("settings")
+        options.pop("odometry"),
+        options.pop("weights"),
+        options["prior"],
+        options.pop("mapping"),
+        options.pop("settings"),
     )
     _refuse_missing_parts(options.pop("pose_graph"))
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
@@ -241,8 +246,16 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
 
 
 def _method_settings(
-    odometry: str | None, prior: Path | None, mapping: bool | None, settings: tuple[str, ...]
+    odometry: str | None, weights: Path | None, prior: Path | None, mapping: bool | None, settings: tuple[str, ...]
 ) -> tuple[str, ...]:
+    from lidarslam.config import setting
+
+    if weights is not None:
+        if odometry not in (None, "learned") or prior is not None:
+            raise click.UsageError(
+                "--weights are those of the learned odometry; leave them, or the other odometry, out"
+            )
+        odometry, settings = "learned", (*settings, setting("odometry.learned.weights", str(weights.resolve())))
     if prior is not None:
         if odometry is not None:
             raise click.UsageError("--prior is an odometry of its own; leave --odometry out")
@@ -330,6 +343,64 @@ def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: 
     with show_count(out.name) as progress:
         summary = record(request, progress)
     click.echo(format_summary(request, summary))
+
+
+@main.command(
+    epilog="""lidarslam train office.mcap street.mcap --out trained
+    lidarslam train KITTI --sequence 00 --out trained --from shipped --steps 2000
+    lidarslam train --out trained --set simulated.recordings=100
+    lidarslam train --out trained --resume"""
+)
+@click.argument("sources", type=_PATH, nargs=-1, metavar="[SOURCE]...")
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Directory of the training.")
+@click.option("--resume", is_flag=True, help="Go on with the training in DIR, on the recordings it was begun with.")
+@click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="Where to compute; auto takes a GPU where there is one.",
+)
+@click.option("--steps", type=click.IntRange(min=1), help="How long to train.  [default: 12000]")
+@click.option("--network", type=click.Choice(["correlation", "delora"]), help="What to train.  [default: correlation]")
+@click.option(
+    "--losses",
+    type=click.Choice(["both", "point-to-plane", "plane-to-plane", "paper", "alignment"]),
+    help="What to minimise: geometric losses, as they are or as DeLORA's paper has them, or the distance to the motion"
+    " that alignment finds.  [default: both and alignment]",
+)
+@click.option("--from", "start_from", metavar="WEIGHTS", help="Begin with these weights; shipped: the program's own.")
+@click.option(
+    "--prepared", type=_PATH, metavar="DIR", help="Where prepared recordings are kept.  [default: prepared in --out]"
+)
+@_reader_options
+@_config_options
+@click.pass_context
+def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> None:
+    """Teach a network how a sensor moves between scans; recordings need no labels.
+
+    Ctrl-C ends the training with what there is, and --resume goes on with it. Several GPUs: start it with torchrun.
+    """
+    from lidarslam.train_command import TrainOptions, run_train
+
+    if run_train(TrainOptions(sources, **options), click.echo).interrupted:
+        ctx.exit(EXIT_MENDABLE)
+
+
+@main.command(epilog="lidarslam export --weights trained/weights.safetensors --out exported")
+@click.option("--weights", type=_PATH, metavar="FILE", help="Trained weights.  [default: those of the program]")
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Folder that encoder.onnx and pair.onnx go to.")
+def export(weights: Path | None, out: Path) -> None:
+    """Write a trained network as ONNX, for other programs.
+
+    encoder.onnx takes the points and normals of scans as images; pair.onnx takes what it gives for two of them.
+    """
+    from odometry.checkpoint import default_weights, load_checkpoint
+    from odometry.export import export_onnx
+
+    for path in export_onnx(load_checkpoint(weights or default_weights()), out):
+        click.echo(f"written to {path}")
 
 
 @main.command(
@@ -472,7 +543,7 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
 
 
 @main.command(
-    epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods constant-velocity+map,kiss-icp
+    epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods learned,learned+map,kiss-icp
     lidarslam compare office.mcap --out compared --methods kiss-icp,prior --prior wheel_odometry.tum
     lidarslam compare --benchmark configs/benchmarks/kitti.yaml --data KITTI --out compared"""
 )
@@ -482,7 +553,7 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
     "--methods",
     metavar="NAME,...",
     help="BASE[@VOXEL][+map][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  "
-    "[default: constant-velocity+map,kiss-icp, or the benchmark's]",
+    "[default: learned+map,kiss-icp, or the benchmark's]",
 )
 @click.option("--benchmark", type=_FILE, metavar="FILE", help="Recordings, methods and tables as the file has them.")
 @click.option("--data", type=_PATH, metavar="DIR", help="Folder that the benchmark's paths are relative to.")

@@ -19,7 +19,7 @@ from lidarslam.methods import parse_methods
 from lidarslam.progress import show_count
 from lidarslam.supervised import Limits
 
-DEFAULT_METHODS = "constant-velocity+map,kiss-icp"
+DEFAULT_METHODS = "learned+map,kiss-icp"
 
 Say = Callable[[str], None]
 

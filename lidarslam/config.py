@@ -6,7 +6,7 @@ Defaults live in the code, beside what consumes them; a file or `--set` holds on
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -15,11 +15,16 @@ from pydantic_core import ErrorDetails
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run_directory import RUN_SECTION
+from lidarslam.training_directory import SOURCES_SECTION
 from mapping.config import GlobalMapConfig, MappingConfig
 from odometry.config import OdometryConfig
 
 # PyYAML lets Python's own errors through for what has the form or the tag of a date or a number: 2021-13-45.
 _UNREADABLE_VALUE = (ValueError, AttributeError)
+# The sections of a run's or a training's config.yaml that are no configuration.
+_DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
+
+M = TypeVar("M", bound=BaseModel)
 
 
 class ViewerConfig(BaseModel):
@@ -51,28 +56,37 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     Raises:
         ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
     """
-    tree = {} if path is None else _read_yaml(path)
-    tree.pop(RUN_SECTION, None)
+    return load_model(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
+
+
+def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
+    """Any configuration: its defaults, changed by a YAML file and then by settings; the example shows what those are.
+
+    A section of the file that says what was computed, rather than how, is passed over.
+
+    Raises:
+        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    """
+    tree = {} if path is None else read_yaml(path)
+    for section in _DESCRIPTIONS:
+        tree.pop(section, None)
     for setting in settings:
-        _apply(tree, setting)
+        _apply(tree, setting, example)
     try:
-        return Config.model_validate(tree)
+        return model.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(_explain(error, _origin(path, settings))) from None
+        raise ConfigError(_explain(error, model, _origin(path, settings))) from None
 
 
 def reader_settings(**options: str | None) -> list[str]:
     """The reader's options that were given, as settings; quoted as YAML text, so that sequence 04 stays 04."""
-    quoted = {key: value.replace("'", "''") for key, value in options.items() if value is not None}
-    return [f"reader.{key}='{value}'" for key, value in quoted.items()]
+    return [setting(f"reader.{key}", value) for key, value in options.items() if value is not None]
 
 
-def resolved(config: Config) -> Config:
-    """The configuration with what depends on other choices filled in."""
-    if config.odometry.method is not None:
-        return config
-    method = "constant-velocity" if config.mapping.enabled else "kiss-icp"
-    return config.model_copy(update={"odometry": config.odometry.model_copy(update={"method": method})})
+def setting(key: str, text: str) -> str:
+    """A setting whose value is a text, whatever it looks like to YAML."""
+    quoted = text.replace("'", "''")
+    return f"{key}='{quoted}'"
 
 
 def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:
@@ -81,7 +95,12 @@ def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:
     return str(yaml.safe_dump(tree | config.model_dump(mode="json"), sort_keys=False, allow_unicode=True))
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The tree in a file.
+
+    Raises:
+        ConfigError: it is not readable YAML, or no keys and values.
+    """
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -98,12 +117,12 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _apply(tree: dict[str, Any], setting: str) -> None:
+def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
     """Set one `key.path=value` in the tree; the value is read as YAML."""
     dotted, separator, text = setting.partition("=")
     keys = dotted.strip().split(".")
     if not separator or not all(keys):
-        raise ConfigError(f"--set {setting!r}: expected key.path=value, such as odometry.kiss_icp.voxel_size_m=0.5")
+        raise ConfigError(f"--set {setting!r}: expected key.path=value, such as {example}")
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
@@ -123,16 +142,16 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
     return " or ".join(([str(path)] if path else []) + (["--set"] if settings else []))
 
 
-def _explain(error: ValidationError, origin: str) -> str:
+def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
-    return f"configuration ({origin}): " + "; ".join(_explain_fault(fault) for fault in error.errors())
+    return f"configuration ({origin}): " + "; ".join(_explain_fault(fault, model) for fault in error.errors())
 
 
-def _explain_fault(fault: ErrorDetails) -> str:
+def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     location = [str(part) for part in fault["loc"]]
     key = ".".join(location)
     if fault["type"] == "extra_forbidden":
-        return f"there is no {key}{_suggest(location)}"
+        return f"there is no {key}{_suggest(location, model)}"
     if fault["type"] == "model_type":
         return f"{key}={fault['input']!r}: expected a section"
     if fault["type"] == "value_error":
@@ -141,10 +160,12 @@ def _explain_fault(fault: ErrorDetails) -> str:
     return f"{key}={fault['input']!r}: {fault['msg'].lower()}"
 
 
-def _suggest(location: Sequence[str]) -> str:
-    section: Any = Config
+def _suggest(location: Sequence[str], model: type[BaseModel]) -> str:
+    section: Any = model
     for key in location[:-1]:
-        section = section.model_fields[key].annotation
+        annotation = section.model_fields[key].annotation
+        # A section that may be null is a union of itself and None.
+        section = next((part for part in get_args(annotation) if part is not type(None)), annotation)
     known = list(section.model_fields)
     close = difflib.get_close_matches(location[-1], known, n=1)
     return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(known)}"

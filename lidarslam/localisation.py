@@ -145,10 +145,11 @@ class ScanToMap:
         started = time.perf_counter()
         measured = estimated.interval_s is not None
         odometry = SweepMotion(estimated.velocity, following.velocity if following else None)
-        prior = Prior(estimated.motion.T_prev_curr if measured else None, odometry.mean(estimated.scan))
+        motion = estimated.motion
+        prior = Prior(motion.T_prev_curr if measured else None, odometry.mean(estimated.scan), motion.covariance)
         mapped = self._mapper.process(estimated.scan, prior)
         expected = inverse(self._T_world_last) @ mapped.T_world_expected
-        self._T_odom_lidar = self._T_odom_lidar @ (estimated.motion.T_prev_curr if measured else expected)
+        self._T_odom_lidar = self._T_odom_lidar @ (motion.T_prev_curr if measured else expected)
         self._T_world_last = mapped.state.T_world_lidar
         return Localised(
             T_world_lidar=mapped.state.T_world_lidar,

@@ -12,7 +12,7 @@ import numpy as np
 
 from evaluation.trajectory_metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam import run_directory as files
-from lidarslam.config import Config, dump_yaml, resolved
+from lidarslam.config import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
@@ -94,7 +94,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     """
     if request.out.resolve() == request.source.resolve():
         raise OutputError(f"{request.out}: is the recording itself; name another directory for the run")
-    config = resolved(request.config)
+    config = request.config
     recording = open_recording(request.source, config.reader)
     chosen = range(len(recording))[request.start : request.stop : request.step]
     if not chosen:
@@ -186,7 +186,7 @@ def _make_odometry(config: Config, prior: Path | None) -> Odometry:
     if method == "constant-velocity" and not config.mapping.enabled:
         raise ConfigError(
             "constant-velocity only predicts; without scan-to-map refinement it would stand still."
-            " Choose --odometry kiss-icp, give a trajectory with --prior, or leave --no-mapping out"
+            " Choose --odometry learned, give a trajectory with --prior, or leave --no-mapping out"
         )
     if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")

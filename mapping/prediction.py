@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, skew
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from mapping.config import MappingConfig
 
 # Accelerations of carriers, one standard deviation, rotation about each axis and translation along it: what is
@@ -29,10 +29,13 @@ class Prior:
     Attributes:
         T_prev_curr: (4, 4) the motion since the previous scan.
         velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
+        covariance: (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the
+            odometry does not say: the configuration's.
     """
 
     T_prev_curr: FloatArray | None = None
     velocity: FloatArray | None = None
+    covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,26 +134,24 @@ def predict(state: State, stamp: float, prior: Prior, carrier: Carrier, config: 
     pose_covariance = covariance[:6, :6] + np.diag(drift**2 + _LEAST_SIGMA**2)
     velocity_covariance = covariance[6:, 6:] + np.diag((carrier.acceleration * interval_s) ** 2)
     T_world_lidar, velocity = state.T_world_lidar @ T_moved, state.velocity
-    sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
+    uncertainty = _uncertainty(prior, config)
     if prior.T_prev_curr is not None:
         error = log(inverse(T_world_lidar) @ state.T_world_lidar @ prior.T_prev_curr)
-        step, pose_covariance = _fuse(pose_covariance, error, np.diag(sigmas**2))
+        step, pose_covariance = _fuse(pose_covariance, error, uncertainty)
         T_world_lidar = T_world_lidar @ exp(step)
     if prior.velocity is not None and interval_s > 0.0:
-        step, velocity_covariance = _fuse(
-            velocity_covariance, prior.velocity - velocity, np.diag((sigmas / interval_s) ** 2)
-        )
+        difference = prior.velocity - velocity
+        step, velocity_covariance = _fuse(velocity_covariance, difference, uncertainty / interval_s**2)
         velocity = velocity + step
     return Prediction(T_world_lidar, velocity, pose_covariance, velocity_covariance)
 
 
-def adjoint(T_a_b: FloatArray) -> FloatArray:
-    """(6, 6): takes tangent vectors, rotation first, from frame b to frame a."""
-    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = R
-    A[3:, :3] = skew(t) @ R
-    return A
+def _uncertainty(prior: Prior, config: MappingConfig) -> FloatArray:
+    """(6, 6) covariance of the odometry's motion: its own word, else the configuration's."""
+    if prior.covariance is not None:
+        return prior.covariance
+    sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
+    return np.asarray(np.diag(sigmas**2), dtype=np.float64)
 
 
 def _fuse(covariance: FloatArray, difference: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:

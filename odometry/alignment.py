@@ -12,10 +12,12 @@ from torch import Tensor
 
 from odometry.alignment_config import AlignmentConfig
 from odometry.projection import ImageGrid
-from odometry.torch_geometry import exp, inverse, log, transform_points
+from odometry.torch_geometry import exp, inverse, log, skew, transform_points
 
 # A pair whose motion changes by less than this in a step has arrived: rotation in radians, translation in metres.
 _ARRIVED = 1e-4
+# Sine of the angle between beam and surface below which pixels are not taken as any wider.
+_MOST_GRAZING = 0.2
 # Information that keeps the normal equations solvable where neither the images nor a guess say anything.
 _LEAST_INFORMATION = 1e-3
 
@@ -109,8 +111,8 @@ def align(
     """
     guess, T = T_prev_curr, T_prev_curr
     source = _sample(current, config.column_step)
-    scales = torch.linspace(0.0, 1.0, max(config.iterations, 1)).tolist()
-    for done in scales:
+    previous = _filled(previous, config.fill_columns)
+    for done in torch.linspace(0.0, 1.0, config.iterations).tolist():
         scale_m = config.coarse_m * (config.fine_m / config.coarse_m) ** min(1.0, done / config.anneal_share)
         pairs = _pair(T, source, previous, interval_s, scale_m, config)
         T, moved = _step(T, pairs, scale_m, guess, guess_information, config)
@@ -124,52 +126,74 @@ def _sample(images: SweepImages, column_step: int) -> _Cloud:
     points = images.points[..., ::column_step].flatten(2).mT  # (B, 3, H, W') -> (B, N, 3)
     normals = images.normals[..., ::column_step].flatten(2).mT
     offsets = images.offsets[..., ::column_step].flatten(1)
-    return _Cloud(points, normals, offsets, normals.square().sum(-1) > 0.5)
+    valid = normals.square().sum(-1) > 0.5
+    if len(points) == 1:  # what does not take part need not be there
+        chosen = valid[0].nonzero()[:, 0]
+        points, normals, offsets, valid = (values[:, chosen] for values in (points, normals, offsets, valid))
+    return _Cloud(points, normals, offsets, valid)
+
+
+def _filled(images: SweepImages, columns: int) -> SweepImages:
+    """Pixels without a normal stand for the nearest one in their row that has one, up to so many columns away.
+
+    A point is held against a plane, which goes on beyond its pixel; the gate sees to it that it does not go too far.
+    """
+    size, _, height, width = images.points.shape
+    pixel = torch.arange(height * width, device=images.points.device).view(1, height, width).expand(size, -1, -1)
+    has_normal = images.normals.square().sum(1) > 0.5
+    filled, nearest = has_normal, pixel
+    for distance in range(1, columns + 1):
+        for step in (distance, -distance):
+            wanted = ~filled & has_normal.roll(step, -1)
+            nearest = torch.where(wanted, pixel.roll(step, -1), nearest)
+            filled = filled | wanted
+    nearest = nearest.flatten(1)
+
+    def take(values: Tensor) -> Tensor:
+        return values.flatten(2).gather(2, nearest[:, None].expand(-1, values.shape[1], -1)).view(values.shape)
+
+    return SweepImages(
+        take(images.points), take(images.normals), take(images.offsets[:, None])[:, 0], images.low, images.high
+    )
 
 
 def compensate(points: Tensor, offsets: Tensor, velocity: Tensor, is_direction: bool = False) -> Tensor:
     """Points (B, N, 3) as seen from the middle of the sweep, for a body that moves evenly at velocity (B, 6).
 
-    The exponential map to second order, which is exact to 0.1 mrad for a turn of 10 degrees within half a sweep.
+    The exponential map to second order, which is exact to 0.12 mrad for a turn of 10 degrees a sweep, half of it to
+    either side of the middle, and to eight times that for 20 degrees.
     """
-    omega, v = velocity[:, None, :3].expand_as(points), velocity[:, None, 3:]
+    cross = skew(velocity[:, :3]).mT  # points @ cross is the cross product of the rotation vector with them
     t = offsets[..., None]
-    first = torch.linalg.cross(omega, points) + (0.0 if is_direction else v)
-    second = torch.linalg.cross(omega, first)
-    return points + t * first + (0.5 * t * t) * second
+    first = points @ cross if is_direction else torch.baddbmm(velocity[:, None, 3:], points, cross)
+    moved: Tensor = torch.addcmul(points, t, torch.baddbmm(first, (0.5 * t) * first, cross))
+    return moved
 
 
 def _pair(
     T: Tensor, source: _Cloud, target: SweepImages, interval_s: Tensor, scale_m: float, config: AlignmentConfig
 ) -> _Pairs:
-    """Hold every point against the plane of the pixel that it falls into."""
+    """Hold every point against the plane of the pixel that it falls into.
+
+    The target's pixels are as measured, each at its own time: points are taken to that time, placed, and compared
+    there. The time is that of the pixel they would fall into otherwise, right but for the seam of the sweep.
+    """
     velocity = log(T) / interval_s[:, None]
     moved = transform_points(T, compensate(source.points, source.offsets, velocity))
-    normals = compensate(source.normals, source.offsets, velocity, is_direction=True) @ T[:, :3, :3].mT
-    pixel, inside = _look_up(moved, target, velocity)
-    reference = _gather(target.points, pixel)
-    planes = _gather(target.normals, pixel)
-    offsets = target.offsets.flatten(1).gather(1, pixel)
-    reference = compensate(reference, offsets, velocity)
-    planes = compensate(planes, offsets, velocity, is_direction=True)
-    difference = moved - reference
-    residuals = (difference * planes).sum(-1)
-    # What lies farther along the surface than pixels are wide is another surface seen past an edge.
-    gate = config.gate_m + config.gate_share * moved.square().sum(-1).sqrt() + scale_m
-    kept = source.valid & inside & (difference.square().sum(-1) < gate * gate)
-    kept &= (normals * planes).sum(-1) > config.least_cosine
-    return _Pairs(moved, planes, residuals, kept)
-
-
-def _look_up(moved: Tensor, target: SweepImages, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (B, N) of the target that points (B, N, 3) in its middle frame fall into, and whether they do.
-
-    The target's pixels are as measured, each at its own time: a point is taken to that time before it is placed. The
-    time is that of the pixel it would fall into otherwise, which is the right one but for the seam of the sweep.
-    """
     pixel, _ = _place(moved, target)
-    offsets = target.offsets.flatten(1).gather(1, pixel)
-    return _place(compensate(moved, -offsets, velocity), target)
+    seen = compensate(moved, -target.offsets.flatten(1).gather(1, pixel), velocity)
+    pixel, inside = _place(seen, target)
+    reference, planes = _gather(target.points, pixel), _gather(target.normals, pixel)
+    difference = seen - reference
+    residuals = (difference * planes).sum(-1)
+    # What lies farther along the surface than pixels are wide is another surface seen past an edge. On ground that the
+    # beams graze, pixels are metres wide; were they not, rings, which go along with the sensor, would hold it back.
+    squared = seen.square().sum(-1)
+    across = (seen * planes).sum(-1).abs().maximum(_MOST_GRAZING * squared.sqrt())
+    gate = config.gate_m + config.gate_share * squared / across.clamp(min=1e-6) + scale_m
+    kept = source.valid & inside & (difference.square().sum(-1) < gate * gate)
+    kept &= ((source.normals @ T[:, :3, :3].mT) * planes).sum(-1) > config.least_cosine
+    return _Pairs(seen, planes, residuals, kept)
 
 
 def _place(points: Tensor, target: SweepImages) -> tuple[Tensor, Tensor]:
@@ -212,8 +236,9 @@ def _step(
     if guess_information is not None:
         away = log(T @ inverse(guess))
         H, g = H + guess_information, g + (guess_information @ away[..., None])[..., 0]
-    H = H + _LEAST_INFORMATION * torch.eye(6, dtype=H.dtype, device=H.device)
-    delta = -torch.linalg.solve(H.double(), g.double()[..., None])[..., 0].to(T.dtype)
+    # In float32 so little would be lost beside what the images say of other directions.
+    H = H.double() + _LEAST_INFORMATION * torch.eye(6, dtype=torch.float64, device=H.device)
+    delta = -torch.linalg.solve(H, g.double()[..., None])[..., 0].to(T.dtype)
     delta = delta * (config.largest_step / delta.abs().amax(-1, keepdim=True).clamp(min=config.largest_step))
     return exp(delta) @ T, float(delta.abs().max())
 

@@ -5,8 +5,9 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
+from odometry.learned_config import LearnedConfig
 
-OdometryName = Literal["kiss-icp", "constant-velocity", "external"]
+OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "external"]
 
 
 class KissConfig(BaseModel):
@@ -54,8 +55,7 @@ class OdometryConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: OdometryName | None = Field(
-        None, description="null: constant-velocity with scan-to-map refinement, kiss-icp without"
-    )
+    method: OdometryName = "learned"
+    learned: LearnedConfig = LearnedConfig()
     kiss_icp: KissConfig = KissConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from odometry.network_config import CorrelationConfig
-from odometry.torch_geometry import exp
+from odometry.torch_geometry import exp, full_precision
 
 INPUT_CHANNELS = 9
 # Standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.
@@ -140,7 +140,8 @@ class CorrelationNetwork(nn.Module):
     def forward(self, previous: Tensor, current: Tensor) -> Estimate:
         """The motion between scans with features (B, C, H', W') each."""
         unit_previous, unit_current = (functional.normalize(f, dim=1) for f in (previous, current))
-        turns = self._turn_scores(unit_previous, unit_current)  # (B, W')
+        with full_precision(previous.device):
+            turns = self._turn_scores(unit_previous.float(), unit_current.float())  # (B, W')
         shift = turns.argmax(dim=1)
         turned, unit_turned = (_shift_columns(f, shift) for f in (current, unit_current))
         volume = torch.cat([previous, turned, self._local(unit_previous, unit_turned)], dim=1)
@@ -149,9 +150,11 @@ class CorrelationNetwork(nn.Module):
         moments = _moments(x)  # (B, 10 M)
         certainty = (turns.logsumexp(1) - turns.amax(1))[:, None]
         hidden = self.head(torch.cat([moments, certainty], dim=1))
-        T_turned_curr = _turn(shift + _fraction(turns, shift), turns.shape[1])
-        log_sigma = self.confidence(hidden) - 3.0
-        return Estimate(exp(self.motion(hidden)) @ T_turned_curr, log_sigma.clamp(*_LOG_SIGMA), turns)
+        with full_precision(previous.device):
+            hidden = hidden.float()
+            T_turned_curr = _turn(shift + _fraction(turns, shift), turns.shape[1])
+            log_sigma = self.confidence(hidden) - 3.0
+            return Estimate(exp(self.motion(hidden)) @ T_turned_curr, log_sigma.clamp(*_LOG_SIGMA), turns)
 
     def _turn_scores(self, previous: Tensor, current: Tensor) -> Tensor:
         """(B, W') mean correlation with the current scan moved by 0, 1, ... columns; unit features (B, C, H', W')."""
@@ -160,7 +163,7 @@ class CorrelationNetwork(nn.Module):
         column = torch.arange(width, device=gram.device)
         # A scan turned by s columns shows at column p what it had at p - s.
         diagonals = (column[:, None] - column[None, :]).remainder(width)  # (W' of the previous, shift)
-        mean: Tensor = gram.gather(2, diagonals.expand(len(gram), -1, -1)).mean(dim=1) / height
+        mean: Tensor = gram.gather(2, diagonals.expand(gram.shape[0], -1, -1)).mean(dim=1) / height
         return mean * self.sharpness.exp()
 
     def _local(self, previous: Tensor, current: Tensor) -> Tensor:

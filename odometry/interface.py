@@ -16,11 +16,14 @@ class Motion:
             first scan.
         points_used: how many points of the scan the estimate rests on; 0 for a prediction.
         failure: why the motion is only a prediction, None when it was measured.
+        covariance: (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None when the method
+            does not say.
     """
 
     T_prev_curr: FloatArray
     points_used: int
     failure: str | None = None
+    covariance: FloatArray | None = None
 
 
 class Odometry(Protocol):

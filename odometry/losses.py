@@ -128,8 +128,8 @@ def point_to_plane(matched: Matched, config: LossConfig) -> Tensor:
 def plane_to_plane(matched: Matched, config: LossConfig) -> Tensor:
     """Mean difference (B,) between the turned normals and those they met (equation 2 of the paper).
 
-    "squared" is |n - m|^2, which is 2 - 2 cos of the angle between them. "linear" is |n - m|, rounded off at zero; wrong
-    pairs weigh less in it.
+    "squared" is |n - m|^2, which is 2 - 2 cos of the angle between them. "linear" is |n - m|, rounded off at zero;
+    wrong pairs weigh less in it.
     """
     squared = (matched.source_normals - matched.target_normals).square().sum(-1)
     if config.plane_norm == "squared":

@@ -37,8 +37,8 @@ class DeloraPairs(nn.Module):
     def forward(self, previous: Tensor, current: Tensor) -> Estimate:
         """The motion, with a confidence that is a guess."""
         T_prev_curr: Tensor = self.network(previous, current)
-        unknown = torch.full((len(previous), 6), _UNKNOWN_SIGMA, device=previous.device).log()
-        return Estimate(T_prev_curr, unknown, previous.new_zeros(len(previous), 0))
+        unknown = torch.full((previous.shape[0], 6), _UNKNOWN_SIGMA, device=previous.device).log()
+        return Estimate(T_prev_curr, unknown, previous.new_zeros(previous.shape[0], 0))
 
 
 def make_network(config: NetworkConfig) -> nn.Module:

@@ -14,3 +14,7 @@ class NormalConfig(BaseModel):
     min_neighbours: int = Field(6, ge=3, description="points that a neighbourhood must have, itself included")
     max_flatness: float = Field(0.1, gt=0.0, le=1.0, description="smallest eigenvalue over the middle one, at most")
     min_spread: float = Field(0.02, ge=0.0, le=1.0, description="middle eigenvalue over the largest one, at least")
+    wide_gate_m: float | None = Field(
+        2.0, gt=0.0, description="the gate of a second try where the first finds no plane; null: none is made"
+    )
+    wide_columns: int = Field(8, ge=0, description="how far the second neighbourhood reaches to the left and right")

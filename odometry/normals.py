@@ -33,10 +33,19 @@ def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
     """
     if images.ndim != 4 or images.shape[1] < 4:
         raise ValueError(f"images must be (B, at least 4, H, W), got {tuple(images.shape)}")
-    if images.shape[3] < 2 * config.columns + 1:
+    if images.shape[3] < 2 * max(config.columns, config.wide_columns) + 1:
         raise ValueError(f"images of {images.shape[3]} columns are narrower than the neighbourhood")
     images = images[:, :4].float()
-    count, covariance = _scatter(images, config)
+    normals = _planes(images, config, config.gate_m, config.columns)
+    if config.wide_gate_m is not None:
+        missing = (normals.square().sum(dim=1, keepdim=True) < 0.5) & (images[:, 3:] > 0.0)
+        normals = torch.where(missing, _planes(images, config, config.wide_gate_m, config.wide_columns), normals)
+    return normals
+
+
+def _planes(images: Tensor, config: NormalConfig, gate_m: float, columns: int) -> Tensor:
+    """Normals (B, 3, H, W) from neighbourhoods of one size, zero where they are no planes."""
+    count, covariance = _scatter(images, config.rows, columns, gate_m)
     size = covariance[0] + covariance[1] + covariance[2]
     scaled = covariance / size.clamp(min=_TINY)
     smallest, middle, largest = _eigenvalues(scaled)
@@ -49,7 +58,7 @@ def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
     return normals * torch.where(planar, -away.sign(), 0.0)[:, None]
 
 
-def _scatter(images: Tensor, config: NormalConfig) -> tuple[Tensor, Tensor]:
+def _scatter(images: Tensor, rows: int, columns: int, gate_m: float) -> tuple[Tensor, Tensor]:
     """Numbers of neighbours (B, H, W) and their scatter matrices (6, B, H, W): xx, yy, zz, xy, yz, xz about the mean.
 
     Sums are of differences to the pixel itself: coordinates of tens of metres would leave no digits to float32.
@@ -57,16 +66,16 @@ def _scatter(images: Tensor, config: NormalConfig) -> tuple[Tensor, Tensor]:
     height, width = images.shape[2:]
     # (4, B, H, W), as all below treats channels alike
     centre = images.transpose(0, 1).contiguous()
-    padded = functional.pad(images, (config.columns, config.columns, 0, 0), mode="circular")
-    padded = functional.pad(padded, (0, 0, config.rows, config.rows)).transpose(0, 1).contiguous()
+    padded = functional.pad(images, (columns, columns, 0, 0), mode="circular")
+    padded = functional.pad(padded, (0, 0, rows, rows)).transpose(0, 1).contiguous()
     # Nothing is near to infinity, so one comparison tests both the gate and whether there is a neighbour.
     padded[3].masked_fill_(padded[3] <= 0.0, math.inf)
     count = torch.zeros_like(centre[3])
     sums, products = torch.zeros_like(centre[:3]), centre.new_zeros(6, *centre.shape[1:])
-    for down in range(2 * config.rows + 1):
-        for right in range(2 * config.columns + 1):
+    for down in range(2 * rows + 1):
+        for right in range(2 * columns + 1):
             around = padded[:, :, down : down + height, right : right + width]
-            near = ((around[3] - centre[3]).abs_() <= config.gate_m).float()
+            near = ((around[3] - centre[3]).abs_() <= gate_m).float()
             offset = (around[:3] - centre[:3]).mul_(near)
             count += near
             sums += offset

@@ -13,7 +13,7 @@ from odometry.pairs import PairBatch
 from odometry.torch_geometry import inverse, log
 from odometry.training_config import TrainingConfig
 
-# Errors of this size cost one: a degree, and five centimetres. Beyond it the cost grows linearly.
+# Errors are squared up to this size, a degree and five centimetres, where they cost a half; beyond they cost linearly.
 _ROTATION = math.radians(1.0)
 _TRANSLATION_M = 0.05
 
@@ -97,5 +97,5 @@ def _surfaces(images: Tensor, most: int | None = None, generator: Generator | No
         has_normal = values[..., 3:].square().sum(-1) > 0.5
         order = torch.rand(has_normal.shape, generator=generator).to(values.device) + has_normal
         values = values.gather(1, order.topk(most, dim=1).indices[..., None].expand(-1, -1, 6))
-    points, normals = values.split(3, dim=-1)
+    points, normals = values[..., :3], values[..., 3:]
     return Surfaces(points, normals, normals.square().sum(-1) > 0.5)

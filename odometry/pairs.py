@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
@@ -15,6 +16,8 @@ from odometry.training_config import AugmentationConfig
 
 # A prime that keeps the random streams of steps and processes apart.
 _STREAM = 1_000_003
+# What a generator takes for a seed.
+_SEEDS = 2**63
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +41,16 @@ class PairBatch:
 
     def to(self, device: torch.device) -> "PairBatch":
         """The same on another device."""
-        moved = (None if value is None else value.to(device, non_blocking=True) for value in vars(self).values())
-        return PairBatch(*moved)
+        moved: dict[str, Any] = {
+            name: None if value is None else value.to(device, non_blocking=True) for name, value in vars(self).items()
+        }
+        return PairBatch(**moved)
 
     def with_images(self, change: Callable[[Tensor], Tensor], T_prev_curr: Tensor) -> "PairBatch":
         """The batch with all its images changed alike, and the motions that follow from it."""
-        images = (self.previous, self.current, self.previous_surfaces, self.current_surfaces)
-        changed = (None if image is None else change(image) for image in images)
-        return PairBatch(*changed, T_prev_curr, self.believed)
+        surfaces = (self.previous_surfaces, self.current_surfaces)
+        previous, current = (None if images is None else change(images) for images in surfaces)
+        return PairBatch(change(self.previous), change(self.current), previous, current, T_prev_curr, self.believed)
 
 
 class Pairs:
@@ -63,7 +68,7 @@ class Pairs:
 
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
         """The pairs of one step; recordings are equally likely, whatever their length."""
-        generator = torch.Generator().manual_seed(self._seed * _STREAM**2 + step * _STREAM + process)
+        generator = torch.Generator().manual_seed((self._seed * _STREAM**2 + step * _STREAM + process) % _SEEDS)
         return augmented(_stack([self._draw(generator) for _ in range(size)]), self._config, generator)
 
     def _draw(self, generator: Generator) -> PairBatch:
@@ -86,7 +91,7 @@ def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces:
     ]
     still = [_compensated(recording, i) if surfaces else None for i in (previous, current)]
     believed = recording.believed[previous:current].all()
-    return PairBatch(*raw, *still, T[None], believed[None])
+    return PairBatch(raw[0], raw[1], still[0], still[1], T[None], believed[None])
 
 
 def _compensated(recording: PreparedRecording, scan: int) -> Tensor:
@@ -98,9 +103,11 @@ def _compensated(recording: PreparedRecording, scan: int) -> Tensor:
 
 
 def _velocity(recording: PreparedRecording, scan: int) -> Tensor:
-    """(6,) during a sweep: the mean of the motions that end and begin in its middle."""
+    """(6,) during a sweep: the mean of the believed motions that end and begin in its middle; zero without any."""
     around = slice(max(scan - 1, 0), scan + 1)
-    return (log(recording.T_prev_curr[around]) / recording.interval_s[around, None]).mean(dim=0)
+    believed = recording.believed[around].float()
+    velocity = log(recording.T_prev_curr[around]) / recording.interval_s[around, None]
+    return (believed @ velocity) / believed.sum().clamp(min=1.0)
 
 
 def _reversed(pair: PairBatch) -> PairBatch:
@@ -111,8 +118,9 @@ def _reversed(pair: PairBatch) -> PairBatch:
 
 
 def _stack(pairs: Sequence[PairBatch]) -> PairBatch:
-    parts = ([getattr(pair, name) for pair in pairs] for name in vars(pairs[0]))
-    return PairBatch(*(None if part[0] is None else torch.cat(part) for part in parts))
+    parts = {name: [getattr(pair, name) for pair in pairs] for name in vars(pairs[0])}
+    stacked: dict[str, Any] = {name: None if part[0] is None else torch.cat(part) for name, part in parts.items()}
+    return PairBatch(**stacked)
 
 
 def augmented(batch: PairBatch, config: AugmentationConfig, generator: Generator) -> PairBatch:

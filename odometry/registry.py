@@ -1,9 +1,12 @@
 """Which odometry methods there are; a method's module is imported when it is chosen."""
 
+from typing import cast
+
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
 from odometry.config import OdometryConfig
 from odometry.interface import Odometry
+from odometry.learned_config import LearnedConfig
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
@@ -22,6 +25,8 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         from odometry.external import ExternalOdometry
 
         return ExternalOdometry(prior)
+    if config.method == "learned":
+        return _make_learned(config.learned)
     if config.method != "constant-velocity":
         from odometry.kiss import KissOdometry
 
@@ -29,3 +34,12 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
     from odometry.constant_velocity import ConstantVelocity
 
     return ConstantVelocity()
+
+
+def _make_learned(config: LearnedConfig) -> Odometry:
+    from odometry.checkpoint import default_weights, load_checkpoint, network_of
+    from odometry.learned import LearnedOdometry
+    from odometry.networks import PairNetwork
+
+    checkpoint = load_checkpoint(config.weights or default_weights())
+    return LearnedOdometry(cast(PairNetwork, network_of(checkpoint)), checkpoint.images, config)

@@ -4,6 +4,7 @@ The conventions are those of `lidarslam.core.geometry`: a tangent vector is `(ro
 rotation first, shape (..., 6). Every function keeps the dtype and the device of what it is given.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from math import factorial
 
 import torch
@@ -21,6 +22,13 @@ _CUBIC = tuple((-1) ** k / factorial(2 * k + 3) for k in range(8))  # (a - sin(a
 _ARC_TANGENT = tuple((-1) ** k / (2 * k + 1) for k in range(7))  # atan(r) / r
 # |B_2k| / (2k)!, k = 1..7, with Bernoulli's numbers: (1 - a/2 * cot(a/2)) / a^2
 _COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000, 1 / 74724249600)
+
+
+def full_precision(device: torch.device) -> AbstractContextManager[object]:
+    """A context without autocast, which would leave the matrix products of motions no more than three digits."""
+    if torch.is_autocast_enabled(device.type):
+        return torch.autocast(device.type, enabled=False)
+    return nullcontext()
 
 
 def make_transform(R: Tensor, t: Tensor) -> Tensor:

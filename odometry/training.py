@@ -11,6 +11,7 @@ from odometry.networks import PairNetwork
 from odometry.objective import Objective, motion_error, objective
 from odometry.pairs import PairBatch, pair_of
 from odometry.preparation import PreparedRecording
+from odometry.torch_geometry import full_precision
 from odometry.training_config import TrainingConfig
 
 _LEAST_RATE = 0.01  # of the learning rate, at the end
@@ -56,16 +57,17 @@ def loss_of(network: PairNetwork, batch: PairBatch, config: TrainingConfig, gene
     images = torch.cat([batch.previous, batch.current])
     features = network.encode(images[:, :3], images[:, 3:])
     estimate = network(*features.chunk(2))
-    return objective(estimate, batch, config, generator)
+    with full_precision(images.device):
+        return objective(estimate, batch, config, generator)
 
 
 @torch.no_grad()
 def validate(
     network: PairNetwork, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
 ) -> Validation:
-    """Every pair of consecutive scans, as it is."""
+    """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none."""
     errors, sigmas = [], []
-    for recording in recordings:
+    for recording in (recording for recording in recordings if len(recording) > gap):
         error, sigma = _errors(network, recording, gap, device or torch.device("cpu"))
         errors.append(error)
         sigmas.append(sigma)
@@ -90,7 +92,7 @@ def _errors(
     features = torch.cat(
         [
             network.encode(points.to(device), normals.float().to(device))
-            for points, normals in zip(images.points.split(16), images.normals.split(16), strict=True)
+            for points, normals in zip(torch.split(images.points, 16), torch.split(images.normals, 16), strict=True)
         ]
     )
     count = len(features) - gap

@@ -1,8 +1,9 @@
 """Settings of training; light, so that reading a configuration imports no torch."""
 
-from typing import Literal, Self
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing_extensions import Self
 
 from odometry.image_config import ImageConfig
 from odometry.loss_config import LossConfig
@@ -16,7 +17,7 @@ class AugmentationConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_gap: int = Field(3, ge=1, description="scans between the two of a pair, 1 to this many")
+    max_gap: int = Field(3, ge=1, description="steps from one scan of a pair to the other, 1 to this many")
     reverse: float = Field(0.5, ge=0.0, le=1.0, description="the later scan comes first")
     roll: float = Field(0.8, ge=0.0, le=1.0, description="the current scan is turned about z by whole columns")
     roll_deg: float = Field(12.0, ge=0.0, description="standard deviation of most of these turns")

@@ -41,9 +41,13 @@ CONFINED = {
     "click": ("lidarslam.cli",),
     "laspy": ("lidarslam.reference_cloud",),
     "pye57": ("lidarslam.reference_cloud",),
+    "lightning_fabric": ("lidarslam.training_devices",),
+    "safetensors": ("odometry.tensor_file",),
+    "onnx": ("odometry.export",),
+    "onnxscript": ("odometry.export",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
 }
-HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib"}
+HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "lightning_fabric"}
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "common", "base", "helpers", "helper", "misc", "tools"}
 
 

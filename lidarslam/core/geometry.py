@@ -107,6 +107,15 @@ def interpolate(T_w_a: FloatArray, T_w_b: FloatArray, fraction: ArrayLike) -> Fl
     return T_w_a @ exp(fraction[..., None] * log(inverse(T_w_a) @ T_w_b))
 
 
+def adjoint(T_a_b: FloatArray) -> FloatArray:
+    """(6, 6): takes tangent vectors, rotation first, from frame b to frame a."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[3:, :3] = skew(t) @ R
+    return A
+
+
 def is_rigid(T: FloatArray, tolerance: float = 1e-5) -> bool:
     """Whether every (4, 4) of the array is finite, orthonormal, right-handed and has the bottom row 0 0 0 1."""
     R = T[..., :3, :3]

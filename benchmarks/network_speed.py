@@ -1,0 +1,89 @@
+"""How long the networks take for a pair of scans, beside one another in one run, and how the rest of a scan compares.
+
+    python benchmarks/network_speed.py --threads 2
+
+Prints a table with the processor time and the wall time of each network for a pair of images of the same size, the
+median over `--repeats`. Encodings are kept from pair to pair in the program, so `correlation` is timed as it is used: one
+scan encoded, one pair compared. Then the same for the other stages of the learned odometry on a simulated scan.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from statistics import median
+
+import torch
+from mapping_accuracy import simulate
+
+from odometry.alignment import align
+from odometry.image_config import ImageConfig
+from odometry.learned_config import LearnedConfig
+from odometry.network_config import CorrelationConfig, NetworkConfig, NetworkName
+from odometry.networks import make_network
+from odometry.sweep_images import Imager
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=int, default=16)
+    parser.add_argument("--columns", type=int, default=720)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--sensor", default="vlp-16")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
+    size = f"{options.rows} x {options.columns}"
+    print(f"A pair of {size} images, {options.threads} threads\n")
+    print("| network | parameters | wall, ms | CPU, ms | times faster |\n| --- | --- | --- | --- | --- |")
+    timings = {}
+    for name in ("delora", "correlation"):
+        count, wall, cpu = _time_network(name, options)
+        timings[name] = wall
+        print(f"| {name} | {count:,} | {wall:.1f} | {cpu:.1f} | {timings['delora'] / wall:.1f} |", flush=True)
+    print(f"\nStages of the learned odometry, {options.sensor} in an office\n")
+    print("| stage | wall, ms | CPU, ms |\n| --- | --- | --- |")
+    for name, stage in _stages(options).items():
+        wall, cpu = _timed(stage, options.repeats)
+        print(f"| {name} | {wall:.1f} | {cpu:.1f} |", flush=True)
+
+
+def _time_network(name: NetworkName, options: argparse.Namespace) -> tuple[int, float, float]:
+    """Parameters, wall and processor milliseconds of one scan and one pair."""
+    sizes = CorrelationConfig(rows=options.rows)
+    network = make_network(NetworkConfig(name=name, correlation=sizes)).eval()
+    points = torch.randn(1, 3, options.rows, options.columns) * 10.0
+    normals = torch.nn.functional.normalize(torch.randn_like(points), dim=1)
+    with torch.inference_mode():
+        earlier = network.encode(points, normals)  # type: ignore[operator]
+        wall, cpu = _timed(lambda: network(earlier, network.encode(points, normals)), options.repeats)  # type: ignore[operator]
+    return sum(p.numel() for p in network.parameters()), wall, cpu
+
+
+def _stages(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
+    scans = simulate("office", "handheld", options.sensor, 12, 0).scans[-2:]
+    imager = Imager(ImageConfig(rows=options.rows, columns=options.columns))
+    images = imager.images(list(scans))
+    previous, current = images.select(slice(0, 1)), images.select(slice(1, 2))
+    interval, T = torch.tensor([0.1]), torch.eye(4)[None]
+    config = LearnedConfig().alignment
+    return {
+        "image and normals": lambda: imager.images([scans[1]]),
+        "alignment": lambda: align(T, current, previous, interval, config),
+    }
+
+
+@torch.inference_mode()
+def _timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median wall and processor milliseconds, after two rounds that do not count."""
+    walls, cpus = [], []
+    for _ in range(repeats + 2):
+        wall, cpu = time.perf_counter(), time.process_time()
+        work()
+        walls.append(1e3 * (time.perf_counter() - wall))
+        cpus.append(1e3 * (time.process_time() - cpu))
+    return median(walls[2:]), median(cpus[2:])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""One training on disk: names every file of it, and says whether an earlier one may be gone on with or replaced."""
+
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from lidarslam.core.errors import OutputError
+
+# The section of config.yaml that says what was trained on, not how; its first.
+SOURCES_SECTION = "trained_on"
+
+CONFIG = "config.yaml"
+WEIGHTS = "weights.safetensors"
+LAST_WEIGHTS = "weights_last.safetensors"
+STATE = "state.safetensors"
+LOSSES = "train.csv"
+VALIDATION = "validation.csv"
+CURVES = "tensorboard"
+PREPARED = "prepared"
+
+# Prepared recordings are no results: another training in the directory uses them again.
+RESULTS = (CONFIG, WEIGHTS, LAST_WEIGHTS, STATE, LOSSES, VALIDATION, CURVES)
+
+
+def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
+    """The files of a training that lies in the directory already, if it may be gone on with or replaced.
+
+    Raises:
+        OutputError: it holds a training and neither is asked for, holds other files of these names, or there is none
+            to go on with.
+    """
+    present = [name for name in RESULTS if (path / name).exists()]
+    listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
+    if present and not is_training(path):
+        raise OutputError(f"{path}: holds files that are not those of a training ({listed}); name another directory")
+    if resume and not present:
+        raise OutputError(f"{path}: holds no training to go on with; leave --resume out to begin one")
+    if present and not resume and not overwrite:
+        raise OutputError(
+            f"{path}: holds a training already ({listed}); name another directory, go on with it by --resume,"
+            " or replace it with --overwrite"
+        )
+    return present
+
+
+def make_directory(path: Path) -> None:
+    """Make the directory, unless it is there.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise OutputError(f"{path}: a file is in the way; name another directory") from error
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def remove_results(path: Path, names: Iterable[str]) -> None:
+    """Make room for another training."""
+    for name in names:
+        if (path / name).is_dir():
+            shutil.rmtree(path / name)
+        else:
+            (path / name).unlink()
+
+
+def is_training(path: Path) -> bool:
+    """Whether a training's own description lies there: its first section says what was trained on."""
+    try:
+        return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{SOURCES_SECTION}:")
+    except (OSError, UnicodeDecodeError):
+        return False

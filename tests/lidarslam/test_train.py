@@ -1,0 +1,261 @@
+"""Training from a folder of scans to weights: the same seed, the same weights, however often it is interrupted."""
+
+import csv
+import pickle
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from lidarslam import training_data
+from lidarslam.cli import main
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.scan import Scan
+from lidarslam.train import execute
+from lidarslam.train_config import SimulatedConfig, TrainConfig, dump_train_yaml, load_train_config, loss_settings
+from lidarslam.train_request import StepReport, TrainNarrator, TrainRequest
+from lidarslam.training_data import Stretch, hold_out, prepared, recorded
+from odometry.checkpoint import load_checkpoint, network_of
+from odometry.loss_config import LossConfig
+from odometry.networks import make_network
+from odometry.training import Validation, validate
+
+TINY = (
+    "training.images={rows: 8, columns: 96}",
+    "training.network.correlation={rows: 8, widths: [8, 8, 8], pair_width: 8, reach: 2}",
+    "training.batch=2",
+    "training.geometric_points=64",
+    "training.steps=8",
+    "training.log_every=3",
+    "training.validate_every=4",
+    "training.warmup_steps=2",
+    "training.hold_out=0.3",
+)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Small networks are fastest so."""
+    earlier = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(earlier)
+
+
+@pytest.fixture(scope="module")
+def room_folder(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan]) -> Path:
+    """Ten scans without stamps or truth."""
+    folder = tmp_path_factory.mktemp("room")
+    for index, scan in enumerate(room_scans[:10]):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the tests share prepared recordings."""
+    return tmp_path_factory.mktemp("ready")
+
+
+class Listener(TrainNarrator):
+    """Keeps what it is told, and presses Ctrl-C after a validation."""
+
+    def __init__(self, interrupt_at: int | None = None) -> None:
+        self.interrupt_at = interrupt_at
+        self.reports: list[StepReport] = []
+        self.validations: list[tuple[int, Validation]] = []
+        self.read = 0
+
+    def preparing(self, done: int, total: int) -> None:  # noqa: ARG002
+        self.read = done
+
+    def stepped(self, report: StepReport) -> None:
+        self.reports.append(report)
+
+    def validated(self, step: int, result: Validation, is_best: bool) -> None:  # noqa: ARG002
+        self.validations.append((step, result))
+        if step == self.interrupt_at:
+            signal.raise_signal(signal.SIGINT)
+
+
+def request(source: Path, out: Path, ready: Path, *settings: str, resume: bool = False) -> TrainRequest:
+    config = load_train_config(None, [*TINY, *settings])
+    return TrainRequest((source,), out, config, device="cpu", prepared=ready, resume=resume)
+
+
+def losses(out: Path) -> list[dict[str, str]]:
+    with (out / "train.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if k != "pairs_per_s"} for row in csv.DictReader(file)]
+
+
+def same_weights(one: Path, other: Path) -> bool:
+    a, b = (load_checkpoint(path / "weights_last.safetensors").weights for path in (one, other))
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    whole, parts, other = tmp_path / "whole", tmp_path / "parts", tmp_path / "other"
+    outcome = execute(request(room_folder, whole, ready), Listener())
+    assert (outcome.steps, outcome.interrupted) == (8, False)
+    listener = Listener(interrupt_at=4)
+    outcome = execute(request(room_folder, parts, ready), listener)
+    assert (outcome.steps, outcome.interrupted) == (4, True)
+    assert [step for step, _ in listener.validations] == [0, 4]
+    outcome = execute(request(room_folder, parts, ready, resume=True), Listener())
+    assert (outcome.steps, outcome.interrupted) == (8, False)
+    assert [row["step"] for row in losses(whole)] == ["3", "6", "8"]
+    assert losses(parts) == losses(whole)
+    assert (parts / "validation.csv").read_text() == (whole / "validation.csv").read_text()
+    assert same_weights(whole, parts)
+    execute(request(room_folder, other, ready, "training.seed=1"), Listener())
+    assert not same_weights(whole, other)
+
+
+def test_what_a_training_leaves(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    listener = Listener()
+    outcome = execute(request(room_folder, tmp_path / "out", ready), listener)
+    assert listener.read == 10
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {
+        "config.yaml", "state.safetensors", "tensorboard", "train.csv", "validation.csv", "weights.safetensors",
+        "weights_last.safetensors",
+    }  # fmt: skip
+    assert list((tmp_path / "out" / "tensorboard").iterdir())
+    best = load_checkpoint(outcome.weights)
+    assert outcome.best in [result for _, result in listener.validations]
+    assert best.images.columns == 96
+    assert best.about["sources"] == [str(room_folder)]
+
+
+def test_recordings_are_prepared_once(room_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_train_config(None, TINY)
+    stretch = recorded(room_folder, config.reader)
+    first = prepared([stretch], config.training.images, tmp_path, lambda _: None)
+    monkeypatch.setattr(training_data, "prepare", lambda *_: pytest.fail("prepared again"))
+    again = prepared([stretch], config.training.images, tmp_path, lambda _: None)
+    for name in ("T_prev_curr", "believed", "share", "interval_s"):
+        assert torch.equal(getattr(first[0], name), getattr(again[0], name))
+    for name, value in vars(first[0].images).items():
+        assert torch.equal(value, getattr(again[0].images, name))
+        assert value.dtype == getattr(again[0].images, name).dtype
+
+
+def test_long_recordings_become_pieces() -> None:
+    stretch = Stretch("long", {}, lambda: pytest.fail("opened"), 100, 1301)
+    pieces = list(stretch.pieces())
+    assert [len(piece) for piece in pieces] == [400, 400, 401]
+    assert (pieces[0].first, pieces[-1].stop) == (100, 1301)
+
+
+def test_whole_recordings_are_held_out_and_the_end_of_a_single_one() -> None:
+    many = [Stretch(str(number), {}, lambda: pytest.fail("opened"), 0, 50) for number in range(10)]
+    learned, held_out = hold_out(many, 0.2, seed=0)
+    assert (len(learned), len(held_out)) == (8, 2)
+    assert sorted(stretch.name for stretch in [*learned, *held_out]) == [str(number) for number in range(10)]
+    assert hold_out(many, 0.2, seed=0) == (learned, held_out)
+    assert any(hold_out(many, 0.2, seed=seed) != (learned, held_out) for seed in range(1, 4))
+    assert len(hold_out(many[:2], 0.01, seed=0)[1]) == 1
+    (learnt,), (held,) = hold_out(many[:1], 0.1, seed=0)
+    assert (learnt.first, learnt.stop, held.first, held.stop) == (0, 45, 45, 50)
+    assert hold_out(many, 0.0, seed=0) == (many, [])
+    with pytest.raises(InputError, match=r"hold_out=0"):
+        hold_out([Stretch("short", {}, lambda: pytest.fail("opened"), 0, 3)], 0.1, seed=0)
+
+
+def test_named_losses() -> None:
+    def training(name: str) -> tuple[LossConfig | None, float]:
+        config = load_train_config(None, loss_settings(name)).training
+        return config.geometric, config.alignment_weight
+
+    assert training("both") == (LossConfig(), 0.0)
+    assert training("paper") == (LossConfig.paper(), 0.0)
+    assert training("point-to-plane") == (LossConfig(plane_to_plane=False), 0.0)
+    assert training("plane-to-plane") == (LossConfig(point_to_plane=False), 0.0)
+    assert training("alignment") == (None, 1.0)
+    assert loss_settings(None) == []
+
+
+def test_a_written_configuration_is_read_back(tmp_path: Path) -> None:
+    config = TrainConfig(simulated=SimulatedConfig(recordings=3))
+    (tmp_path / "config.yaml").write_text(dump_train_yaml(config, {"sources": []}))
+    assert load_train_config(tmp_path / "config.yaml") == config
+
+
+def train(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["train", *map(str, arguments)], catch_exceptions=False)
+
+
+def test_the_command_trains_goes_on_and_replaces(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    out, settings = tmp_path / "out", [word for setting in TINY for word in ("--set", setting)]
+    options = ("--out", out, "--prepared", ready, "--device", "cpu")
+    result = train(room_folder, *options, *settings, "--steps", 3)
+    assert result.exit_code == 0, result.output
+    for words in ("training on 1 recording: 7 scans to learn from, 3 more", "step 3/3  loss", "validation after 0"):
+        assert words in result.output
+    assert f"--odometry learned --weights {out / 'weights.safetensors'}" in result.output
+    result = train(room_folder, *options, *settings)
+    assert result.exit_code == 1
+    assert "holds a training already" in result.output
+    result = train(*options, "--resume", "--steps", 5)  # on what, and how, is remembered
+    assert result.exit_code == 0, result.output
+    assert "going on after step 3" in result.output
+    assert [row["step"] for row in losses(out)] == ["3", "5"]
+    result = train(room_folder, *options, "--overwrite", "--steps", 2, "--from", out / "weights.safetensors")
+    assert result.exit_code == 0, result.output
+    assert [row["step"] for row in losses(out)] == ["2"]
+    assert load_checkpoint(out / "weights.safetensors").images.columns == 96
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ((), "there is nothing to train on; name a SOURCE"),
+        (("--set", "training.geometric.gate=1"), "there is no training.geometric.gate; did you mean gate_m?"),
+        (("--set", "training.batch"), "such as training.batch=8"),
+        (("--resume",), "holds no training to go on with"),
+        (("--resume", "--overwrite"), "choose one"),
+        (("--resume", "--from", "shipped"), "leave --from out"),
+        (("nowhere",), "nowhere: no such file or folder"),
+        (("--from", "nowhere.safetensors"), "nowhere.safetensors: no such file"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(arguments: tuple[str, ...], told: str, tmp_path: Path) -> None:
+    result = train(*arguments, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert told in result.output
+    assert len(result.output.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_recordings_or_files_are_not_gone_on_with(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    out = tmp_path / "out"
+    execute(request(room_folder, out, ready, "training.steps=1"), TrainNarrator())
+    with pytest.raises(ConfigError, match="not those that this training was begun with"):
+        execute(request(room_folder, out, ready, "reader.rate_hz=5", resume=True), TrainNarrator())
+    (out / "state.safetensors").write_bytes(pickle.dumps({"a": 1}))
+    with pytest.raises(InputError, match="is a pickle"):
+        execute(request(room_folder, out, ready, resume=True), TrainNarrator())
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "weights.safetensors").write_text("mine")
+    with pytest.raises(OutputError, match="not those of a training"):
+        execute(request(room_folder, tmp_path / "foreign", ready), TrainNarrator())
+
+
+@pytest.mark.slow
+def test_a_short_recording_is_learnt_by_heart(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    """Labels play no part: alignment found the motions that the error is measured against."""
+    settings = ("training.steps=300", "training.validate_every=100", "training.batch=8", "training.hold_out=0.0")
+    plain = ("roll", "any_roll", "mirror", "scale", "drop_beams", "drop_points", "hide_sector")
+    augmentation = f"training.augmentation={{{', '.join(f'{name}: 0.0' for name in plain)}}}"
+    outcome = execute(request(room_folder, tmp_path / "out", ready, *settings, augmentation), TrainNarrator())
+    trained = load_checkpoint(outcome.weights)
+    config = load_train_config(None, TINY)
+    recording = prepared([recorded(room_folder, config.reader)], config.training.images, ready, lambda _: None)
+    before = validate(make_network(trained.network).eval(), recording)
+    after = validate(network_of(trained), recording)
+    assert after.rotation_rms_deg < 0.5 * before.rotation_rms_deg
+    assert after.translation_rms_m < 0.5 * before.translation_rms_m

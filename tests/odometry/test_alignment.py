@@ -1,0 +1,205 @@
+"""Motions between sweeps that are exact, and what is said where they cannot be found."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from odometry.alignment import Aligned, SweepImages, align, compensate
+from odometry.alignment_config import AlignmentConfig
+from odometry.torch_geometry import exp, inverse, log, transform_points
+
+CONFIG = AlignmentConfig()
+INTERVAL_S = torch.tensor([0.1])
+TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)  # rad/s, m/s
+TURNING = (0.1, 0.1, math.radians(80.0), 1.0, 0.3, 0.1)
+# Wrong by 2 degrees about an axis of no particular direction, and by 10 cm.
+WRONG = (0.012, -0.012, 0.030, 0.06, -0.06, 0.05)
+
+
+def moved(twist: tuple[float, ...]) -> Tensor:
+    """The true motion (1, 4, 4) from one sweep to the next."""
+    return exp(0.1 * torch.tensor([twist], dtype=torch.float64)).float()
+
+
+def guess(twist: tuple[float, ...], wrong: tuple[float, ...] = WRONG) -> Tensor:
+    return exp(torch.tensor([wrong])) @ moved(twist)
+
+
+def errors(T: Tensor, truth: Tensor) -> tuple[float, float]:
+    """The worst error of a batch, degrees and metres."""
+    error = log(T.double() @ inverse(truth.double()))
+    return float(error[:, :3].norm(dim=1).rad2deg().max()), float(error[:, 3:].norm(dim=1).max())
+
+
+def one_on_the_other(sweeps: SweepImages, T: Tensor, **options: object) -> Aligned:
+    """The second of two sweeps on the first."""
+    config = AlignmentConfig.model_validate(options)
+    return align(T, sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1)), INTERVAL_S, config)
+
+
+def together(sweeps: list[SweepImages]) -> SweepImages:
+    return SweepImages(*(torch.cat([getattr(one, name) for one in sweeps]) for name in vars(sweeps[0])))
+
+
+@pytest.mark.parametrize("rolling", [False, True])
+def test_a_known_motion_is_found_from_a_wrong_guess(box_room, rolling):
+    found = one_on_the_other(box_room.sweeps(2, TWIST, rolling=rolling), guess(TWIST))
+    rotation_deg, translation_m = errors(found.T_prev_curr, moved(TWIST))
+    assert rotation_deg < 0.01
+    assert translation_m < 2e-4
+    assert found.share > 0.97
+    assert found.residual_m < 1e-3
+
+
+def test_the_truth_stays_where_it_is(box_room):
+    found = one_on_the_other(box_room.sweeps(2, TWIST), moved(TWIST))
+    assert errors(found.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
+
+
+def test_an_upside_down_sensor_is_as_good(box_room):
+    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double().numpy()
+    found = one_on_the_other(box_room.sweeps(2, TWIST, upside_down), guess(TWIST))
+    rotation_deg, translation_m = errors(found.T_prev_curr, moved(TWIST))
+    assert rotation_deg < 0.01
+    assert translation_m < 2e-4
+
+
+def test_turning_sweeps_are_compensated(box_room):
+    sweeps = box_room.sweeps(2, TURNING)
+    assert errors(one_on_the_other(sweeps, guess(TURNING)).T_prev_curr, moved(TURNING)) < (0.03, 0.002)
+    as_if_at_once = replace(sweeps, offsets=torch.zeros_like(sweeps.offsets))
+    assert errors(one_on_the_other(as_if_at_once, guess(TURNING)).T_prev_curr, moved(TURNING))[0] > 0.1
+
+
+def test_the_interval_tells_how_fast_the_motion_is(box_room):
+    """Were the sweeps half as far apart, the body would move twice as fast in them."""
+    sweeps = box_room.sweeps(2, TURNING)
+    found = align(
+        guess(TURNING), sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1)), 0.5 * INTERVAL_S, AlignmentConfig()
+    )
+    assert errors(found.T_prev_curr, moved(TURNING))[0] > 0.1
+
+
+def test_items_of_a_batch_are_on_their_own(box_room):
+    twists = [TWIST, TURNING, (0.0, 0.0, -0.5, -2.0, 0.5, 0.0)]
+    sweeps = [box_room.sweeps(2, twist) for twist in twists]
+    current, previous = (together([one.select(slice(i, i + 1)) for one in sweeps]) for i in (1, 0))
+    guesses = torch.cat([guess(twist) for twist in twists])
+    batch = align(guesses, current, previous, INTERVAL_S.expand(3), CONFIG)
+    assert errors(batch.T_prev_curr, torch.cat([moved(twist) for twist in twists])) < (0.03, 0.002)
+    for i, twist in enumerate(twists):
+        alone = one_on_the_other(sweeps[i], guess(twist))
+        torch.testing.assert_close(batch.T_prev_curr[i], alone.T_prev_curr[0], rtol=0, atol=2e-5)
+        torch.testing.assert_close(batch.share[i], alone.share[0], rtol=0, atol=1e-3)
+        assert batch.matched[i] == pytest.approx(int(alone.matched[0]), abs=3)
+
+
+def test_without_a_step_the_guess_is_the_answer(box_room):
+    found = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST), iterations=0)
+    assert torch.equal(found.T_prev_curr, guess(TWIST))
+    assert found.share < 0.7
+
+
+def test_a_guess_is_held_as_firmly_as_its_information_says(box_room):
+    sweeps = box_room.sweeps(2, TWIST)
+    current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
+    close = guess(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
+    certain = align(close, current, previous, INTERVAL_S, CONFIG, 1e9 * torch.eye(6)[None])
+    assert errors(certain.T_prev_curr, close) < (0.01, 5e-4)
+    uncertain = align(close, current, previous, INTERVAL_S, CONFIG, 1e-3 * torch.eye(6)[None])
+    assert errors(uncertain.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
+
+
+def test_the_information_of_a_guess_is_of_changes_from_the_left(box_room):
+    """Turned by a right angle in between, the previous scan's x is the current one's y: the former is held."""
+    twist = (0.0, 0.0, 0.5 * math.pi / 0.1, 0.5, 0.2, 0.0)
+    sweeps = box_room.sweeps(2, twist, rolling=False)
+    T = guess(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
+    holds_x = torch.zeros(1, 6, 6)
+    holds_x[:, 3, 3] = 1e9
+    found = align(T, sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1)), INTERVAL_S, CONFIG, holds_x)
+    away = found.T_prev_curr[0, :3, 3] - moved(twist)[0, :3, 3]
+    # What is held wrongly pulls a little at the rest.
+    assert float(away[0] - T[0, 0, 3] + moved(twist)[0, 0, 3]) == pytest.approx(0.0, abs=1e-4)
+    assert away[1].abs() < 0.01
+
+
+def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
+    """The walls say nothing of x; all else is found."""
+    twist, wrong = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0), (0.01, 0.01, 0.02, 0.10, 0.06, 0.05)
+    sweeps = corridor.sweeps(2, twist)
+    current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
+    T = guess(twist, wrong)
+    kept = align(T, current, previous, INTERVAL_S, CONFIG, torch.eye(6)[None])
+    error = log(kept.T_prev_curr @ inverse(moved(twist)))[0]
+    # Turning it back about the origin moves it along x by less than a millimetre.
+    torch.testing.assert_close(kept.T_prev_curr[0, 0, 3], T[0, 0, 3], rtol=0, atol=1e-3)
+    torch.testing.assert_close(error[:3], torch.zeros(3), rtol=0, atol=1e-5)
+    torch.testing.assert_close(error[4:], torch.zeros(2), rtol=0, atol=1e-4)
+    assert kept.share > 0.95
+
+
+def test_information_is_weak_along_a_corridor(corridor):
+    twist = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0)
+    found = one_on_the_other(corridor.sweeps(2, twist), moved(twist))
+    information = found.information[0]
+    assert information[3, 3] < 1e-6 * information[4, 4]
+    assert information[5, 5] > 100.0
+    # Every matched point says one metre of information along its normal: they sum up to their number.
+    assert information[3:, 3:].trace() == pytest.approx(int(found.matched), rel=1e-3)
+
+
+def test_share_and_residual_tell_what_does_not_fit(box_room, corridor):
+    room, street = box_room.sweeps(1, TWIST), corridor.sweeps(1, TWIST)
+    unrelated = align(torch.eye(4)[None], street, room, INTERVAL_S, CONFIG)
+    assert unrelated.share < 0.3
+    beside = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST), iterations=0)
+    fits = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
+    assert beside.residual_m > 20.0 * fits.residual_m
+    assert beside.residual_m < 2.0 * CONFIG.fine_m
+
+
+@pytest.mark.parametrize("empty", ["current", "previous", "both"])
+def test_empty_images_move_nothing(box_room, empty):
+    full = box_room.sweeps(1, TWIST)
+    nothing = SweepImages(
+        torch.zeros_like(full.points), torch.zeros_like(full.normals), torch.zeros_like(full.offsets),
+        full.low, full.high,
+    )  # fmt: skip
+    current = full if empty == "previous" else nothing
+    previous = full if empty == "current" else nothing
+    found = align(guess(TWIST), current, previous, INTERVAL_S, CONFIG)
+    torch.testing.assert_close(found.T_prev_curr, guess(TWIST))
+    assert (float(found.share), float(found.residual_m), int(found.matched)) == (0.0, 0.0, 0)
+    assert not found.information.any()
+
+
+def test_what_leaves_the_elevations_takes_no_part(box_room):
+    """Pitched by 20 degrees a third of the points fall above or below the other image; the rest are right."""
+    twist = (0.0, math.radians(200.0), 0.0, 0.0, 0.0, 0.0)
+    sweeps = box_room.sweeps(2, twist, rolling=False)
+    found = one_on_the_other(sweeps, guess(twist, (0.0, 0.01, 0.0, 0.01, 0.0, 0.0)))
+    assert errors(found.T_prev_curr, moved(twist)) < (0.01, 1e-3)
+    assert 0.5 < float(found.share) < 0.85
+    assert found.residual_m < 2e-3
+
+
+@pytest.mark.parametrize("is_direction", [False, True])
+def test_compensation_is_the_exponential_to_second_order(is_direction):
+    g = torch.Generator().manual_seed(3)
+    points = torch.nn.functional.normalize(torch.randn(1, 500, 3, generator=g, dtype=torch.float64), dim=-1)
+    offsets = 0.1 * torch.rand(1, 500, generator=g, dtype=torch.float64) - 0.05
+    axis = torch.nn.functional.normalize(torch.randn(3, generator=g, dtype=torch.float64), dim=0)
+    v = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
+    for turn_deg, accuracy in ((10.0, 1.2e-4), (20.0, 9.5e-4)):
+        velocity = torch.cat([axis * math.radians(turn_deg) / 0.1, v])[None]
+        T = exp(offsets[0, :, None] * velocity)  # (N, 4, 4)
+        exact = transform_points(T, points[0, :, None])[:, 0]
+        if is_direction:
+            exact = exact - T[:, :3, 3]
+        difference = (compensate(points, offsets, velocity, is_direction)[0] - exact).norm(dim=-1)
+        assert difference.max() < accuracy
+        assert difference.max() > 0.5 * accuracy  # else the docstring says too little

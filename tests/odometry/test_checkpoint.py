@@ -1,0 +1,163 @@
+"""Weights on disk: what is written comes back, and what is no such file is refused in one line."""
+
+import os
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from odometry import checkpoint as module
+from odometry.checkpoint import Checkpoint, checkpoint_of, default_weights, load_checkpoint, network_of, save_checkpoint
+from odometry.image_config import ImageConfig
+from odometry.network_config import CorrelationConfig, NetworkConfig
+from odometry.networks import make_network
+from odometry.tensor_file import Kind, write_tensor_file
+
+IMAGES = ImageConfig(rows=8, columns=96)
+
+
+@pytest.fixture
+def trained() -> Checkpoint:
+    config = NetworkConfig(correlation=CorrelationConfig(rows=8, widths=(8, 8, 8), pair_width=8, reach=2))
+    torch.manual_seed(3)
+    return checkpoint_of(make_network(config), config, IMAGES, {"steps": 7, "sources": ["office"]})
+
+
+@pytest.fixture
+def file(trained: Checkpoint, tmp_path: Path) -> Path:
+    save_checkpoint(tmp_path / "weights.safetensors", trained)
+    return tmp_path / "weights.safetensors"
+
+
+def test_what_is_saved_comes_back(trained: Checkpoint, file: Path) -> None:
+    loaded = load_checkpoint(file)
+    assert (loaded.network, loaded.images, loaded.about) == (trained.network, trained.images, trained.about)
+    points = 5.0 * torch.randn(2, 3, 8, 96)
+    with torch.no_grad():
+        results = []
+        for one in (trained, loaded):
+            network = network_of(one)
+            assert not network.training
+            features = network.encode(points, torch.zeros_like(points))
+            results.append(network(features, features.flip(0)))
+    assert torch.equal(results[0].T_prev_curr, results[1].T_prev_curr)
+    assert torch.equal(results[0].log_sigma, results[1].log_sigma)
+
+
+def test_loading_leaves_the_random_numbers_alone(file: Path) -> None:
+    before = torch.get_rng_state()
+    network_of(load_checkpoint(file))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_copy_does_not_change_with_the_network() -> None:
+    network = torch.nn.Linear(2, 2)
+    kept = checkpoint_of(network, NetworkConfig(), IMAGES)
+    before = kept.weights["weight"].clone()
+    with torch.no_grad():
+        network.weight.add_(1.0)
+    assert torch.equal(kept.weights["weight"], before)
+
+
+def test_a_failed_write_leaves_the_earlier_file(
+    trained: Checkpoint, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    earlier = file.read_bytes()
+
+    def fail(self: Path, target: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(OutputError, match="No space left"):
+        save_checkpoint(file, replace(trained, about={}))
+    assert file.read_bytes() == earlier
+    assert list(file.parent.iterdir()) == [file]
+
+
+class _Malicious:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.mkdir, (str(self.trace),)
+
+
+@pytest.mark.parametrize("how", ["pickle", "archive"])
+def test_a_pickle_is_refused_unopened(how: str, tmp_path: Path) -> None:
+    path, trace = tmp_path / "weights.pt", tmp_path / "trace"
+    if how == "pickle":
+        path.write_bytes(pickle.dumps(_Malicious(trace)))
+    else:
+        torch.save({"weight": _Malicious(trace)}, path)
+    with pytest.raises(InputError, match=r"is a pickle.*was not opened"):
+        load_checkpoint(path)
+    assert not trace.exists()
+
+
+def test_what_is_no_weights_file_is_told(tmp_path: Path, trained: Checkpoint) -> None:
+    missing = tmp_path / "missing.safetensors"
+    with pytest.raises(InputError, match="no such file"):
+        load_checkpoint(missing)
+    text = tmp_path / "notes.txt"
+    text.write_text("some notes that are long enough")
+    with pytest.raises(InputError, match="no safetensors file"):
+        load_checkpoint(text)
+    other = tmp_path / "other.safetensors"
+    save_file(trained.weights, other)
+    with pytest.raises(InputError, match="another program"):
+        load_checkpoint(other)
+    with pytest.raises(InputError, match="cannot be read"):
+        load_checkpoint(tmp_path)
+
+
+def test_other_kinds_and_newer_versions_are_told(tmp_path: Path, trained: Checkpoint) -> None:
+    path = tmp_path / "w.safetensors"
+    write_tensor_file(path, Kind("the state of a training", 1), trained.weights, {})
+    with pytest.raises(InputError, match="holds the state of a training, not weights"):
+        load_checkpoint(path)
+    write_tensor_file(path, Kind("weights", 99), trained.weights, {})
+    with pytest.raises(InputError, match="version 99, this program knows 1 at most; use a newer"):
+        load_checkpoint(path)
+
+
+def test_a_cut_file_is_told(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(InputError, match="is damaged"):
+        load_checkpoint(file)
+
+
+def test_weights_that_do_not_fit_are_told(trained: Checkpoint, file: Path) -> None:
+    def saved(change: Callable[[dict[str, torch.Tensor]], object]) -> Path:
+        weights = dict(trained.weights)
+        change(weights)
+        save_checkpoint(file, replace(trained, weights=weights))
+        return file
+
+    with pytest.raises(InputError, match=r"motion\.bias of network correlation is missing"):
+        load_checkpoint(saved(lambda w: w.pop("motion.bias")))
+    with pytest.raises(InputError, match=r"motion\.bias is \(5,\), network correlation has \(6,\)"):
+        load_checkpoint(saved(lambda w: w.update({"motion.bias": torch.zeros(5)})))
+    with pytest.raises(InputError, match=r"motion\.bias holds values that are not finite"):
+        load_checkpoint(saved(lambda w: w.update({"motion.bias": torch.full((6,), torch.nan)})))
+    with pytest.raises(InputError, match="has no surplus"):
+        load_checkpoint(saved(lambda w: w.update({"surplus": torch.zeros(1)})))
+
+
+def test_a_configuration_of_a_later_program_is_told(trained: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    write_tensor_file(path, module.WEIGHTS, trained.weights, {"network": {"name": "other"}, "images": {}})
+    with pytest.raises(InputError, match="configuration does not fit this program"):
+        load_checkpoint(path)
+
+
+def test_missing_default_weights_say_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_DEFAULT", "not_there.safetensors")
+    with pytest.raises(ConfigError, match="--weights FILE"):
+        default_weights()

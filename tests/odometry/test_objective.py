@@ -1,0 +1,236 @@
+"""The loss of motions whose errors are known."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from odometry.correlation import Estimate
+from odometry.objective import Objective, motion_error, objective
+from odometry.pairs import PairBatch, pair_of
+from odometry.torch_geometry import exp, inverse
+from odometry.training_config import TrainingConfig
+
+TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
+WIDTH = 24
+ALIGNMENT_ONLY = TrainingConfig(geometric=None)
+PARTS = ("alignment", "confidence", "turn", "point_to_plane", "plane_to_plane")
+
+
+@pytest.fixture(scope="module")
+def pair(small_room) -> PairBatch:
+    return pair_of(small_room.recording(2, TWIST), 0, 1)
+
+
+def batch_of(targets: Tensor, believed: list[bool] | None = None) -> PairBatch:
+    """Pairs without surfaces."""
+    images = torch.zeros(len(targets), 6, 4, 8)
+    return PairBatch(images, images, None, None, targets, torch.tensor(believed or [True] * len(targets)))
+
+
+def estimate_of(T: Tensor, log_sigma: float = 0.0, scores: Tensor | None = None) -> Estimate:
+    scores = torch.zeros(len(T), WIDTH) if scores is None else scores
+    return Estimate(T, torch.full((len(T), 6), log_sigma), scores)
+
+
+def loss(estimate: Estimate, batch: PairBatch, config: TrainingConfig = ALIGNMENT_ONLY) -> Objective:
+    return objective(estimate, batch, config, torch.Generator().manual_seed(0))
+
+
+def off(rotation_deg: float = 0.0, translation_m: float = 0.0) -> Tensor:
+    """(1, 4, 4) changes from the left."""
+    return exp(torch.tensor([[0.0, math.radians(rotation_deg), 0.0, 0.0, 0.0, translation_m]]))
+
+
+def yaw(columns: float) -> Tensor:
+    """(1, 4, 4) turns by so many columns of scores."""
+    return exp(torch.tensor([[0.0, 0.0, columns * 2.0 * math.pi / WIDTH, 0.0, 0.0, 0.0]]))
+
+
+def test_the_truth_costs_nothing_but_its_confidence():
+    T = exp(torch.tensor([[0.1, -0.2, 0.3, 1.0, 2.0, 3.0]]))
+    parts = loss(estimate_of(T, log_sigma=-5.0), batch_of(T))
+    assert float(parts.alignment) == pytest.approx(0.0, abs=1e-6)
+    assert float(parts.confidence) == pytest.approx(-30.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("rotation_deg", "translation_m", "cost"),
+    [(0.5, 0.0, 0.125), (1.0, 0.0, 0.5), (3.0, 0.0, 2.5), (0.0, 0.05, 0.5), (0.0, 0.25, 4.5)],
+)
+def test_errors_cost_their_square_and_then_their_size(rotation_deg, translation_m, cost):
+    T = exp(torch.tensor([[0.1, -0.2, 0.3, 0.0, 0.0, 0.0]]))
+    parts = loss(estimate_of(off(rotation_deg, translation_m) @ T), batch_of(T))
+    assert float(parts.alignment) == pytest.approx(cost, rel=1e-3)
+
+
+def test_the_error_is_the_change_from_the_left():
+    target = exp(torch.tensor([[0.5, -0.2, 0.3, 1.0, 2.0, 3.0]]))
+    xi = torch.tensor([[0.01, 0.02, -0.03, 0.1, -0.2, 0.3]])
+    torch.testing.assert_close(motion_error(exp(xi) @ target, target), xi, rtol=0, atol=2e-6)
+
+
+def test_the_total_is_weighted(pair):
+    config = TrainingConfig(alignment_weight=2.0, geometric_weight=3.0)
+    estimate = estimate_of(off(2.0, 0.1) @ pair.T_prev_curr, -1.0)
+    parts = loss(estimate, pair, config)
+    alignment = parts.alignment + 0.1 * parts.confidence + 0.5 * parts.turn
+    expected = 2.0 * alignment + 3.0 * (parts.point_to_plane + parts.plane_to_plane)
+    torch.testing.assert_close(parts.total, expected)
+    assert all(float(getattr(parts, name)) != 0.0 for name in PARTS)
+
+
+@pytest.mark.parametrize(
+    ("config", "off_parts"),
+    [
+        (ALIGNMENT_ONLY, ("point_to_plane", "plane_to_plane")),
+        (TrainingConfig(alignment_weight=0.0), ("alignment", "confidence", "turn")),
+    ],
+)
+def test_parts_are_switched_off(pair, config, off_parts):
+    parts = loss(estimate_of(off(2.0, 0.1) @ pair.T_prev_curr), pair, config)
+    for name in PARTS:
+        assert (float(getattr(parts, name)) == 0.0) == (name in off_parts)
+
+
+def test_nothing_to_minimise_is_told():
+    with pytest.raises(ValueError, match="no loss"):
+        TrainingConfig(geometric=None, alignment_weight=0.0)
+    with pytest.raises(ValueError, match="no loss"):
+        TrainingConfig(geometric_weight=0.0, alignment_weight=0.0)
+
+
+def test_without_surfaces_or_scores_those_parts_are_zero():
+    T = torch.eye(4)[None]
+    parts = loss(estimate_of(off(2.0), scores=torch.zeros(1, 0)), batch_of(T), TrainingConfig())
+    assert [float(getattr(parts, name)) for name in PARTS[2:]] == [0.0, 0.0, 0.0]
+    assert parts.alignment > 0.0
+
+
+def test_what_is_not_believed_does_not_count():
+    targets = torch.eye(4).repeat(3, 1, 1)
+    T = torch.cat([off(2.0), off(50.0, 9.0), off(0.0, 0.1)])
+    scores = torch.randn(3, WIDTH, generator=torch.Generator().manual_seed(1))
+    some = loss(estimate_of(T, scores=scores), batch_of(targets, [True, False, True]))
+    without = loss(estimate_of(T[::2], scores=scores[::2]), batch_of(targets[::2]))
+    for name in ("total", *PARTS):
+        torch.testing.assert_close(getattr(some, name), getattr(without, name))
+
+
+def test_nothing_believed_costs_nothing_and_pulls_nowhere():
+    xi = torch.full((2, 6), 0.3, requires_grad=True)
+    parts = loss(estimate_of(exp(xi)), batch_of(torch.eye(4).repeat(2, 1, 1), [False, False]))
+    assert float(parts.total.detach()) == 0.0
+    (gradient,) = torch.autograd.grad(parts.total, xi)
+    assert not gradient.any()
+
+
+def test_confidence_does_not_reach_the_motion():
+    xi = torch.tensor([[0.01, 0.0, 0.02, 0.1, 0.0, -0.2]], requires_grad=True)
+    log_sigma = torch.full((1, 6), -2.0, requires_grad=True)
+    parts = loss(Estimate(exp(xi), log_sigma, torch.zeros(1, WIDTH)), batch_of(torch.eye(4)[None]))
+    reached = torch.autograd.grad(parts.confidence, [xi, log_sigma], allow_unused=True)
+    assert reached[0] is None
+    assert reached[1] is not None
+
+
+def test_confidence_is_best_at_the_standard_deviation_of_a_laplace_distribution():
+    """Over many errors drawn from one the gradient vanishes at its standard deviation."""
+    g = torch.Generator().manual_seed(0)
+    uniform = torch.rand(50_000, generator=g, dtype=torch.float64) - 0.5
+    sigma = 0.02
+    errors = -uniform.sign() * torch.log1p(-2.0 * uniform.abs()) * (sigma / math.sqrt(2.0))
+    xi = torch.zeros(len(errors), 6, dtype=torch.float64)
+    xi[:, 4] = errors
+    log_sigma = torch.tensor(math.log(sigma), dtype=torch.float64, requires_grad=True)
+    estimate = Estimate(exp(xi), log_sigma.expand(len(errors), 6), torch.zeros(len(errors), 0))
+    confidence = loss(estimate, batch_of(torch.eye(4, dtype=torch.float64).expand(len(errors), 4, 4))).confidence
+    (gradient,) = torch.autograd.grad(confidence, log_sigma)
+    # Five directions without an error pull by one each.
+    assert float(gradient) == pytest.approx(5.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("columns", "shares"),
+    [
+        (0.0, {0: 1.0}),
+        (3.0, {3: 1.0}),
+        (3.25, {3: 0.75, 4: 0.25}),
+        (-0.25, {WIDTH - 1: 0.25, 0: 0.75}),
+        (-5.0, {WIDTH - 5: 1.0}),
+        (11.5, {11: 0.5, 12: 0.5}),
+        (-11.5, {12: 0.5, 13: 0.5}),
+    ],
+)
+def test_the_turn_is_shared_by_the_columns_around_it(columns, shares):
+    scores = torch.zeros(1, WIDTH, requires_grad=True)
+    parts = loss(estimate_of(torch.eye(4)[None], scores=scores), batch_of(yaw(columns)))
+    assert float(parts.turn.detach()) == pytest.approx(math.log(WIDTH), rel=1e-5)
+    (gradient,) = torch.autograd.grad(parts.turn, scores)
+    expected = torch.zeros(WIDTH)
+    for column, share in shares.items():
+        expected[column] = share
+    torch.testing.assert_close(1.0 / WIDTH - gradient[0], expected, rtol=0, atol=1e-5)
+
+
+def test_the_turn_does_not_see_other_motions():
+    target = yaw(3.25)
+    lifted = exp(torch.tensor([[0.0, 0.0, 0.0, 5.0, 6.0, 7.0]])) @ target
+    scores = torch.randn(1, WIDTH, generator=torch.Generator().manual_seed(0))
+    a, b = (loss(estimate_of(T, scores=scores), batch_of(T)).turn for T in (target, lifted))
+    torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("change", [off(1.0), off(0.0, 0.05), off(-1.0), off(0.0, -0.05), yaw(0.1)])
+def test_geometry_is_best_at_the_truth(pair, change):
+    config = TrainingConfig(alignment_weight=0.0)
+    truth = loss(estimate_of(pair.T_prev_curr), pair, config)
+    beside = loss(estimate_of(change @ pair.T_prev_curr), pair, config)
+    # The nearest point of some is that of another wall.
+    assert truth.point_to_plane < 5e-4
+    assert beside.point_to_plane > truth.point_to_plane + 2e-4
+
+
+def test_geometry_compares_the_compensated_surfaces(pair):
+    """Not what the network sees."""
+    blind = PairBatch(
+        torch.zeros_like(pair.previous), torch.zeros_like(pair.current), pair.previous_surfaces,
+        pair.current_surfaces, pair.T_prev_curr, pair.believed,
+    )  # fmt: skip
+    config = TrainingConfig(alignment_weight=0.0)
+    estimate = estimate_of(off(1.0) @ pair.T_prev_curr)
+    assert torch.equal(loss(estimate, blind, config).total, loss(estimate, pair, config).total)
+
+
+def test_geometry_pulls_towards_the_truth(pair):
+    xi = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 0.04]], requires_grad=True)
+    parts = loss(estimate_of(exp(xi) @ pair.T_prev_curr), pair, TrainingConfig(alignment_weight=0.0))
+    (gradient,) = torch.autograd.grad(parts.total, xi)
+    assert gradient[0, 5] > 0.01
+
+
+@pytest.mark.parametrize(("with_normal", "same"), [(16 * 96, False), (60, True)])
+def test_the_points_looked_up_are_drawn_at_random_from_those_with_normals(pair, with_normal, same):
+    """Where there are fewer than are wanted, all of them are looked up whatever the draw."""
+    assert pair.current_surfaces is not None
+    chosen = torch.randperm(16 * 96, generator=torch.Generator().manual_seed(0)).view(1, 1, 16, 96) < with_normal
+    sparse = torch.cat([pair.current_surfaces[:, :3], pair.current_surfaces[:, 3:] * chosen], dim=1)
+    batch = PairBatch(pair.previous, pair.current, pair.previous_surfaces, sparse, pair.T_prev_curr, pair.believed)
+    estimate = estimate_of(off(0.0, 0.05) @ pair.T_prev_curr)
+
+    def value(seed: int, points: int = 64) -> float:
+        config = TrainingConfig(alignment_weight=0.0, geometric_points=points)
+        return float(objective(estimate, batch, config, torch.Generator().manual_seed(seed)).point_to_plane)
+
+    assert value(0) == value(0)
+    assert (value(0) == pytest.approx(value(1), rel=1e-5)) == same
+    assert (value(0) == pytest.approx(value(0, 16 * 96), rel=1e-5)) == same
+
+
+def test_inverse_pairs_cost_the_same():
+    """Turned round, a pure rotation or translation is as far from the truth."""
+    T = exp(torch.tensor([[0.0, 0.0, 0.0, 1.0, 2.0, 0.5]]))
+    there = loss(estimate_of(off(0.0, 0.2) @ T), batch_of(T)).alignment
+    back = loss(estimate_of(inverse(off(0.0, 0.2) @ T)), batch_of(inverse(T))).alignment
+    torch.testing.assert_close(there, back)

@@ -1,0 +1,327 @@
+"""Pairs stay the truth's, however they are changed."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from odometry.pairs import PairBatch, Pairs, augmented, pair_of
+from odometry.preparation import PreparedRecording
+from odometry.torch_geometry import exp, inverse, log, rotate, rotation_angle, transform_points
+from odometry.training_config import AugmentationConfig
+
+TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
+NONE = AugmentationConfig(
+    max_gap=1, reverse=0.0, roll=0.0, roll_deg=0.0, any_roll=0.0, mirror=0.0, scale=0.0, drop_beams=0.0,
+    drop_points=0.0, hide_sector=0.0, range_noise_m=0.0,
+)  # fmt: skip
+WORN = {"drop_beams": 1.0, "drop_points": 0.5, "hide_sector": 1.0, "range_noise_m": 0.05}
+
+
+def only(**options: object) -> AugmentationConfig:
+    return AugmentationConfig.model_validate({**NONE.model_dump(), **options})
+
+
+@pytest.fixture(scope="module")
+def recording(small_room) -> PreparedRecording:
+    return small_room.recording(4, TWIST)
+
+
+def motion(steps: float = 1.0) -> Tensor:
+    return exp(0.1 * steps * torch.tensor(TWIST, dtype=torch.float64)).float()
+
+
+def same(a: PairBatch, b: PairBatch) -> bool:
+    return all(
+        x is y if x is None or y is None else torch.equal(x, y)
+        for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
+    )
+
+
+def fit(batch: PairBatch, item: int) -> tuple[Tensor, Tensor]:
+    """Of the current points moved onto the previous ones: distances to the nearest, ascending, and normals' cosines.
+
+    Distances are in units of the previous scan's greatest range, which no augmentation changes but scaling.
+    """
+    assert batch.previous_surfaces is not None
+    assert batch.current_surfaces is not None
+    previous, current = (s[item].flatten(1).double().T for s in (batch.previous_surfaces, batch.current_surfaces))
+    T = batch.T_prev_curr[item].double()
+    distance, nearest = torch.cdist(transform_points(T, current[:, :3]), previous[:, :3]).min(dim=1)
+    cosine = (rotate(T, current[:, 3:]) * previous[nearest, 3:]).sum(1)
+    order = distance.argsort()
+    return distance[order] / previous[:, :3].norm(dim=1).max(), cosine[order]
+
+
+def test_a_pair_as_it_is(recording):
+    pair = pair_of(recording, 1, 2)
+    torch.testing.assert_close(pair.T_prev_curr[0], motion())
+    for images, number in ((pair.previous, 1), (pair.current, 2)):
+        assert torch.equal(images[0, :3], recording.images.points[number])
+        assert torch.equal(images[0, 3:], recording.images.normals[number])
+    assert pair.believed.tolist() == [True]
+    plain = pair_of(recording, 1, 2, surfaces=False)
+    assert plain.previous_surfaces is None
+    assert plain.current_surfaces is None
+
+
+@pytest.mark.parametrize("gap", [1, 2, 3])
+def test_motions_add_up_over_gaps(recording, gap):
+    torch.testing.assert_close(pair_of(recording, 0, gap).T_prev_curr[0], motion(gap), rtol=0, atol=1e-6)
+
+
+def test_motions_add_up_in_their_order(recording):
+    g = torch.Generator().manual_seed(0)
+    T = exp(torch.randn(3, 6, generator=g))
+    uneven = replace(recording, T_prev_curr=T)
+    torch.testing.assert_close(pair_of(uneven, 0, 3).T_prev_curr[0], T[0] @ T[1] @ T[2])
+    torch.testing.assert_close(pair_of(uneven, 1, 2).T_prev_curr[0], T[1])
+
+
+@pytest.mark.parametrize(("previous", "current"), [(0, 1), (2, 3), (0, 3)])
+def test_surfaces_are_those_seen_from_the_middle_of_the_sweep(small_room, recording, previous, current):
+    """Laid on one another by the motion, walls are on walls."""
+    pair = pair_of(recording, previous, current)
+    surfaces = torch.stack([s[0] for s in (pair.previous_surfaces, pair.current_surfaces)])
+    raw = torch.stack([pair.previous[0], pair.current[0]])
+    poses = torch.stack([motion(previous), motion(current)])
+    assert wall_distance(poses, surfaces) < 0.002
+    assert wall_distance(poses, raw) > 0.05
+
+
+def wall_distance(poses: Tensor, images: Tensor) -> float:
+    """The greatest distance from the outer walls of points whose normals are along y, and that lie near those."""
+    points = transform_points(poses, images[:, :3].flatten(2).mT)
+    normals = rotate(poses, images[:, 3:].flatten(2).mT)
+    outside = (normals[..., 1].abs() > 0.9) & (points[..., 1].abs() > 4.6)
+    return float((points[outside][:, 1].abs() - 5.0).abs().max())
+
+
+@pytest.mark.parametrize(("motion_number", "previous_is_same", "current_is_same"), [(1, True, False), (2, True, True)])
+def test_a_sweep_is_as_fast_as_the_motions_around_it(recording, motion_number, previous_is_same, current_is_same):
+    """Of the pair 0, 1 the second motion tells of scan 1 alone, the third of none."""
+    T = recording.T_prev_curr.clone()
+    T[motion_number] = exp(torch.tensor([0.0, 0.0, 0.3, 0.5, 0.0, 0.0]))
+    changed, same_as = pair_of(replace(recording, T_prev_curr=T), 0, 1), pair_of(recording, 0, 1)
+    assert torch.equal(changed.previous_surfaces, same_as.previous_surfaces) == previous_is_same
+    assert torch.equal(changed.current_surfaces, same_as.current_surfaces) == current_is_same
+
+
+def test_the_believed_alone_tell_how_fast_a_sweep_was(small_room):
+    good = small_room.recording(3, TWIST)
+    bad = small_room.recording(3, TWIST)
+    bad.T_prev_curr[0] = exp(torch.tensor([0.5, 0.0, 1.0, 3.0, 0.0, 0.0]))
+    bad.believed[0] = False
+    for mine, truth in zip(_surfaces(pair_of(bad, 1, 2)), _surfaces(pair_of(good, 1, 2)), strict=True):
+        torch.testing.assert_close(mine, truth, rtol=0, atol=1e-5)
+    bad.believed[1] = False
+    still = pair_of(bad, 1, 2)
+    assert torch.equal(still.previous, still.previous_surfaces)
+
+
+def _surfaces(pair: PairBatch) -> tuple[Tensor | None, Tensor | None]:
+    return pair.previous_surfaces, pair.current_surfaces
+
+
+def test_a_pair_is_believed_if_all_motions_between_are(recording):
+    doubtful = PreparedRecording(
+        recording.images, recording.interval_s, recording.T_prev_curr, torch.tensor([True, False, True]),
+        recording.share,
+    )  # fmt: skip
+    pairs = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
+    assert [bool(pair_of(doubtful, *pair).believed) for pair in pairs] == [True, False, True, False, False]
+
+
+def test_the_same_step_gives_the_same_pairs(recording):
+    a, b = (Pairs([recording], AugmentationConfig(), seed=3) for _ in range(2))
+    a.batch(8, 2)
+    assert same(a.batch(7, 3), b.batch(7, 3))
+
+
+@pytest.mark.parametrize("other", [{"step": 8}, {"process": 1}, {"seed": 4}])
+def test_other_steps_processes_and_seeds_give_others(recording, other):
+    def batch(seed: int = 3, step: int = 7, process: int = 0) -> PairBatch:
+        return Pairs([recording], AugmentationConfig(), seed).batch(step, 3, process)
+
+    assert not torch.equal(batch(**other).T_prev_curr, batch().T_prev_curr)
+    assert not torch.equal(batch(**other).previous, batch().previous)
+
+
+def test_seeds_may_be_large(recording):
+    assert len(Pairs([recording], NONE, 2**40).batch(0, 1).previous) == 1
+
+
+def test_no_recordings_are_told():
+    with pytest.raises(ValueError, match="recording"):
+        Pairs([], NONE, 0)
+
+
+def test_recordings_are_equally_likely(small_room, recording):
+    short = small_room.recording(2, (0.0, 0.0, 0.0, 3.0, 0.0, 0.0))
+    batch = Pairs([recording, short], NONE, 0, surfaces=False).batch(0, 200)
+    forwards = (batch.T_prev_curr[:, :3, 3].norm(dim=1) - 0.3).abs() < 1e-4
+    assert 75 < int(forwards.sum()) < 125
+
+
+def test_gaps_are_drawn_up_to_the_greatest_and_the_recordings_length(small_room, recording):
+    steps = Pairs([recording], only(max_gap=2), 0, surfaces=False).batch(0, 60)
+    angles = rotation_angle(steps.T_prev_curr) / rotation_angle(motion())
+    assert set(angles.round(decimals=2).tolist()) == {1.0, 2.0}
+    short = Pairs([small_room.recording(2, TWIST)], only(max_gap=5), 0, surfaces=False).batch(0, 10)
+    assert len(short.previous) == 10
+
+
+AUGMENTATIONS: dict[str, dict[str, object]] = {
+    "turned_alike": {},
+    "roll": {"roll": 1.0, "roll_deg": 20.0},
+    "any_roll": {"roll": 1.0, "any_roll": 1.0},
+    "mirror": {"mirror": 1.0},
+    "scale": {"scale": 0.5},
+    "reverse": {"reverse": 1.0},
+    "all": {"roll": 0.8, "roll_deg": 12.0, "any_roll": 0.2, "mirror": 0.5, "scale": 0.3},
+}
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+@pytest.mark.parametrize("gap", [1, 2])
+def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
+    """Moved by it the current points lie on the previous ones where they lay before."""
+    as_it_is = pair_of(recording, 0, gap)
+    if name == "reverse":
+        two = pair_of(recording, 0, 1)
+        batch = Pairs([_first_two(recording)], only(reverse=1.0), 0).batch(0, 3)
+        expected = fit(PairBatch(
+            two.current, two.previous, two.current_surfaces, two.previous_surfaces, inverse(two.T_prev_curr),
+            two.believed,
+        ), 0)  # fmt: skip
+    else:
+        several = PairBatch(*(torch.cat([v] * 3) for v in vars(as_it_is).values()))
+        generator = torch.Generator().manual_seed(1)
+        batch = augmented(several, only(**AUGMENTATIONS[name]), generator)
+        expected = fit(as_it_is, 0)
+    for item in range(3):
+        distance, cosine = fit(batch, item)
+        torch.testing.assert_close(distance, expected[0], rtol=0, atol=1e-6)
+        assert (cosine - expected[1]).abs().median() < 1e-6
+        torch.testing.assert_close(cosine.mean(), expected[1].mean(), rtol=0, atol=1e-3)
+        wrong = PairBatch(
+            batch.previous, batch.current, batch.previous_surfaces, batch.current_surfaces,
+            exp(torch.tensor([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])) @ batch.T_prev_curr, batch.believed,
+        )  # fmt: skip
+        assert (fit(wrong, item)[0] - expected[0]).abs().max() > 1e-5
+
+
+def _first_two(recording: PreparedRecording) -> PreparedRecording:
+    return PreparedRecording(
+        recording.images.select(slice(0, 2)), recording.interval_s[:1], recording.T_prev_curr[:1],
+        recording.believed[:1], recording.share[:1],
+    )  # fmt: skip
+
+
+def test_what_the_network_sees_is_changed_like_the_surfaces(recording):
+    """Raw sweeps and compensated ones go the same way; seen here where they are the same."""
+    still = PreparedRecording(
+        recording.images, recording.interval_s, recording.T_prev_curr, torch.zeros(3, dtype=torch.bool),
+        recording.share,
+    )  # fmt: skip
+    batch = Pairs([still], only(**AUGMENTATIONS["all"], reverse=0.5), 0).batch(0, 8)
+    assert torch.equal(batch.previous, batch.previous_surfaces)
+    assert torch.equal(batch.current, batch.current_surfaces)
+
+
+def test_mirrors_turn_the_other_way_round(recording):
+    batch = Pairs([recording], only(mirror=0.5), 0, surfaces=False).batch(0, 40)
+    yaw = log(batch.T_prev_curr)[:, 2]
+    torch.testing.assert_close(yaw.abs(), yaw[0].abs().expand(40), rtol=0, atol=1e-5)
+    assert 10 < int((yaw < 0.0).sum()) < 30
+
+
+def test_rolls_are_of_whole_columns_and_of_the_size_asked_for(small_room):
+    rest = small_room.recording(2, (0.0,) * 6)
+    batch = Pairs([rest], only(roll=0.75, roll_deg=20.0), 0, surfaces=False).batch(0, 300)
+    columns = log(batch.T_prev_curr)[:, 2] * (96 / (2.0 * math.pi))
+    torch.testing.assert_close(columns, columns.round(), rtol=0, atol=1e-3)
+    assert float(columns.std()) == pytest.approx(math.sqrt(0.75) * 20.0 * 96 / 360.0, rel=0.15)
+
+
+def test_scales_are_as_often_up_as_down(recording):
+    batch = Pairs([recording], only(scale=0.3), 0, surfaces=False).batch(0, 200)
+    scale = batch.T_prev_curr[:, :3, 3].norm(dim=1) / motion()[:3, 3].norm()
+    assert scale.max() < 1.3
+    assert scale.max() > 1.25
+    assert scale.min() > 1.0 / 1.3
+    assert float(scale.log().mean()) == pytest.approx(0.0, abs=0.03)
+    torch.testing.assert_close(batch.previous[:, 3:].norm(dim=1), torch.ones(200, 16, 96), rtol=0, atol=1e-5)
+
+
+def _with_holes(recording: PreparedRecording) -> PairBatch:
+    pair = pair_of(recording, 0, 1)
+    holes = torch.rand(1, 1, 16, 96, generator=torch.Generator().manual_seed(0)) < 0.2
+    return pair.with_images(lambda images: images * ~holes, pair.T_prev_curr)
+
+
+@pytest.mark.parametrize("name", WORN)
+def test_worn_scans_gain_nothing_and_surfaces_are_spared(recording, name):
+    whole = _with_holes(recording)
+    several = PairBatch(*(torch.cat([v] * 8) for v in vars(whole).values()))
+    worn = augmented(several, only(**{name: WORN[name]}), torch.Generator().manual_seed(2))
+    for before, after in ((worn.previous_surfaces, worn.previous), (worn.current_surfaces, worn.current)):
+        there, left = (images[:, :3].square().sum(1) > 0.0 for images in (before, after))
+        assert (left & ~there).sum() == 0
+        assert (after[:, 3:].square().sum(1) > 0.5).le(left).all()
+        if name == "range_noise_m":
+            assert torch.equal(left, there)
+        else:
+            assert (there & ~left).any()
+    torch.testing.assert_close(rotation_angle(worn.T_prev_curr), rotation_angle(several.T_prev_curr))
+
+
+def _worn(recording: PreparedRecording, **options: object) -> Tensor:
+    """(B, H, W) the pixels that are left of full images."""
+    batch = Pairs([recording], only(**options), 0, surfaces=False).batch(0, 60)
+    return batch.current[:, :3].square().sum(1) > 0.0
+
+
+def test_beams_go_as_a_whole_and_at_most_half_of_them_on_average(recording):
+    left = _worn(recording, drop_beams=1.0)
+    rows = left.any(2)
+    assert torch.equal(left, rows[:, :, None].expand_as(left))
+    assert float(rows.float().mean()) == pytest.approx(0.75, abs=0.05)
+
+
+def test_points_go_each_on_its_own(recording):
+    left = _worn(recording, drop_points=0.5)
+    assert float(left.float().mean()) == pytest.approx(0.75, abs=0.05)
+    assert left.flatten(1).float().mean(1).min() > 0.45
+    assert left.any(2).all()
+
+
+def test_a_sector_goes_in_one_piece(recording):
+    left = _worn(recording, hide_sector=1.0)
+    columns = left.any(1)
+    assert torch.equal(left, columns[:, None].expand_as(left))
+    assert ((columns != columns.roll(1, 1)).sum(1) <= 2).all()
+    assert columns.float().mean(1).min() >= 0.74
+    assert float(columns.float().mean()) == pytest.approx(0.875, abs=0.03)
+
+
+def test_noise_is_along_the_rays_and_of_the_size_asked_for(recording):
+    pair = pair_of(recording, 0, 1, surfaces=False)
+    several = PairBatch(*(None if v is None else torch.cat([v] * 40) for v in vars(pair).values()))
+    quiet, noisy = (
+        augmented(several, only(range_noise_m=sigma), torch.Generator().manual_seed(5)) for sigma in (0.0, 0.05)
+    )
+    before, after = (b.previous[:, :3].double() for b in (quiet, noisy))
+    ranges = before.norm(dim=1)
+    torch.testing.assert_close(torch.nn.functional.cosine_similarity(before, after), torch.ones_like(ranges))
+    spread = (after.norm(dim=1) - ranges)[ranges > 1.0].view(-1).std()
+    # A standard deviation that is drawn evenly up to s makes s / sqrt(3) in all.
+    assert float(spread) == pytest.approx(0.05 / math.sqrt(3.0), rel=0.2)
+
+
+def test_a_batch_moves_between_devices(recording):
+    batch = Pairs([recording], NONE, 0, surfaces=False).batch(0, 2)
+    assert same(batch.to(torch.device("cpu")), batch)
+    assert batch.to(torch.device("meta")).previous.device.type == "meta"

@@ -1,0 +1,133 @@
+"""Motions of recordings that are known, found without a guess."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lidarslam.core.scan import Scan
+from odometry.alignment import SweepImages
+from odometry.image_config import ImageConfig
+from odometry.preparation import compensated, prepare
+from odometry.torch_geometry import exp, inverse, log
+
+CONFIG = ImageConfig(rows=16, columns=360)
+SLOW = (0.05, -0.05, 0.1, 1.0, 0.3, 0.1)
+TURNING = (0.0, 0.0, math.radians(120.0), 1.0, 0.3, 0.0)
+
+
+def errors(recording, twist):
+    """Of each motion, degrees and metres."""
+    truth = exp(0.1 * torch.tensor(twist, dtype=torch.float64))
+    error = log(recording.T_prev_curr.double() @ inverse(truth))
+    return error[:, :3].norm(dim=1).rad2deg(), error[:, 3:].norm(dim=1)
+
+
+@pytest.mark.parametrize("twist", [SLOW, TURNING])
+def test_motions_are_found_from_scratch(box_room, twist):
+    recording = prepare(box_room.scans(10, twist), CONFIG)  # more than are made into images at a time
+    assert len(recording) == 10
+    assert recording.images.points.shape == (10, 3, 16, 360)
+    rotation_deg, translation_m = errors(recording, twist)
+    # The rest is that of normals near edges.
+    assert rotation_deg.max() < 0.15
+    assert translation_m.max() < 0.003
+    assert recording.believed.all()
+    assert recording.share.min() > 0.95
+    torch.testing.assert_close(recording.interval_s, torch.full((9,), 0.1), rtol=0, atol=1e-6)
+
+
+def test_sudden_turns_are_found_from_rest(box_room):
+    """More than alignment finds its way over by itself, with other motions on top."""
+    fast = (0.0, 0.0, math.radians(-250.0), 1.0, 0.3, 0.0)
+    images = box_room.sweeps(2, fast, rolling=False)
+    points = images.points.flatten(2).mT.double().numpy()
+    recording = prepare([Scan(points[i], 0.1 * i) for i in range(2)], CONFIG)
+    assert recording.believed.all()
+    assert errors(recording, fast)[0].max() < 0.15
+    assert errors(recording, fast)[1].max() < 0.003
+
+
+def test_intervals_are_from_middle_to_middle(box_room):
+    scans = box_room.scans(3, SLOW)
+    scans[1] = Scan(scans[1].points, scans[1].stamp + 0.1, scans[1].time_offsets - 0.1)  # the same, stamped at its end
+    recording = prepare(scans, CONFIG)
+    torch.testing.assert_close(recording.interval_s, torch.full((2,), 0.1), rtol=0, atol=1e-6)
+    assert errors(recording, SLOW)[0].max() < 0.15
+
+
+def test_scans_of_different_places_are_not_believed(box_room, corridor):
+    scans = [*box_room.scans(2, SLOW), *corridor.scans(2, SLOW)]
+    assert prepare(scans, CONFIG).believed.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["noise", "empty"])
+def test_one_bad_scan_does_not_lose_those_after_it(box_room, kind):
+    scans = box_room.scans(6, TURNING)
+    points = np.random.default_rng(0).normal(size=(4000 if kind == "noise" else 0, 3))
+    scans[2] = Scan.from_raw(3.0 * points, scans[2].stamp + 0.05)
+    recording = prepare(scans, CONFIG)
+    assert recording.believed.tolist() == [True, False, False, True, True]
+    rotation_deg, translation_m = (error[recording.believed] for error in errors(recording, TURNING))
+    assert rotation_deg.max() < 0.15
+    assert translation_m.max() < 0.003
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_pairs_need_two_scans(box_room, count):
+    with pytest.raises(ValueError, match=f"this recording has {count}"):
+        prepare(box_room.scans(2, SLOW)[:count], CONFIG)
+
+
+def test_scans_at_one_time_do_not_move_infinitely_fast(box_room):
+    scan = box_room.scans(1, SLOW)[0]
+    recording = prepare([scan, scan], CONFIG)
+    assert recording.interval_s > 0.0
+    assert recording.T_prev_curr.isfinite().all()
+
+
+def test_a_compensated_sweep_is_what_would_be_seen_at_rest(box_room):
+    """Its points lie on the walls as seen from the middle of the sweep; its times are gone."""
+    raw = box_room.sweeps(1, TURNING)
+    still = compensated(raw, torch.tensor([TURNING]))
+    assert not still.offsets.any()
+    assert wall_distance(raw) > 0.2
+    assert wall_distance(still) < 0.002
+    along_axis = still.normals.abs().amax(1)[still.normals.square().sum(1) > 0.5]
+    assert along_axis.min() > math.cos(math.radians(0.1))
+
+
+def wall_distance(images):
+    """The greatest distance, metres, of points with a normal along x or y from the walls of the room and its boxes."""
+    x, y = images.points[:, 0], images.points[:, 1]
+    sides = [
+        (x, (-7.0, 7.0, 2.6, 3.4, -4.6, -3.4, -2.3, -1.7, 4.5, 5.5)),
+        (y, (-5.0, 5.0, 1.6, 2.4, -3.6, -2.4, 3.2, 3.8, -2.5, -1.5)),
+    ]
+    normals = images.normals.abs()
+    worst = 0.0
+    for axis, (values, planes) in enumerate(sides):
+        here = normals[:, axis] > 0.9
+        worst = max(worst, float((values[here][:, None] - torch.tensor(planes)).abs().amin(1).max()))
+    return worst
+
+
+def test_compensation_back_and_forth_is_none(box_room):
+    raw = box_room.sweeps(2, TURNING)
+    velocity = torch.tensor([TURNING, SLOW])
+    still = compensated(raw, velocity)
+    back = compensated(SweepImages(still.points, still.normals, -raw.offsets, raw.low, raw.high), velocity)
+    torch.testing.assert_close(back.points, raw.points, rtol=0, atol=3e-4)
+    torch.testing.assert_close(back.normals, raw.normals, rtol=0, atol=4e-5)
+
+
+def test_compensation_of_nothing_stays_nothing(box_room):
+    full = box_room.sweeps(1, TURNING)
+    seen = torch.rand(1, 1, 16, 360, generator=torch.Generator().manual_seed(0)) < 0.5
+    raw = SweepImages(full.points * seen, full.normals * seen, full.offsets, full.low, full.high)
+    empty = ~seen[:, 0]
+    still = compensated(raw, torch.tensor([TURNING]))
+    assert torch.equal(still.points.square().sum(1) == 0.0, empty)
+    assert torch.equal(still.normals.square().sum(1) == 0.0, empty)
+    assert torch.equal(compensated(raw, torch.zeros(1, 6)).points, raw.points)

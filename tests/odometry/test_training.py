@@ -1,0 +1,192 @@
+"""The course of training, and what validation says of networks whose errors are known."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from odometry.correlation import CorrelationNetwork, Estimate
+from odometry.network_config import CorrelationConfig
+from odometry.pairs import pair_of
+from odometry.preparation import PreparedRecording
+from odometry.torch_geometry import exp
+from odometry.training import learning_rate, loss_of, make_optimizer, summarise, validate
+from odometry.training_config import TrainingConfig
+
+TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
+SCHEDULE = TrainingConfig(learning_rate=1e-3, warmup_steps=10, steps=110)
+
+
+@pytest.mark.parametrize(("step", "rate"), [(0, 1e-4), (4, 5e-4), (9, 1e-3), (10, 1e-3), (60, 0.505e-3), (110, 1e-5)])
+def test_the_learning_rate_rises_and_falls(step, rate):
+    assert learning_rate(step, SCHEDULE) == pytest.approx(rate, rel=1e-9)
+
+
+def test_the_learning_rate_falls_without_a_leap():
+    rates = [learning_rate(step, SCHEDULE) for step in range(9, 110)]
+    assert rates == sorted(rates, reverse=True)
+    assert max(a - b for a, b in pairwise(rates)) < 1.6e-5
+
+
+def test_warming_up_may_be_left_out_or_take_all():
+    assert learning_rate(0, TrainingConfig(warmup_steps=0, steps=1)) == 1e-3
+    assert learning_rate(4, TrainingConfig(warmup_steps=10, steps=5)) == pytest.approx(5e-4)
+
+
+def test_weights_are_decayed_and_nothing_else():
+    network = CorrelationNetwork(CorrelationConfig())
+    optimizer = make_optimizer(network, TrainingConfig(weight_decay=0.125, learning_rate=0.01))
+    decay = {id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]}
+    assert sum(len(group["params"]) for group in optimizer.param_groups) == len(decay)
+    assert len(decay) == len(list(network.parameters()))
+    for name, parameter in network.named_parameters():
+        is_weight = name.endswith("weight") and "norm" not in name
+        assert decay[id(parameter)] == (0.125 if is_weight else 0.0), name
+    assert {group["lr"] for group in optimizer.param_groups} == {0.01}
+
+
+def test_a_few_steps_bring_the_loss_down(small_room):
+    torch.manual_seed(0)
+    network = CorrelationNetwork(CorrelationConfig(widths=(8, 16, 16), pair_width=16))
+    config = TrainingConfig(learning_rate=3e-3, geometric_points=128)
+    optimizer = make_optimizer(network, config)
+    pair = pair_of(small_room.recording(2, TWIST), 0, 1)
+    generator = torch.Generator().manual_seed(0)
+    alignment = []
+    for _ in range(15):
+        loss = loss_of(network, pair, config, generator)
+        optimizer.zero_grad()
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        alignment.append(float(loss.alignment.detach()))
+    assert alignment[-1] < 0.5 * alignment[0]
+
+
+def test_the_loss_is_that_of_single_encodings(small_room):
+    """Encoding both scans together changes nothing."""
+    torch.manual_seed(0)
+    network = CorrelationNetwork(CorrelationConfig(widths=(8, 16, 16), pair_width=16))
+    pair = pair_of(small_room.recording(2, TWIST), 0, 1)
+    config = TrainingConfig(geometric=None)
+    turned = replace(pair, previous=pair.current, current=pair.previous)
+    with torch.no_grad():
+        previous, current = (network.encode(i[:, :3], i[:, 3:]) for i in (pair.previous, pair.current))
+        loss, other = (loss_of(network, p, config, torch.Generator()) for p in (pair, turned))
+        scores = network(previous, current).turn_scores.log_softmax(1)
+    column = 0.08 * 24 / (2.0 * math.pi)  # the turn of the pair, of which two columns have a share
+    expected = -(1.0 - column) * scores[0, 0] - column * scores[0, 1]
+    torch.testing.assert_close(loss.turn, expected, rtol=0, atol=1e-4)
+    assert abs(float(loss.alignment - other.alignment)) > 0.01
+
+
+def test_half_precision_stops_before_the_loss(small_room):
+    torch.manual_seed(0)
+    network = CorrelationNetwork(CorrelationConfig(widths=(8, 16, 16), pair_width=16))
+    pair = pair_of(small_room.recording(2, TWIST), 0, 1)
+    config = TrainingConfig(geometric=None)
+    with torch.no_grad():
+        exact = loss_of(network, pair, config, torch.Generator())
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            half = loss_of(network, pair, config, torch.Generator())
+    assert half.total.dtype == torch.float32
+    torch.testing.assert_close(half.alignment, exact.alignment, rtol=0.05, atol=0.1)
+
+
+class Stub(nn.Module):
+    """Knows the truth by the number of the scan, which it finds in the first pixel, and errs by what it is told.
+
+    Attributes:
+        errors: (N, 6) by the number of the previous scan.
+        sizes: of the batches it was given to encode.
+    """
+
+    def __init__(self, errors: Tensor, log_sigma: float) -> None:
+        super().__init__()
+        self.errors, self.log_sigma = errors, log_sigma
+        self.sizes: list[int] = []
+
+    def encode(self, points: Tensor, normals: Tensor) -> Tensor:
+        assert normals.dtype == torch.float32  # recordings may keep halves
+        self.sizes.append(len(points))
+        return points[:, 0, 0, 0]
+
+    def forward(self, previous: Tensor, current: Tensor) -> Estimate:
+        steps = current - previous
+        truth = exp(0.1 * steps[:, None] * torch.tensor([TWIST]))
+        T = exp(self.errors[previous.long()]) @ truth
+        return Estimate(T, torch.full((len(T), 6), self.log_sigma), torch.zeros(len(T), 0))
+
+
+def numbered(count: int, small_room) -> PreparedRecording:
+    recording = small_room.recording(2, TWIST)
+    points = torch.arange(count, dtype=torch.float32)[:, None, None, None].expand(count, 3, 4, 8)
+    images = replace(
+        recording.images, points=points, normals=points.half(), offsets=torch.zeros(count, 4, 8),
+        low=torch.zeros(count), high=torch.ones(count),
+    )  # fmt: skip
+    T = recording.T_prev_curr.expand(count - 1, 4, 4)
+    return PreparedRecording(images, torch.ones(count - 1), T, torch.ones(count - 1) > 0, torch.ones(count - 1))
+
+
+def known_errors(count: int) -> Tensor:
+    """(count, 6): 1, 2, 3, ... degrees about y, and as many centimetres along z."""
+    errors = torch.zeros(count, 6)
+    errors[:, 1] = torch.deg2rad(torch.arange(1.0, count + 1.0))
+    errors[:, 5] = 0.01 * torch.arange(1.0, count + 1.0)
+    return errors
+
+
+def test_validation_tells_known_errors(small_room):
+    recording = numbered(6, small_room)  # five pairs, with errors of 1 to 5
+    found = validate(Stub(known_errors(6), math.log(0.02)), [recording])
+    assert found.pairs == 5
+    assert found.rotation_rms_deg == pytest.approx(math.sqrt(11.0), rel=1e-4)
+    assert found.translation_rms_m == pytest.approx(0.01 * math.sqrt(11.0), rel=1e-4)
+    assert found.rotation_median_deg == pytest.approx(3.0, rel=1e-4)
+    assert found.translation_median_m == pytest.approx(0.03, rel=1e-4)
+    # Of 5 x 6 errors 20 are zero. One sigma holds 1 degree (17 mrad), 1 cm and (just) 2 cm; two sigma (40 mrad) 2
+    # degrees and up to 4 cm; three sigma 3 degrees (52 mrad) and all 5 cm.
+    sigma = 0.02 * 1.001
+    found = validate(Stub(known_errors(6), math.log(sigma)), [recording])
+    assert found.covered_percent == pytest.approx([100.0 * (20 + n) / 30 for n in (1 + 2, 2 + 4, 3 + 5)])
+
+
+def test_validation_leaves_out_what_is_not_believed(small_room):
+    recording = numbered(6, small_room)
+    doubtful = replace(recording, believed=torch.tensor([True, False, True, False, False]))
+    found = validate(Stub(known_errors(6), 0.0), [doubtful])
+    assert found.pairs == 2
+    assert found.rotation_rms_deg == pytest.approx(math.sqrt((1.0 + 9.0) / 2.0), rel=1e-4)
+
+
+def test_validation_is_over_all_recordings_and_gaps(small_room):
+    recordings = [numbered(6, small_room), numbered(20, small_room), numbered(2, small_room)]
+    stub = Stub(known_errors(20), 0.0)
+    assert validate(stub, recordings).pairs == 5 + 19 + 1
+    assert stub.sizes == [6, 16, 4, 2]
+    wide = validate(stub, recordings, gap=3)  # one recording is too short for it
+    assert wide.pairs == 3 + 17
+    squares = sum(n * n for n in range(1, 4)) + sum(n * n for n in range(1, 18))
+    assert wide.rotation_rms_deg == pytest.approx(math.sqrt(squares / 20.0), rel=1e-4)
+
+
+def test_a_network_that_is_right_has_no_error(small_room):
+    found = validate(Stub(torch.zeros(6, 6), -5.0), [numbered(6, small_room)])
+    assert found.rotation_rms_deg < 1e-4
+    assert found.translation_rms_m < 1e-6
+    assert found.covered_percent == (100.0, 100.0, 100.0)
+
+
+def test_coverage_of_a_normal_distribution():
+    g = torch.Generator().manual_seed(0)
+    sigmas = torch.rand(20_000, 6, generator=g) + 0.1
+    found = summarise(torch.randn(20_000, 6, generator=g) * sigmas, sigmas)
+    assert found.covered_percent == pytest.approx((68.27, 95.45, 99.73), abs=0.3)
+
+
+def test_rows_of_network_and_images_agree():
+    with pytest.raises(ValueError, match="must be the same"):
+        TrainingConfig.model_validate({"images": {"rows": 32}})

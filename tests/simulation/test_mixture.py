@@ -1,0 +1,111 @@
+"""Mixtures are drawn by a seed and a number alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.mixture import Excerpt, mixture
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.worlds.registry import WORLDS
+
+SEED = 0
+SCANS = 3
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[Excerpt]:
+    return list(mixture(len(WORLDS), SCANS, SEED))
+
+
+@dataclass
+class Numbered:
+    """A recording whose scans are stamped with their number; remembers which were asked for."""
+
+    count: int
+    made: list[int] = field(default_factory=list)
+    name = "numbered"
+    ground_truth = Trajectory(np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1)))
+
+    def __len__(self) -> int:
+        return self.count
+
+    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+        for number in range(self.count)[start:stop:step]:
+            self.made.append(number)
+            yield Scan(np.ones((1, 3)), float(number))
+
+
+@pytest.mark.parametrize(
+    ("chosen", "expected"),
+    [
+        ((), [10, 11, 12, 13]),
+        ((1,), [11, 12, 13]),
+        ((0, 2), [10, 11]),
+        ((1, 99), [11, 12, 13]),
+        ((0, None, 3), [10, 13]),
+        ((4,), []),
+        ((2, 1), []),
+    ],
+)
+def test_an_excerpt_is_a_recording_of_its_own(chosen, expected):
+    whole = Numbered(20)
+    excerpt = Excerpt(whole, 10, 4)
+    assert len(excerpt) == 4
+    assert [scan.stamp for scan in excerpt.scans(*chosen)] == expected
+    assert whole.made == expected
+    assert excerpt.name == "numbered@10"
+    assert excerpt.ground_truth is whole.ground_truth
+
+
+def test_an_excerpt_is_streamed():
+    whole = Numbered(20)
+    list(islice(Excerpt(whole, 3, 10).scans(), 2))
+    assert whole.made == [3, 4]
+
+
+def test_all_worlds_appear(drawn):
+    assert {simulation(excerpt).world.name for excerpt in drawn} == set(WORLDS)
+    assert len({excerpt.name for excerpt in drawn}) == len(drawn)
+    assert len({simulation(excerpt).sensor.name for excerpt in drawn}) > 2
+    assert len({simulation(excerpt).motion.name for excerpt in drawn}) > 2
+
+
+def test_excerpts_have_so_many_scans_of_their_recording(drawn):
+    for excerpt in drawn:
+        assert len(excerpt) == SCANS
+        assert len(excerpt.whole) == excerpt.first + SCANS
+        truth = excerpt.ground_truth
+        assert truth is not None
+        assert len(truth) == len(excerpt.whole)
+    office = drawn[1]  # quickly cast
+    scans = list(office.scans())
+    stamps = [(office.first + i) / simulation(office).sensor.rate_hz for i in range(SCANS)]
+    assert [scan.stamp for scan in scans] == pytest.approx(stamps)
+    assert min(len(scan) for scan in scans) > 1000
+
+
+def test_a_number_is_the_same_whatever_comes_before_it(drawn):
+    (alone,) = mixture(1, SCANS, SEED, first=1)
+    again, there = simulation(alone), simulation(drawn[1])
+    assert (alone.name, alone.first) == (drawn[1].name, drawn[1].first)
+    np.testing.assert_array_equal(again.T_body_lidar, there.T_body_lidar)
+    scan, other = next(iter(alone.scans())), next(iter(drawn[1].scans()))
+    assert scan.points.tobytes() == other.points.tobytes()
+    assert scan.time_offsets.tobytes() == other.time_offsets.tobytes()
+
+
+def test_another_seed_draws_others(drawn):
+    (other,) = mixture(1, SCANS, SEED + 1, first=1)
+    assert simulation(other).world.name == simulation(drawn[1]).world.name
+    assert simulation(other).world.seed != simulation(drawn[1]).world.seed
+    assert other.name != drawn[1].name
+
+
+def simulation(excerpt: Excerpt) -> Simulation:
+    assert isinstance(excerpt.whole, Simulation)
+    return excerpt.whole
