@@ -3,8 +3,8 @@
     python benchmarks/network_speed.py --threads 2
 
 Prints a table with the processor time and the wall time of each network for a pair of images of the same size, the
-median over `--repeats`. Encodings are kept from pair to pair in the program, so `correlation` is timed as it is used: one
-scan encoded, one pair compared. Then the same for the other stages of the learned odometry on a simulated scan.
+median over `--repeats`. Encodings are kept from pair to pair in the program, so `correlation` is timed as it is used:
+one scan encoded, one pair compared. Then the same for the other stages of the learned odometry on a simulated scan.
 """
 
 import argparse

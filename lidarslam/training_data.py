@@ -28,7 +28,7 @@ PIECE = 500
 # To be raised whenever preparation, or the simulation, computes something else than before.
 _KIND = Kind("a recording prepared for training", version=1)
 _SWEEP = ("points", "normals", "offsets", "low", "high")
-_MOTIONS = ("interval_s", "T_prev_curr", "believed", "share")
+_MOTIONS = ("interval_s", "T_prev_curr", "believed", "explained")
 
 Counter = Callable[[int], None]
 """Told of scans that are ready, how many more."""

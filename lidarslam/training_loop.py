@@ -151,10 +151,11 @@ class TrainingLoop:
             if recordings.held_out:
                 result = validate(network, recordings.held_out, device=self._devices.device)
                 self._log.validation(standing.step, result)
-                is_best = standing.best is None or score(result) < standing.best
+                # Where there is nothing to compare with, the last is as good as any.
+                is_best = not result.pairs or standing.best is None or score(result) < standing.best
                 if is_best:
                     standing.best = score(result)
-                    self._save_weights(files.WEIGHTS, result)
+                    self._save_weights(files.WEIGHTS, result if result.pairs else None)
                 narrator.validated(standing.step, result, is_best)
             else:
                 self._save_weights(files.WEIGHTS, None)

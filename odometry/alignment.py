@@ -18,6 +18,8 @@ from odometry.torch_geometry import exp, inverse, log, skew, transform_points
 _ARRIVED = 1e-4
 # Sine of the angle between beam and surface below which pixels are not taken as any wider.
 _MOST_GRAZING = 0.2
+# Part of the best known direction's information that counts as none.
+_NEXT_TO_NOTHING = 0.02
 # Information that keeps the normal equations solvable where neither the images nor a guess say anything.
 _LEAST_INFORMATION = 1e-3
 
@@ -57,6 +59,10 @@ class Aligned:
         information: (B, 6, 6) of the images alone, rotation first, for a change of `T_prev_curr` from the left, if
             points scattered independently by 1 m about their planes; divide by their variance.
         share: (B,) of the points with a normal that lie on the other image.
+        explained: (B,) of what the current scan says about the direction of translation that fares worst, the part said
+            by points that lie on the other image. Most of a street looks the same a metre on, and lies well on itself;
+            what would tell does not. 1 where the scan says next to nothing of any direction.
+        weakest: (B, 3) that direction, unit, in the previous frame.
         residual_m: (B,) root mean square distance of those from the planes.
         matched: (B,) how many they are.
     """
@@ -64,8 +70,14 @@ class Aligned:
     T_prev_curr: Tensor
     information: Tensor
     share: Tensor
+    explained: Tensor
+    weakest: Tensor
     residual_m: Tensor
     matched: Tensor
+
+    def select(self, chosen: Tensor | slice) -> "Aligned":
+        """Some of the pairs."""
+        return Aligned(*(value[chosen] for value in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,4 +263,22 @@ def _judge(T: Tensor, source: _Cloud, target: SweepImages, interval_s: Tensor, c
     H, _ = _normal_equations(pairs, near.to(T.dtype))
     squares = (pairs.residuals.square() * near).sum(-1)
     share = matched / source.valid.sum(-1).clamp(min=1)
-    return Aligned(T, H, share, (squares / matched.clamp(min=1)).sqrt(), matched)
+    explained, weakest = _explained(source.normals @ T[:, :3, :3].mT, source.valid, near)
+    return Aligned(T, H, share, explained, weakest, (squares / matched.clamp(min=1)).sqrt(), matched)
+
+
+def _explained(normals: Tensor, valid: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """The least ratio (B,), over directions (B, 3), of the information of the points that lie well to that of all.
+
+    The smallest generalised eigenvalue of the two sums of squared normals (B, N, 3). To both a little is added, so that
+    directions of which hardly any point says anything do not count as missed.
+    """
+    everything = (normals * valid[..., None]).mT @ normals
+    matched = (normals * near[..., None]).mT @ normals
+    largest = everything.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1.0)
+    little = (_NEXT_TO_NOTHING * largest)[:, None, None] * torch.eye(3, dtype=normals.dtype, device=normals.device)
+    root = torch.linalg.cholesky((everything + little).double())
+    half = torch.linalg.solve_triangular(root, (matched + little).double(), upper=False)
+    ratio, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(root, half.mT, upper=False))
+    weakest = torch.linalg.solve_triangular(root.mT, vectors[..., :1], upper=True)[..., 0]
+    return ratio[:, 0].to(normals.dtype), torch.nn.functional.normalize(weakest, dim=-1).to(normals.dtype)

@@ -19,4 +19,11 @@ class AlignmentConfig(BaseModel):
     least_cosine: float = Field(0.8, ge=0.0, le=1.0, description="between the normals of a pair")
     residual_m: float = Field(0.03, gt=0.0, description="standard deviation of points about their planes")
     independent_share: float = Field(0.05, gt=0.0, le=1.0, description="of the points whose errors are independent")
+    doubtful: float = Field(
+        0.45, ge=0.0, le=1.0, description="of what a scan says that the two agree on; below, other guesses are tried"
+    )
+    clearly_better: float = Field(0.05, ge=0.0, description="by which more must be agreed on for another guess")
+    search_m: tuple[float, ...] = Field(
+        (0.8, 1.6, 2.4, 3.2), description="distances, to either side, that are tried along the direction in doubt"
+    )
     largest_step: float = Field(0.3, gt=0.0, description="of one Gauss-Newton step, radians and metres")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from odometry.torch_geometry import make_transform, rotation_from_quaternion
+from odometry.torch_geometry import full_precision, make_transform, rotation_from_quaternion
 
 Activation = Literal["tanh", "relu"]
 
@@ -63,8 +63,10 @@ class DeloraNetwork(nn.Module):
         features = self.features(images_prev, images_curr)  # (B, 512, H/2, W/32)
         pooled = self.pool(features).flatten(1)  # (B, 512, 1, 1) -> (B, 512)
         shared = self.trunk(pooled)  # (B, 1000)
-        quaternions = self.rotation(shared)  # (B, 4), w first, of any length
-        return make_transform(rotation_from_quaternion(quaternions), self.translation(shared))
+        with full_precision(shared.device):
+            shared = shared.float()
+            quaternions = self.rotation(shared)  # (B, 4), w first, of any length
+            return make_transform(rotation_from_quaternion(quaternions), self.translation(shared))
 
     def features(self, images_prev: Tensor, images_curr: Tensor) -> Tensor:
         """What is pooled, (B, 512, ceil(H/2), ceil(W/32)): rolling the images by 32 columns rolls it by one."""

@@ -14,5 +14,8 @@ class ImageConfig(BaseModel):
 
     rows: int = Field(16, ge=4, le=256)
     columns: int = Field(720, ge=64, le=4096)
-    order: Literal["elevation", "ring"] = Field("elevation", description="what a row is: an elevation or a laser")
+    order: Literal["elevation", "ring"] = Field(
+        "elevation",
+        description="what a row is: an elevation or a laser, which alignment takes as evenly spaced in elevation",
+    )
     normals: NormalConfig = NormalConfig()

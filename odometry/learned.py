@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, orthonormalize
 from lidarslam.core.scan import Scan
-from odometry.alignment import Aligned, SweepImages, align
+from odometry.alignment import Aligned, SweepImages
+from odometry.alignment_search import align_best
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
@@ -25,6 +26,8 @@ from odometry.sweep_images import Imager, middle_offset_s
 # No motion is better than this, whatever the residuals say: rotation in radians, translation in metres. What bends one
 # sweep bends the next, and whoever fuses motions takes their errors as independent.
 _LEAST_SIGMA = np.array([np.deg2rad(0.5)] * 3 + [0.03] * 3)
+# Rings of points on the ground go along with the sensor and hold alignment back, by a part of the way.
+_HELD_BACK = 0.2
 # Part of a change of motion from one pair to the next that may hide within a sweep.
 _HIDDEN_SHARE = 0.25
 
@@ -80,30 +83,27 @@ class LearnedOdometry:
         if interval_s <= 0.0:
             return Motion(np.eye(4), 0, "the scan is not later than the one before")
         aligned, information = self._align(last, sweep, interval_s)
-        T_prev_curr = aligned.T_prev_curr[0].double().numpy(force=True)
-        matched, share = int(aligned.matched), float(aligned.share)
-        if share < self._config.least_share or matched < self._config.least_points:
+        T_prev_curr = orthonormalize(aligned.T_prev_curr[0].double().numpy(force=True))
+        matched, explained = int(aligned.matched), float(aligned.explained)
+        if explained < self._config.least_explained or matched < self._config.least_points:
             self._T_last, self._T_middle_stamp = None, np.eye(4)
-            return Motion(np.eye(4), 0, f"only {100.0 * share:.0f} % of the scan ({matched} points) fits the last one")
+            return Motion(np.eye(4), 0, f"the scan does not fit the last one: {_misfit(matched, explained)}")
         covariance = _covariance(T_prev_curr, information, self._T_last)
         motion = self._between_stamps(last, sweep, T_prev_curr)
         self._T_last = T_prev_curr
         return Motion(motion, matched, covariance=covariance)
 
     def _align(self, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
-        """The better of the network's guess and, where that lies badly, of going on as before; with its information."""
+        """From the network's guess, or going on as before, or further afield; and the information about it."""
         guess = self._network(last.features, sweep.features)
         information = torch.diag_embed((-2.0 * guess.log_sigma).exp())
-        interval = guess.T_prev_curr.new_tensor([interval_s])
+        guesses = guess.T_prev_curr
+        if self._T_last is not None:
+            guesses = torch.cat([guesses, torch.from_numpy(self._T_last).to(guesses)[None]])
         config = self._config.alignment
-        best = align(guess.T_prev_curr, sweep.images, last.images, interval, config, information)
-        if float(best.share) < self._config.doubtful_share and self._T_last is not None:
-            T_last = torch.from_numpy(self._T_last).to(guess.T_prev_curr)[None]
-            other = align(T_last, sweep.images, last.images, interval, config)
-            if float(other.share) > float(best.share) + self._config.clearly_better:
-                best, information = other, torch.zeros_like(information)
+        aligned = align_best(guesses, sweep.images, last.images, guesses.new_tensor([interval_s]), config, information)
         variance = config.residual_m**2 / config.independent_share
-        return best, (information + best.information / variance)[0]
+        return aligned, (information + aligned.information / variance)[0]
 
     def _between_stamps(self, last: _Sweep, sweep: _Sweep, T_prev_curr: FloatArray) -> FloatArray:
         """The motion between the scans' stamps, from that between the middles of their sweeps.
@@ -121,6 +121,10 @@ class LearnedOdometry:
         return np.asarray(inverse(T_middle_stamp) @ T_last_middle_stamp, dtype=np.float64)
 
 
+def _misfit(matched: int, explained: float) -> str:
+    return f"{matched} points do, which is {100.0 * explained:.0f} % of what it says of one direction"
+
+
 def _covariance(T_prev_curr: FloatArray, information: Tensor, T_last: FloatArray | None) -> FloatArray:
     """(6, 6) of the error `xi` in T_true = T_prev_curr @ exp(xi), rotation first.
 
@@ -130,6 +134,7 @@ def _covariance(T_prev_curr: FloatArray, information: Tensor, T_last: FloatArray
     left = np.linalg.inv(information.double().numpy(force=True) + 1e-6 * np.eye(6))
     A = adjoint(inverse(T_prev_curr))
     covariance = A @ left @ A.T + np.diag(_LEAST_SIGMA**2)
+    covariance[3:, 3:] += np.eye(3) * (_HELD_BACK * np.linalg.norm(T_prev_curr[:3, 3])) ** 2
     if T_last is not None:
         covariance += np.diag((_HIDDEN_SHARE * log(inverse(T_last) @ T_prev_curr)) ** 2)
     return np.asarray(covariance, dtype=np.float64)

@@ -19,9 +19,7 @@ class LearnedConfig(BaseModel):
     threads: int = Field(1, ge=1, description="of torch; mapping works beside it")
     bfloat16: bool = Field(False, description="encode with half the digits, where the device is faster so")
     alignment: AlignmentConfig = AlignmentConfig(column_step=3)
-    doubtful_share: float = Field(
-        0.6, ge=0.0, le=1.0, description="of the points that fit; below, going on as before is tried too"
+    least_explained: float = Field(
+        0.3, ge=0.0, le=1.0, description="of what a scan says that must agree with the last one for it to be believed"
     )
-    clearly_better: float = Field(0.1, ge=0.0, le=1.0, description="by which that must fit more points")
-    least_share: float = Field(0.25, ge=0.0, le=1.0, description="below, the motion is not believed")
-    least_points: int = Field(60, ge=6, description="below, the motion is not believed")
+    least_points: int = Field(60, ge=6, description="that must agree")

@@ -20,7 +20,7 @@ _TRANSLATION_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """A loss and its parts, means over the batch; parts that are switched off are zero."""
+    """A loss and its parts, means over the pairs that are believed; parts that are switched off are zero."""
 
     total: Tensor
     alignment: Tensor
@@ -45,8 +45,8 @@ def objective(estimate: Estimate, batch: PairBatch, config: TrainingConfig, gene
     if config.geometric is not None and surfaces[0] is not None and surfaces[1] is not None:
         current = _surfaces(surfaces[1], config.geometric_points, generator)
         loss = geometric_loss(estimate.T_prev_curr, current, _surfaces(surfaces[0]), config.geometric)
-        planes, normals = loss.point_to_plane.mean(), loss.plane_to_plane.mean()
-        total = total + config.geometric_weight * loss.total.mean()
+        planes, normals = (_mean(part, batch.believed) for part in (loss.point_to_plane, loss.plane_to_plane))
+        total = total + config.geometric_weight * _mean(loss.total, batch.believed)
     return Objective(total, alignment, confidence, turn, planes, normals)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from lidarslam.core.scan import Scan
 from odometry.alignment import Aligned, SweepImages, align, compensate
 from odometry.alignment_config import AlignmentConfig
+from odometry.alignment_search import align_best, try_guesses
 from odometry.image_config import ImageConfig
 from odometry.sweep_images import Imager, middle_offset_s
 from odometry.torch_geometry import exp, log
@@ -23,12 +24,11 @@ from odometry.torch_geometry import exp, log
 _AT_ONCE = 8
 # Guesses about the turn from one scan to the next, degrees. Alignment finds its way over half a step.
 _TURNS_DEG = (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0)
-_COARSE = AlignmentConfig(column_step=6, iterations=6)
 _FINE = AlignmentConfig(column_step=2, iterations=10)
-# Another guess must be better by this much than going on as before; a pair that lies worse than that is not believed.
-_CLEARLY_BETTER = 0.03
-_BELIEVED_SHARE = 0.5
-_WELL_SHARE = 0.8
+_TURNING = math.radians(3.0)
+# A pair of scans that agree on less, or on fewer points, is not believed.
+_BELIEVED = 0.4
+_LEAST_POINTS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +40,14 @@ class PreparedRecording:
         interval_s: (N - 1,) from the middle of each sweep to the next.
         T_prev_curr: (N - 1, 4, 4) motions between the middles of sweeps, as alignment found them.
         believed: (N - 1,) whether the two scans lie well on one another.
-        share: (N - 1,) of the points that do.
+        explained: (N - 1,) how much they agree on, see `odometry.alignment.Aligned`.
     """
 
     images: SweepImages
     interval_s: Tensor
     T_prev_curr: Tensor
     believed: Tensor
-    share: Tensor
+    explained: Tensor
 
     def __len__(self) -> int:
         return len(self.images)
@@ -69,7 +69,12 @@ def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:
     images = SweepImages(*(torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])))
     interval_s = torch.tensor(middles, dtype=torch.float64).diff().float().clamp(min=1e-3)
     aligned = _align_all(images, interval_s)
-    return PreparedRecording(images, interval_s, aligned.T_prev_curr, aligned.share > _BELIEVED_SHARE, aligned.share)
+    return PreparedRecording(images, interval_s, aligned.T_prev_curr, _believed(aligned), aligned.explained)
+
+
+def _believed(aligned: Aligned) -> Tensor:
+    """(B,) whether scans lie well on one another; one that says nothing at all does not."""
+    return (aligned.explained > _BELIEVED) & (aligned.matched >= _LEAST_POINTS)
 
 
 def _align_all(images: SweepImages, interval_s: Tensor) -> Aligned:
@@ -79,21 +84,20 @@ def _align_all(images: SweepImages, interval_s: Tensor) -> Aligned:
     for number in range(len(images) - 1):
         current, previous = images.select(slice(number + 1, number + 2)), images.select(slice(number, number + 1))
         best = _align_one(T_last, current, previous, interval_s[number : number + 1])
-        T_last = best.T_prev_curr[0]
+        T_last = best.T_prev_curr[0] if _believed(best) else torch.eye(4)
         found.append(best)
     return Aligned(*(torch.cat([getattr(one, name) for one in found]) for name in vars(found[0])))
 
 
 def _align_one(T_last: Tensor, current: SweepImages, previous: SweepImages, interval_s: Tensor) -> Aligned:
-    guesses = torch.stack([T_last, torch.eye(4)])
-    coarse = _from(guesses, current, previous, interval_s)
-    if float(coarse.share.max()) < _WELL_SHARE or float(log(T_last)[:3].norm()) > math.radians(3.0):
-        tried = _from(_turned(T_last), current, previous, interval_s)
-        coarse = Aligned(*(torch.cat([getattr(coarse, name), getattr(tried, name)]) for name in vars(coarse)))
-    handicap = torch.full_like(coarse.share, _CLEARLY_BETTER)
-    handicap[0] = 0.0
-    best = int((coarse.share - handicap).argmax())
-    return align(coarse.T_prev_curr[best : best + 1], current, previous, interval_s, _FINE)
+    """From the last motion and from rest; from many turns unless that is good, or the sensor was turning."""
+    best = align_best(torch.stack([T_last, torch.eye(4)]), current, previous, interval_s, _FINE)
+    was_turning = float(log(T_last)[:3].norm()) > _TURNING
+    if float(best.explained) >= _FINE.doubtful and not was_turning:
+        return best
+    found = try_guesses(_turned(T_last), current, previous, interval_s, _FINE)
+    other = align(found, current, previous, interval_s, _FINE)
+    return other if float(other.explained) > float(best.explained) + _FINE.clearly_better else best
 
 
 def _turned(T_last: Tensor) -> Tensor:
@@ -101,11 +105,6 @@ def _turned(T_last: Tensor) -> Tensor:
     xi = torch.zeros(len(_TURNS_DEG), 6)
     xi[:, 2] = torch.deg2rad(torch.tensor(_TURNS_DEG))
     return exp(xi) @ T_last
-
-
-def _from(guesses: Tensor, current: SweepImages, previous: SweepImages, interval_s: Tensor) -> Aligned:
-    many = torch.zeros(len(guesses), dtype=torch.int64)
-    return align(guesses, current.select(many), previous.select(many), interval_s[many], _COARSE)
 
 
 def compensated(images: SweepImages, velocity: Tensor) -> SweepImages:

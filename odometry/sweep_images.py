@@ -11,42 +11,51 @@ from odometry.image_config import ImageConfig
 from odometry.normals import surface_normals
 from odometry.projection import ImageGrid, project
 
+# A scan of fewer points, as of a covered sensor, does not tell which elevations the sensor sees.
+_ENOUGH_POINTS = 200
+
 
 class Imager:
-    """Makes images of one sensor's scans; the rows' elevations are those of the first scan that has points."""
+    """Makes images of one sensor's scans; the rows' elevations are those of the first scan with points enough.
+
+    Until there is one, they are those of the scan that had most.
+    """
 
     def __init__(self, config: ImageConfig, device: torch.device | str = "cpu") -> None:
         self._config = config
         self._device = torch.device(device)
         self._grid: ImageGrid | None = None
+        self._grid_points = 0  # of the scan that the grid is from
 
     def images(self, scans: Sequence[Scan]) -> SweepImages:
         """The scans as images, normals included."""
         made = [self._image(scan) for scan in scans]
-        images = torch.stack([image for image, _ in made])  # (B, 4, H, W)
+        images = torch.stack([image for image, _, _ in made])  # (B, 4, H, W)
         normals = surface_normals(images, self._config.normals)
-        grid = self._grid_of(torch.zeros(0, 3))
-        low, high = (images.new_full((len(made),), limit) for limit in (grid.elevation_low, grid.elevation_high))
+        limits = images.new_tensor([(grid.elevation_low, grid.elevation_high) for _, _, grid in made])  # (B, 2)
         return SweepImages(
-            images[:, :3].contiguous(), normals, torch.stack([offsets for _, offsets in made]), low, high
+            images[:, :3].contiguous(), normals, torch.stack([offsets for _, offsets, _ in made]), *limits.unbind(1)
         )
 
-    def _image(self, scan: Scan) -> tuple[Tensor, Tensor]:
-        """Range image (4, H, W) and seconds from the middle of the sweep (H, W)."""
+    def _image(self, scan: Scan) -> tuple[Tensor, Tensor, ImageGrid]:
+        """Range image (4, H, W), seconds from the middle of the sweep (H, W), and where the rows lie."""
         points = torch.from_numpy(scan.points).to(self._device, torch.float32)
-        if len(points) and self._grid is None:
-            self._grid = self._grid_of(points)
+        grid = self._grid_of(points)
         by_ring = self._config.order == "ring" and scan.rings is not None
         rings = torch.from_numpy(scan.rings).to(self._device) if by_ring and scan.rings is not None else None
-        projection = project(points, self._grid_of(points), rings=rings)
+        projection = project(points, grid, rings=rings)
         index = projection.index[0]
         if scan.time_offsets is None or not len(scan):
-            return projection.images[0], points.new_zeros(index.shape)
+            return projection.images[0], points.new_zeros(index.shape), grid
         offsets = torch.from_numpy(scan.time_offsets - middle_offset_s(scan)).to(self._device, torch.float32)
-        return projection.images[0], torch.where(index >= 0, offsets[index.clamp(min=0)], 0.0)
+        return projection.images[0], torch.where(index >= 0, offsets[index.clamp(min=0)], 0.0), grid
 
     def _grid_of(self, points: Tensor) -> ImageGrid:
-        return self._grid or ImageGrid.around(points, self._config.rows, self._config.columns)
+        """The grid for a scan, which is that of an earlier one unless this one tells more."""
+        if self._grid is None or self._grid_points < min(_ENOUGH_POINTS, len(points)):
+            self._grid = ImageGrid.around(points, self._config.rows, self._config.columns)
+            self._grid_points = len(points)
+        return self._grid
 
 
 def middle_offset_s(scan: Scan) -> float:

@@ -25,7 +25,7 @@ class Validation:
         rotation_rms_deg, translation_rms_m: over all believed pairs.
         rotation_median_deg, translation_median_m: likewise.
         covered_percent: of the errors that lie within one, two and three standard deviations.
-        pairs: how many.
+        pairs: how many; where there is none, all else is not a number.
     """
 
     rotation_rms_deg: float
@@ -66,7 +66,7 @@ def validate(
     network: PairNetwork, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
 ) -> Validation:
     """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none."""
-    errors, sigmas = [], []
+    errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
     for recording in (recording for recording in recordings if len(recording) > gap):
         error, sigma = _errors(network, recording, gap, device or torch.device("cpu"))
         errors.append(error)
@@ -76,6 +76,8 @@ def validate(
 
 def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
     """Statistics of errors (N, 6) with standard deviations (N, 6)."""
+    if not len(errors):
+        return Validation(math.nan, math.nan, math.nan, math.nan, (math.nan, math.nan, math.nan), 0)
     rotation = torch.rad2deg(errors[:, :3].norm(dim=1))
     translation = errors[:, 3:].norm(dim=1)
     covered = [100.0 * float((errors.abs() <= k * sigmas).float().mean()) for k in (1, 2, 3)]

@@ -11,6 +11,9 @@ from odometry.network_config import NetworkConfig
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 
+# The least that DeLORA's network can look at.
+_DELORA_ROWS = 16
+
 
 class AugmentationConfig(BaseModel):
     """How pairs are changed so that none is seen twice; probabilities unless said otherwise. See `odometry.pairs`."""
@@ -60,9 +63,24 @@ class TrainingConfig(BaseModel):
     def _something_is_minimised(self) -> Self:
         if not self.alignment_weight and (self.geometric is None or not self.geometric_weight):
             raise ValueError("geometric and alignment_weight are both off, which leaves no loss")
-        if self.network.correlation.rows != self.images.rows:
+        if self.geometric is not None and self.geometric.correspondence == "projection":
             raise ValueError(
-                f"network.correlation.rows={self.network.correlation.rows} and images.rows={self.images.rows}"
-                " must be the same"
+                "geometric.correspondence=projection is not for training, where scans are turned and thinned;"
+                " take nearest"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _images_suit_the_network(self) -> Self:
+        network, images = self.network.correlation, self.images
+        if network.rows != images.rows:
+            raise ValueError(f"network.correlation.rows={network.rows} and images.rows={images.rows} must be the same")
+        if self.network.name == "delora" and images.rows < _DELORA_ROWS:
+            raise ValueError(
+                f"images.rows={images.rows} is too few for network.name=delora, which needs {_DELORA_ROWS}"
+            )
+        if self.network.name == "correlation" and images.columns % 4:
+            raise ValueError(f"images.columns={images.columns} must be a multiple of 4 for network.name=correlation")
+        if self.network.name == "correlation" and any(width % 8 for width in network.widths):
+            raise ValueError(f"network.correlation.widths={network.widths} must be multiples of 8")
         return self

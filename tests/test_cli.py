@@ -10,9 +10,14 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
+from lidarslam.config import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from odometry.checkpoint import checkpoint_of, save_checkpoint
+from odometry.image_config import ImageConfig
+from odometry.network_config import CorrelationConfig, NetworkConfig
+from odometry.networks import make_network
 
 
 def lidarslam(*arguments: object) -> Result:
@@ -79,6 +84,23 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
     assert both.exit_code == 2
 
 
+def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Path) -> None:
+    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), pair_width=8))
+    weights = tmp_path / "weights of mine: 1.safetensors"
+    images = ImageConfig(columns=180)
+    save_checkpoint(weights, checkpoint_of(make_network(network), network, images))
+    ran = lidarslam("run", recording, "--out", tmp_path / "run", "--weights", weights, "--stop", 2)
+    assert ran.exit_code == 0
+    learned = load_config(tmp_path / "run" / "config.yaml").odometry
+    assert (learned.method, learned.learned.weights) == ("learned", weights)
+    prior = recording / "ground_truth.tum"
+    for other in (("--odometry", "kiss-icp"), ("--odometry", "constant-velocity"), ("--prior", prior)):
+        refused = lidarslam("run", recording, "--out", tmp_path / "other", "--weights", weights, *other)
+        assert refused.exit_code == 2
+        assert "--weights are those of the learned odometry" in refused.stderr
+        assert not (tmp_path / "other").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "message"),
     [
@@ -93,6 +115,12 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
         (["run", "{recording}"], 2, "Missing option '--out'"),
         (["run", "{recording}", "--out", "{out}", "--odometry", "loam"], 2, "'loam' is not one of"),
         (["run", "{recording}", "--out", "{out}", "--step", "0"], 2, "0 is not in the range x>=1"),
+        (["run", "{recording}", "--out", "{out}", "--weights", "{recording}/none"], 2, "does not exist"),
+        (
+            ["run", "{recording}", "--out", "{out}", "--weights", "{recording}/timestamps.txt"],
+            1,
+            "timestamps.txt: is no safetensors file; expected weights",
+        ),
         (["run", "{recording}", "--out", "{out}", "--start", "9"], 1, "none of its 5 scans is left"),
         (["run", "{recording}", "--out", "{out}", "--set", "odometry.kiss=1"], 1, "did you mean kiss_icp?"),
         (

@@ -23,12 +23,14 @@ from lidarslam.pipeline import ScanResult
 from lidarslam.run import RunRequest, execute, in_order
 
 KISS_ICP = [
+    "odometry.method=kiss-icp",
     "mapping.enabled=false",
     "odometry.kiss_icp.voxel_size_m=0.2",
     "odometry.kiss_icp.max_range_m=30",
     "global_map.voxel_size_m=0.1",
 ]
 MAPPING = ["global_map.voxel_size_m=0.1"]
+KITTI = ["odometry.method=kiss-icp", "mapping.enabled=false"]
 
 
 def quiet(number: int, total: int, result: ScanResult) -> None:
@@ -116,7 +118,7 @@ def test_scans_are_laid_on_the_map_by_default(
     cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
     distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))
     assert np.percentile(distance, 95) < 0.02
-    assert "method: constant-velocity" in (out / "config.yaml").read_text()
+    assert "method: learned" in (out / "config.yaml").read_text()
     with (out / "scans.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert all(float(row["ms_refine"]) > 0.0 for row in rows)
@@ -271,7 +273,7 @@ def test_kitti_odometry_is_as_accurate_as_kiss_icps_own_pipeline(real_data: Path
         library.register_frame(*files[index])
         poses.append(library.last_pose)
     _, expected_m = absolute_trajectory_error(files.gt_poses[: len(files)], np.array(poses))
-    outcome = execute(RunRequest(source, tmp_path / "run", load_config(None, ["reader.sequence='04'"])), quiet)
+    outcome = execute(RunRequest(source, tmp_path / "run", load_config(None, [*KITTI, "reader.sequence='04'"])), quiet)
     assert outcome.metrics is not None
     assert abs(outcome.metrics.errors.ate_rmse_m - expected_m) < 0.002
     assert outcome.summary.lost_scans == 0
@@ -297,7 +299,7 @@ def test_kitti_raw_is_deskewed_as_by_kiss_icp(real_data: Path, tmp_path: Path) -
         library.register_frame(scan.points, 0.5 * (1.0 - azimuth / np.pi))
         poses.append(library.last_pose)
         ends.append(scan.stamp + scan.time_offsets.max())
-    execute(RunRequest(drive, tmp_path / "run", load_config()), quiet)
+    execute(RunRequest(drive, tmp_path / "run", load_config(None, KITTI)), quiet)
     ours = read_tum(tmp_path / "run" / "trajectory.tum").select(slice(1, None))
     # KISS-ICP's poses belong to the end of each sweep: compare at our stamps, from the second on.
     theirs = Trajectory(ours.stamps, Trajectory(np.array(ends), np.array(poses)).at(ours.stamps))

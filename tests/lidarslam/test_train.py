@@ -18,11 +18,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.train import execute
 from lidarslam.train_config import SimulatedConfig, TrainConfig, dump_train_yaml, load_train_config, loss_settings
 from lidarslam.train_request import StepReport, TrainNarrator, TrainRequest
+from lidarslam.train_text import format_outcome, format_validation
 from lidarslam.training_data import Stretch, hold_out, prepared, recorded
 from odometry.checkpoint import load_checkpoint, network_of
 from odometry.loss_config import LossConfig
 from odometry.networks import make_network
-from odometry.training import Validation, validate
+from odometry.training import Validation, summarise, validate
 
 TINY = (
     "training.images={rows: 8, columns: 96}",
@@ -131,13 +132,29 @@ def test_what_a_training_leaves(room_folder: Path, tmp_path: Path, ready: Path) 
     assert best.about["sources"] == [str(room_folder)]
 
 
+def test_where_no_held_out_pair_can_be_aligned_the_last_weights_are_kept(
+    room_folder: Path, tmp_path: Path, ready: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = summarise(torch.zeros(0, 6), torch.zeros(0, 6))
+    monkeypatch.setattr("lidarslam.training_loop.validate", lambda *_, **__: nothing)
+    listener = Listener()
+    outcome = execute(request(room_folder, tmp_path / "out", ready), listener)
+    assert "nothing to compare with" in format_validation(8, listener.validations[-1][1], True)
+    kept, last = (
+        load_checkpoint(tmp_path / "out" / name) for name in ("weights.safetensors", "weights_last.safetensors")
+    )
+    assert all(torch.equal(kept.weights[name], last.weights[name]) for name in last.weights)
+    assert outcome.best is None
+    assert "nan" not in format_outcome(tmp_path / "out", outcome)
+
+
 def test_recordings_are_prepared_once(room_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_train_config(None, TINY)
     stretch = recorded(room_folder, config.reader)
     first = prepared([stretch], config.training.images, tmp_path, lambda _: None)
     monkeypatch.setattr(training_data, "prepare", lambda *_: pytest.fail("prepared again"))
     again = prepared([stretch], config.training.images, tmp_path, lambda _: None)
-    for name in ("T_prev_curr", "believed", "share", "interval_s"):
+    for name in ("T_prev_curr", "believed", "explained", "interval_s"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name))
     for name, value in vars(first[0].images).items():
         assert torch.equal(value, getattr(again[0].images, name))

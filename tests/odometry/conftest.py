@@ -1,6 +1,6 @@
 """Sweeps through boxes, cast analytically: every pixel's point, normal and time are exact, and so are the motions."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,15 +33,18 @@ class Scene:
         self, count: int, twist: Sequence[float], start: FloatArray | None = None, rolling: bool = True
     ) -> SweepImages:
         """That many sweeps; not rolling: the pose is that of the middle of the sweep all the time."""
-        times = ((np.arange(self.columns) + 0.5) / self.columns - 0.5) * self.period_s * rolling  # (W,)
-        made = [self._sweep(times, i * self.period_s + times, np.asarray(twist), start) for i in range(count)]
-        points, normals, offsets = (torch.stack(part).float() for part in zip(*made, strict=True))
-        return SweepImages(points, normals, offsets, torch.full((count,), _LOW), torch.full((count,), _HIGH))
+        T_world_start = np.eye(4) if start is None else start
+        return self.sweeps_along(count, lambda times: T_world_start @ exp(np.multiply.outer(times, twist)), rolling)
 
-    def _sweep(
-        self, offsets: FloatArray, times: FloatArray, twist: FloatArray, start: FloatArray | None
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        T = (np.eye(4) if start is None else start) @ exp(np.multiply.outer(times, twist))  # (W, 4, 4)
+    def sweeps_along(self, count: int, poses: Callable[[FloatArray], FloatArray], rolling: bool = True) -> SweepImages:
+        """The same on any way: poses (W, 4, 4) at times (W,)."""
+        offsets = ((np.arange(self.columns) + 0.5) / self.columns - 0.5) * self.period_s * rolling  # (W,)
+        made = [self._sweep(offsets, poses(i * self.period_s + offsets)) for i in range(count)]
+        points, normals, times = (torch.stack(part).float() for part in zip(*made, strict=True))
+        return SweepImages(points, normals, times, torch.full((count,), _LOW), torch.full((count,), _HIGH))
+
+    def _sweep(self, offsets: FloatArray, T: FloatArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Points, normals and times of a sweep whose columns are seen from poses (W, 4, 4)."""
         elevation = np.linspace(_LOW, _HIGH, self.rows)[:, None]
         azimuth = (np.arange(self.columns) + 0.5) * (2.0 * np.pi / self.columns)
         rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -68,8 +71,12 @@ class Scene:
 
     def scans(self, count: int, twist: Sequence[float], start: FloatArray | None = None) -> list[Scan]:
         """The same as scans stamped at the start of their sweeps, points in the order of time."""
-        images, scans = self.sweeps(count, twist, start), []
-        for number in range(count):
+        return self.as_scans(self.sweeps(count, twist, start))
+
+    def as_scans(self, images: SweepImages) -> list[Scan]:
+        """Sweeps of this scene as scans."""
+        scans = []
+        for number in range(len(images)):
             points = images.points[number].permute(2, 1, 0).reshape(-1, 3)
             offsets = images.offsets[number].T
             stamp = (number - 0.5) * self.period_s

@@ -49,7 +49,7 @@ def test_a_known_motion_is_found_from_a_wrong_guess(box_room, rolling):
     found = one_on_the_other(box_room.sweeps(2, TWIST, rolling=rolling), guess(TWIST))
     rotation_deg, translation_m = errors(found.T_prev_curr, moved(TWIST))
     assert rotation_deg < 0.01
-    assert translation_m < 2e-4
+    assert translation_m < 5e-4
     assert found.share > 0.97
     assert found.residual_m < 1e-3
 
@@ -64,7 +64,7 @@ def test_an_upside_down_sensor_is_as_good(box_room):
     found = one_on_the_other(box_room.sweeps(2, TWIST, upside_down), guess(TWIST))
     rotation_deg, translation_m = errors(found.T_prev_curr, moved(TWIST))
     assert rotation_deg < 0.01
-    assert translation_m < 2e-4
+    assert translation_m < 5e-4
 
 
 def test_turning_sweeps_are_compensated(box_room):
@@ -160,6 +160,39 @@ def test_share_and_residual_tell_what_does_not_fit(box_room, corridor):
     fits = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
     assert beside.residual_m > 20.0 * fits.residual_m
     assert beside.residual_m < 2.0 * CONFIG.fine_m
+
+
+def test_nearly_all_is_explained_where_scans_lie_on_one_another(box_room):
+    found = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
+    assert found.explained > 0.9
+    torch.testing.assert_close(found.weakest.norm(dim=1), torch.ones(1))
+
+
+def test_little_is_explained_along_the_way_that_a_scan_is_off(box_room):
+    sweeps = box_room.sweeps(2, TWIST)
+    for axis in range(3):
+        wrong = [0.0] * 6
+        wrong[3 + axis] = 0.4
+        shifted = one_on_the_other(sweeps, guess(TWIST, tuple(wrong)), iterations=0)
+        assert shifted.explained < 0.3
+        assert shifted.weakest[0, axis].abs() > 0.9
+        assert shifted.share > 0.35  # the other walls go along
+
+
+def test_what_a_corridor_does_not_say_is_not_missed(corridor):
+    twist = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+    sweeps = corridor.sweeps(2, twist)
+    for along_m in (0.0, 0.5):
+        found = one_on_the_other(sweeps, guess(twist, (0.0, 0.0, 0.0, along_m, 0.0, 0.0)))
+        assert found.explained > 0.85  # some of the ground is out of sight
+
+
+def test_explained_does_not_depend_on_the_attitude_of_the_sensor(box_room):
+    start = exp(torch.tensor([0.3, -0.2, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
+    wrong = (0.0, 0.0, 0.0, 0.4, 0.0, 0.0)
+    tilted = one_on_the_other(box_room.sweeps(2, TWIST, start), guess(TWIST, wrong), iterations=0)
+    assert tilted.explained < 0.4
+    torch.testing.assert_close(tilted.weakest.norm(dim=1), torch.ones(1))
 
 
 @pytest.mark.parametrize("empty", ["current", "previous", "both"])

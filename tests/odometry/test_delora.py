@@ -3,6 +3,7 @@ import torch
 from torch import Tensor
 
 from odometry.delora import DeloraNetwork
+from odometry.networks import DeloraPairs
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +113,26 @@ def test_refuses_other_images(network: DeloraNetwork, shapes) -> None:
 def test_refuses_a_scale_that_is_not_positive(scale: float) -> None:
     with pytest.raises(ValueError, match="range_scale_m"):
         DeloraNetwork(range_scale_m=scale)
+
+
+@torch.no_grad()
+def test_half_precision_does_not_reach_the_motion(network: DeloraNetwork) -> None:
+    """Three digits are enough for features, not for a rotation."""
+    images = _images()
+    exact = network(*images)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        T = network(*images)
+    assert T.dtype == torch.float32
+    R = T[:, :3, :3]
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(2, 3, 3), rtol=0, atol=1e-6)
+    torch.testing.assert_close(T, exact, rtol=0, atol=5e-3)
+
+
+@torch.no_grad()
+def test_half_precision_leaves_whole_estimates() -> None:
+    prev, curr = _images()
+    pairs = DeloraPairs()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        features = [pairs.encode(images[:, :3], images[:, :3]) for images in (prev, curr)]
+        estimate = pairs(*features)
+    assert {value.dtype for value in vars(estimate).values()} == {torch.float32}

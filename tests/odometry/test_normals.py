@@ -11,6 +11,7 @@ from odometry.normal_config import NormalConfig
 from odometry.normals import _eigenvalues, _null_vector, surface_normals
 
 CONFIG = NormalConfig()
+FIRST_TRY = NormalConfig(wide_gate_m=None)
 ROWS, COLUMNS = 16, 360
 
 
@@ -153,11 +154,36 @@ def test_walls_a_step_apart_do_not_mix() -> None:
     near, far = plane_ranges(directions, truth, 4.0), plane_ranges(directions, truth, 5.0)
     ranges = torch.where(torch.arange(720) < 20, near, far)
     ranges = torch.where(directions[0] > 0.5, ranges, math.inf)
-    gated = surface_normals(image_of(directions, ranges), CONFIG)
+    gated = surface_normals(image_of(directions, ranges), FIRST_TRY)
     assert (gated[0, :, :, 10:30].norm(dim=0) > 0.0).all()
     assert errors_deg(gated, truth[:, None, None]).max() < 0.1
-    mixed = surface_normals(image_of(directions, ranges), NormalConfig(gate_m=5.0, max_flatness=1.0))
+    mixed = surface_normals(image_of(directions, ranges), NormalConfig(gate_m=5.0, max_flatness=1.0, wide_gate_m=None))
     assert errors_deg(mixed, truth[:, None, None]).max() > 10.0
+
+
+def test_sparse_rows_on_the_ground_get_a_normal_at_the_second_try() -> None:
+    truth = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    image = image_of(rays(), plane_ranges(rays(), truth, 1.8))
+    first, both = surface_normals(image, FIRST_TRY), surface_normals(image, CONFIG)
+    apart_m = image[0, 3].diff(dim=0).amax(dim=1)  # from one ring to the next
+    ring = int(((apart_m > 0.5) & (apart_m < 2.0)).nonzero()[-1])
+    assert not first[:, :, ring].any()
+    assert both[:, :, ring].any(dim=1).all()
+    assert errors_deg(both, truth[:, None, None]).max() < 0.1
+
+
+def test_normals_of_the_first_try_are_kept() -> None:
+    image = image_of(rays(), room(rays())[0], 0.01)
+    first, both = surface_normals(image, FIRST_TRY), surface_normals(image, CONFIG)
+    there = first.any(dim=1, keepdim=True)
+    assert torch.equal(both * there, first)
+    assert both.any(dim=1).sum() > there.sum()
+
+
+def test_the_second_try_has_its_own_gate_and_columns() -> None:
+    image = image_of(rays(), room(rays())[0], 0.01)
+    again = surface_normals(image, NormalConfig(wide_gate_m=CONFIG.gate_m, wide_columns=CONFIG.columns))
+    assert torch.equal(again, surface_normals(image, FIRST_TRY))
 
 
 @pytest.mark.parametrize("shift", [1, 4, 170])
@@ -187,7 +213,7 @@ def test_empty_pixels_have_no_normals_and_too_few_neighbours_neither() -> None:
     image = image_of(rays(), room(rays())[0])
     lost = torch.rand(ROWS, COLUMNS, generator=torch.Generator().manual_seed(0)) < 0.7
     image[:, :, lost] = 0.0
-    normals = surface_normals(image, CONFIG)
+    normals = surface_normals(image, FIRST_TRY)
     assert not normals[:, :, lost].any()
     counts = torch.nn.functional.avg_pool2d(
         torch.nn.functional.pad((~lost).float()[None], (4, 4, 0, 0), mode="circular"), (3, 9), 1, divisor_override=1

@@ -1,6 +1,7 @@
 """The loss of motions whose errors are known."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -201,6 +202,19 @@ def test_geometry_compares_the_compensated_surfaces(pair):
     config = TrainingConfig(alignment_weight=0.0)
     estimate = estimate_of(off(1.0) @ pair.T_prev_curr)
     assert torch.equal(loss(estimate, blind, config).total, loss(estimate, pair, config).total)
+
+
+def test_geometry_looks_at_pairs_that_are_believed(pair):
+    """Where alignment failed, the compensation that surfaces rest on is a guess."""
+    T = torch.cat([off(0.0, 0.03) @ pair.T_prev_curr, off(0.0, 0.2) @ pair.T_prev_curr])
+    both = PairBatch(**{name: torch.cat([value, value]) for name, value in vars(pair).items()})
+    both = replace(both, believed=torch.tensor([True, False]))
+    config = TrainingConfig(alignment_weight=0.0, geometric_points=16 * 96)
+    some, one = loss(estimate_of(T), both, config), loss(estimate_of(T[:1]), pair, config)
+    for name in ("total", "point_to_plane", "plane_to_plane"):
+        torch.testing.assert_close(getattr(some, name), getattr(one, name))
+    none = loss(estimate_of(T), replace(both, believed=torch.zeros(2, dtype=torch.bool)), config)
+    assert float(none.total) == 0.0
 
 
 def test_geometry_pulls_towards_the_truth(pair):

@@ -128,7 +128,7 @@ def _surfaces(pair: PairBatch) -> tuple[Tensor | None, Tensor | None]:
 def test_a_pair_is_believed_if_all_motions_between_are(recording):
     doubtful = PreparedRecording(
         recording.images, recording.interval_s, recording.T_prev_curr, torch.tensor([True, False, True]),
-        recording.share,
+        recording.explained,
     )  # fmt: skip
     pairs = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
     assert [bool(pair_of(doubtful, *pair).believed) for pair in pairs] == [True, False, True, False, False]
@@ -216,7 +216,7 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
 def _first_two(recording: PreparedRecording) -> PreparedRecording:
     return PreparedRecording(
         recording.images.select(slice(0, 2)), recording.interval_s[:1], recording.T_prev_curr[:1],
-        recording.believed[:1], recording.share[:1],
+        recording.believed[:1], recording.explained[:1],
     )  # fmt: skip
 
 
@@ -224,7 +224,7 @@ def test_what_the_network_sees_is_changed_like_the_surfaces(recording):
     """Raw sweeps and compensated ones go the same way; seen here where they are the same."""
     still = PreparedRecording(
         recording.images, recording.interval_s, recording.T_prev_curr, torch.zeros(3, dtype=torch.bool),
-        recording.share,
+        recording.explained,
     )  # fmt: skip
     batch = Pairs([still], only(**AUGMENTATIONS["all"], reverse=0.5), 0).batch(0, 8)
     assert torch.equal(batch.previous, batch.previous_surfaces)

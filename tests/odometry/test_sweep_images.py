@@ -78,9 +78,24 @@ def test_the_rows_are_those_of_the_first_scan_that_has_points(box_room, in_one_c
         imager.images([EMPTY])
         imager.images([full])
     images = imager.images([EMPTY, full, other])
-    assert images.low.rad2deg().tolist() == pytest.approx([-18.0] * 3, abs=1e-4)
-    assert images.high.rad2deg().tolist() == pytest.approx([18.0] * 3, abs=1e-4)
+    assert images.low[1:].rad2deg().tolist() == pytest.approx([-18.0] * 2, abs=1e-4)
+    assert images.high[1:].rad2deg().tolist() == pytest.approx([18.0] * 2, abs=1e-4)
     torch.testing.assert_close(images.points[1], box_room.sweeps(1, TWIST).points[0])
+
+
+@pytest.mark.parametrize("in_one_call", [True, False])
+def test_a_scan_of_few_points_does_not_fix_the_rows(box_room, in_one_call):
+    """Each image says where its own rows lie; those of the scan with most points, until one has enough."""
+    full = box_room.scans(1, TWIST)[0]
+    elevation = np.rad2deg(np.arcsin(full.points[:, 2] / np.linalg.norm(full.points, axis=1)))
+    fewer, few = (full.select(np.flatnonzero(elevation > above)[:most]) for above, most in ((10.0, 20), (3.0, 150)))
+    imager, scans = Imager(CONFIG), [fewer, few, fewer, full, few]
+    made = [imager.images(scans)] if in_one_call else [imager.images([scan]) for scan in scans]
+    low, high = (torch.cat([getattr(one, name) for one in made]).rad2deg() for name in ("low", "high"))
+    assert 10.0 < low[0] < 18.0
+    assert 3.0 < low[1] == low[2] < 10.0
+    torch.testing.assert_close(low[3:], torch.full((2,), -18.0), rtol=0, atol=1e-4)
+    torch.testing.assert_close(high[3:], torch.full((2,), 18.0), rtol=0, atol=1e-4)
 
 
 def test_an_imager_begins_anew(box_room):

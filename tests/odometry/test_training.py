@@ -180,11 +180,44 @@ def test_a_network_that_is_right_has_no_error(small_room):
     assert found.covered_percent == (100.0, 100.0, 100.0)
 
 
+def test_without_a_believed_pair_there_is_no_number(small_room):
+    """Be it that none is believed, that all recordings are too short, or that there is none."""
+    doubted = replace(numbered(3, small_room), believed=torch.zeros(2, dtype=torch.bool))
+    for recordings, gap in (([doubted], 1), ([numbered(2, small_room)], 2), ([], 1)):
+        found = validate(Stub(known_errors(6), 0.0), recordings, gap)
+        assert found.pairs == 0
+        numbers = (found.rotation_rms_deg, found.translation_rms_m, found.rotation_median_deg,
+                   found.translation_median_m, *found.covered_percent)  # fmt: skip
+        assert all(math.isnan(number) for number in numbers)
+
+
 def test_coverage_of_a_normal_distribution():
     g = torch.Generator().manual_seed(0)
     sigmas = torch.rand(20_000, 6, generator=g) + 0.1
     found = summarise(torch.randn(20_000, 6, generator=g) * sigmas, sigmas)
     assert found.covered_percent == pytest.approx((68.27, 95.45, 99.73), abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"geometric": {"correspondence": "projection"}}, "correspondence=projection is not for training"),
+        ({"network": {"correlation": {"widths": (24, 44, 64)}}}, r"widths=\(24, 44, 64\) must be multiples of 8"),
+        ({"images": {"columns": 722}}, "columns=722 must be a multiple of 4"),
+        (
+            {"network": {"name": "delora", "correlation": {"rows": 8}}, "images": {"rows": 8}},
+            "rows=8 is too few for network.name=delora, which needs 16",
+        ),
+    ],
+)
+def test_settings_that_training_could_not_work_with_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        TrainingConfig.model_validate(settings)
+
+
+def test_what_does_not_matter_to_a_network_is_not_asked_of_it():
+    delora = {"name": "delora", "correlation": {"widths": (24, 44, 64)}}
+    TrainingConfig.model_validate({"network": delora, "images": {"columns": 722}})
 
 
 def test_rows_of_network_and_images_agree():

@@ -1,0 +1,124 @@
+"""The odometries from scan to scan, beside one another: how wrong each motion is, on recordings training never saw.
+
+    python benchmarks/odometry_accuracy.py --worlds office street --motions tracked car --scans 100
+    python benchmarks/odometry_accuracy.py KITTI/sequences/04
+
+Prints a Markdown table, three rows for each recording: the network's guess alone, the learned odometry (the guess
+refined by alignment), and KISS-ICP with its defaults, which matches scans to its own map. Motions are those between the
+stamps of consecutive scans; RMS of their errors, and the ATE of the trajectory they are chained to. `covered` is the
+share of the motions whose error lies within what 95 % should by the covariance that comes with it. Processor time is of
+this process; KISS-ICP's is in another and not counted.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mapping_accuracy import Recorded, add_simulation_arguments, errors_of, print_row, read, simulate
+from scipy.stats import chi2
+
+from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
+from lidarslam.core.trajectory import Trajectory, chain
+from odometry.alignment_config import AlignmentConfig
+from odometry.config import OdometryConfig
+from odometry.interface import Motion
+from odometry.learned_config import LearnedConfig
+from odometry.registry import make_odometry
+
+_UNREFINED = LearnedConfig(alignment=AlignmentConfig(iterations=0, doubtful=0.0), least_explained=0.0, least_points=6)
+_METHODS = {
+    "network alone": OdometryConfig(learned=_UNREFINED),
+    "learned": OdometryConfig(),
+    "KISS-ICP": OdometryConfig(method="kiss-icp"),
+}
+_COVERED_95 = float(chi2.ppf(0.95, 6))
+_BEYOND_TRUTH_S = 0.2
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What is wrong with a method's motions on one recording; `covered_percent` is None without covariances."""
+
+    rotation_deg: float
+    translation_m: float
+    ate_m: float
+    failures: int
+    covered_percent: float | None
+    cpu_ms: float
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
+    add_simulation_arguments(parser)
+    options = parser.parse_args(arguments)
+    columns = ("recording", "step, m", "turn, deg", "method", "rotation, deg", "translation, cm", "% of the step")
+    print_row([*columns, "ATE, m", "failed", "covered, %", "CPU, ms a scan"])
+    print_row(["---"] * 12)
+    for source in options.sources:
+        _print(read(source))
+    for world in options.worlds:
+        for motion in options.motions:
+            _print(simulate(world, motion, options.sensor, options.scans, options.seed))
+
+
+def _print(recorded: Recorded) -> None:
+    stamps = np.array([scan.stamp for scan in recorded.scans])
+    truth = Trajectory(stamps, recorded.truth.at(stamps, _BEYOND_TRUTH_S))
+    motions = truth.relative_motions()
+    step, turn = _rms(np.linalg.norm(motions[:, :3, 3], axis=1)), np.rad2deg(_rms(rotation_angle(motions)))
+    for name, config in _METHODS.items():
+        errors = _try(config, recorded, truth)
+        covered = "" if errors.covered_percent is None else f"{errors.covered_percent:.0f}"
+        motion = [f"{errors.rotation_deg:.2f}", f"{100.0 * errors.translation_m:.1f}"]
+        motion.append(f"{100.0 * errors.translation_m / step:.0f}")
+        result = [
+            f"{errors.ate_m:.2f}",
+            str(errors.failures),
+            covered,
+            "" if config.method == "kiss-icp" else f"{errors.cpu_ms:.0f}",
+        ]
+        print_row([recorded.name, f"{step:.2f}", f"{turn:.1f}", name, *motion, *result])
+
+
+def _try(config: OdometryConfig, recorded: Recorded, truth: Trajectory) -> Errors:
+    odometry = make_odometry(config)
+    started = time.process_time()
+    try:
+        motions = [odometry.estimate(scan) for scan in recorded.scans]
+    finally:
+        odometry.close()
+    cpu_ms = 1e3 * (time.process_time() - started) / len(motions)
+    estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
+    wrong = inverse(estimated) @ truth.relative_motions()
+    trajectory = Trajectory(truth.stamps, chain(truth.T_world_lidar[0], estimated))
+    return Errors(
+        rotation_deg=float(np.rad2deg(_rms(rotation_angle(wrong)))),
+        translation_m=_rms(np.linalg.norm(wrong[:, :3, 3], axis=1)),
+        ate_m=errors_of(trajectory, recorded).ate_rmse_m,
+        failures=sum(motion.failure is not None for motion in motions),
+        covered_percent=_covered_percent(motions[1:], log(wrong)),
+        cpu_ms=cpu_ms,
+    )
+
+
+def _covered_percent(motions: Sequence[Motion], errors: FloatArray) -> float | None:
+    """Of the errors (N, 6), those within the 95 % ellipsoid of their covariance."""
+    squared = [
+        float(error @ np.linalg.solve(motion.covariance, error))
+        for motion, error in zip(motions, errors, strict=True)
+        if motion.covariance is not None
+    ]
+    return 100.0 * float(np.mean(np.array(squared) <= _COVERED_95)) if squared else None
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""Motions that alignment does not find from the first guess, in a street that looks the same every three metres."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from odometry.alignment import Aligned, SweepImages, align
+from odometry.alignment_config import AlignmentConfig
+from odometry.alignment_search import align_best, try_guesses
+from odometry.torch_geometry import exp, inverse, log
+
+CONFIG = AlignmentConfig()
+INTERVAL_S = torch.tensor([0.1])
+TWIST = (0.0, 0.0, 0.0, 14.0, 0.0, 0.0)  # rad/s, m/s: 1.4 m from sweep to sweep
+REST = torch.eye(4)[None]
+
+
+@pytest.fixture(scope="module")
+def street(box_room) -> SweepImages:
+    """Two sweeps between facades with a pilaster every 3 m; four poles tell where one is."""
+    pilasters = [((x, y, -5.0), (x + 1.0, y + 1.2, 30.0)) for x in range(-36, 37, 3) for y in (-7.0, 5.8)]
+    poles = [(3.1, 4.2), (-5.2, -4.0), (8.3, -4.4), (-9.6, 4.1)]
+    boxes = [((x - 0.15, y - 0.15, -5.0), (x + 0.15, y + 0.15, 5.0)) for x, y in poles]
+    scene = type(box_room)((-np.inf, -6.0, -1.8), (np.inf, 6.0, np.inf), (*pilasters, *boxes))
+    return scene.sweeps(2, TWIST)
+
+
+def moved(along_m: float) -> Tensor:
+    """(1, 4, 4) ahead."""
+    return exp(torch.tensor([[0.0, 0.0, 0.0, along_m, 0.0, 0.0]]))
+
+
+def one_on_the_other(sweeps: SweepImages, guesses: Tensor, information: Tensor | None = None, **options) -> Aligned:
+    """The second of two sweeps on the first."""
+    current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
+    return align_best(guesses, current, previous, INTERVAL_S, AlignmentConfig(**options), information)
+
+
+def wrong_by_m(aligned: Aligned) -> float:
+    return float(log(aligned.T_prev_curr @ inverse(moved(1.4)))[:, 3:].norm())
+
+
+def test_alignment_from_rest_stays_there_and_knows_it(street):
+    found = align(REST, street.select(slice(1, 2)), street.select(slice(0, 1)), INTERVAL_S, CONFIG)
+    assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
+    assert found.share > 0.3  # the ground and the walls go along
+    assert found.explained < CONFIG.doubtful - 0.2
+    torch.testing.assert_close(found.weakest.abs(), torch.tensor([[1.0, 0.0, 0.0]]), rtol=0, atol=0.05)
+
+
+def test_steps_along_the_direction_in_doubt_find_the_motion(street):
+    found = one_on_the_other(street, REST)
+    assert wrong_by_m(found) < 0.02
+    assert found.explained > CONFIG.doubtful
+
+
+def test_no_steps_are_tried_where_there_are_none(street):
+    assert wrong_by_m(one_on_the_other(street, REST, search_m=())) > 1.3
+
+
+def test_a_good_alignment_is_not_searched_around(street):
+    found = one_on_the_other(street, moved(1.35))
+    alone = align(moved(1.35), street.select(slice(1, 2)), street.select(slice(0, 1)), INTERVAL_S, CONFIG)
+    assert torch.equal(found.T_prev_curr, alone.T_prev_curr)
+
+
+def test_a_later_guess_that_explains_more_is_taken(street):
+    found = one_on_the_other(street, torch.cat([REST, moved(1.3)]), search_m=())
+    assert wrong_by_m(found) < 0.02
+
+
+def test_of_guesses_that_explain_as_much_the_first_is_taken(corridor):
+    """Nothing tells how far ahead one is, and all guesses lie well."""
+    sweeps = corridor.sweeps(2, (0.0,) * 6)
+    for first, second in ((-0.2, 0.2), (0.2, -0.2)):
+        found = one_on_the_other(sweeps, torch.cat([moved(first), moved(second)]))
+        assert float(found.T_prev_curr[0, 0, 3]) == pytest.approx(first, abs=0.01)
+
+
+def test_guesses_that_are_alike_are_as_good_as_the_first(street):
+    both = one_on_the_other(street, torch.cat([moved(1.3), moved(1.45)]))
+    assert torch.equal(both.T_prev_curr, one_on_the_other(street, moved(1.3)).T_prev_curr)
+
+
+def test_information_is_about_the_first_guess_alone(street, corridor):
+    """It holds the first guess along the corridor, and says nothing of another that is taken instead."""
+    firm = 1e9 * torch.eye(6)[None]
+    held = one_on_the_other(corridor.sweeps(2, TWIST), moved(1.0), firm)
+    torch.testing.assert_close(held.T_prev_curr, moved(1.0), rtol=0, atol=1e-4)
+    other = one_on_the_other(street, torch.cat([REST, moved(1.3)]), firm, search_m=())
+    assert wrong_by_m(other) < 0.02
+    searched = one_on_the_other(street, REST, firm)
+    assert wrong_by_m(searched) < 0.02
+
+
+def test_the_best_of_many_guesses_is_found_roughly(street):
+    guesses = torch.cat([moved(0.1 * x) for x in (-20, -10, 0, 13, 25)])
+    found = try_guesses(guesses, street.select(slice(1, 2)), street.select(slice(0, 1)), INTERVAL_S, CONFIG)
+    assert found.shape == (1, 4, 4)
+    assert float(found[0, 0, 3]) == pytest.approx(1.4, abs=0.05)

@@ -1,0 +1,273 @@
+"""The learned odometry with a network that says what it is told, on scans whose motions are known."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.scan import Scan
+from odometry.alignment_config import AlignmentConfig
+from odometry.correlation import Estimate
+from odometry.image_config import ImageConfig
+from odometry.interface import Motion
+from odometry.learned import LearnedOdometry
+from odometry.learned_config import LearnedConfig
+
+IMAGES = ImageConfig(rows=16, columns=360)
+TWIST = (0.05, -0.05, 0.5, 1.0, 0.3, 0.1)  # rad/s, m/s
+# Wrong by 2 degrees about an axis of no particular direction, and by 10 cm.
+WRONG = (0.012, -0.012, 0.030, 0.06, -0.06, 0.05)
+STILL = (0.0,) * 6
+
+
+class Told:
+    """Answers with one guess, or with one after the other; the last goes on."""
+
+    def __init__(self, *guesses: FloatArray, log_sigma: float = math.log(0.1)) -> None:
+        self.guesses, self.log_sigma, self.threads = list(guesses), log_sigma, 0
+
+    def encode(self, points: Tensor, normals: Tensor) -> Tensor:  # noqa: ARG002
+        self.threads = torch.get_num_threads()
+        return points
+
+    def __call__(self, previous: Tensor, current: Tensor) -> Estimate:  # noqa: ARG002
+        guess = self.guesses.pop(0) if len(self.guesses) > 1 else self.guesses[0]
+        sigmas = torch.full((1, 6), self.log_sigma)
+        return Estimate(torch.from_numpy(guess).float()[None], sigmas, torch.zeros(1, 0))
+
+
+def estimates(scans: list[Scan], network: Told, **options: object) -> list[Motion]:
+    odometry = LearnedOdometry(network, IMAGES, LearnedConfig.model_validate(options))
+    return [odometry.estimate(scan) for scan in scans]
+
+
+def moved(twist: tuple[float, ...] = TWIST, wrong: tuple[float, ...] = STILL) -> FloatArray:
+    """The motion from one sweep to the next, a guess off by so much."""
+    return exp(wrong) @ exp(0.1 * np.array(twist))
+
+
+def errors(motion: Motion, truth: FloatArray) -> tuple[float, float]:
+    """Degrees and metres."""
+    error = log(inverse(truth) @ motion.T_prev_curr)
+    return float(np.rad2deg(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
+
+
+def assert_close(motion: Motion, truth: FloatArray, rotation_deg: float = 0.15, translation_m: float = 0.006) -> None:
+    assert motion.failure is None
+    found_deg, found_m = errors(motion, truth)
+    assert found_deg < rotation_deg
+    assert found_m < translation_m
+
+
+def stamped(scan: Scan, at: float) -> Scan:
+    """A scan with its stamp at this part of its sweep, which was at its start."""
+    return replace(scan, stamp=scan.stamp + 0.1 * at, time_offsets=scan.time_offsets - 0.1 * at)
+
+
+def test_motions_are_found_from_wrong_guesses(box_room):
+    motions = estimates(box_room.scans(4, TWIST), Told(moved(wrong=WRONG)))
+    for motion in motions[1:]:
+        assert_close(motion, moved())
+        assert motion.points_used > 1000
+
+
+def test_the_first_scan_is_where_it_all_begins(box_room):
+    (first,) = estimates(box_room.scans(1, TWIST), Told(moved()))
+    assert np.array_equal(first.T_prev_curr, np.eye(4))
+    assert first.failure is None
+    assert first.covariance is None
+    assert first.points_used > 1000
+
+
+def test_an_empty_scan_is_a_failure_and_the_next_motion_goes_past_it(box_room):
+    scans = box_room.scans(4, TWIST)
+    scans[2] = Scan(np.zeros((0, 3)), scans[2].stamp)
+    motions = estimates(scans, Told(moved(), moved() @ moved()))
+    assert motions[2].failure == "the scan is empty"
+    assert (motions[2].points_used, motions[2].covariance) == (0, None)
+    assert np.array_equal(motions[2].T_prev_curr, np.eye(4))
+    assert_close(motions[3], moved() @ moved())
+
+
+def test_before_the_first_points_there_is_nothing_to_go_on_from(box_room):
+    scans = box_room.scans(3, TWIST)
+    scans[0] = Scan(np.zeros((0, 3)), scans[0].stamp)
+    empty, first, second = estimates(scans, Told(moved()))
+    assert empty.failure is not None
+    assert first.failure is None
+    assert np.array_equal(first.T_prev_curr, np.eye(4))
+    assert_close(second, moved())
+
+
+def test_another_place_is_a_failure_and_the_next_pair_works_again(box_room):
+    cell = type(box_room)((-1.2, -1.3, -0.7), (1.4, 1.1, 1.0))
+    scans = [*box_room.scans(2, TWIST), *cell.scans(5, TWIST)[2:4], *box_room.scans(6, TWIST)[4:]]
+    motions = estimates(scans, Told(moved(wrong=WRONG)))
+    assert [motion.failure is None for motion in motions] == [True, True, False, True, False, True]
+    for motion in (motions[2], motions[4]):
+        assert motion.failure is not None
+        assert motion.failure.startswith("the scan does not fit the last one: ")
+        assert (motion.points_used, motion.covariance) == (0, None)
+        assert np.array_equal(motion.T_prev_curr, np.eye(4))
+    assert_close(motions[5], moved())
+
+
+def test_too_few_points_are_a_failure(box_room):
+    scans = box_room.scans(2, TWIST)
+    motions = estimates(scans, Told(moved()), least_points=100_000)
+    assert motions[1].failure is not None
+    assert "points do" in motions[1].failure
+
+
+def test_a_scan_that_is_not_later_is_a_failure(box_room):
+    scan = box_room.scans(1, TWIST)[0]
+    motions = estimates([scan, scan], Told(moved()))
+    assert motions[1].failure == "the scan is not later than the one before"
+
+
+def test_a_bad_guess_gives_way_to_the_last_motion(box_room):
+    fast = (0.0, 0.0, math.radians(150.0), 3.0, 0.0, 0.0)
+    far_off = exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0))
+    scans = box_room.scans(4, fast)
+    motions = estimates(scans, Told(moved(fast), moved(fast), far_off), alignment={"search_m": ()})
+    assert_close(motions[3], moved(fast), 0.3, 0.02)
+    alone = estimates(scans[2:], Told(far_off), alignment={"search_m": ()})  # there is no last motion
+    assert alone[1].failure is not None or errors(alone[1], moved(fast))[0] > 10.0
+
+
+@pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
+def test_an_even_motion_is_the_same_wherever_the_stamps_are(box_room, stamp_at):
+    scans = [stamped(scan, stamp_at) for scan in box_room.scans(4, TWIST)]
+    for motion in estimates(scans, Told(moved(wrong=WRONG)))[1:]:
+        assert_close(motion, moved())
+
+
+def test_stamps_in_the_middle_leave_what_alignment_found(box_room):
+    sweeps = box_room.sweeps_along(4, turning(6.0))
+    middle = [stamped(scan, 0.5) for scan in box_room.as_scans(sweeps)]
+    start = box_room.as_scans(sweeps)
+    at_middle, at_start = (estimates(scans, Told(np.eye(4)))[1:] for scans in (middle, start))
+    # From start to start it is half of one and half of the next, but for the first.
+    for (before, after), motion in zip(pairwise(at_middle), at_start[1:], strict=True):
+        halves = [0.5 * log(part.T_prev_curr) for part in (before, after)]
+        np.testing.assert_allclose(motion.T_prev_curr, exp(halves[0]) @ exp(halves[1]), atol=1e-6)
+
+
+@pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
+def test_motions_are_those_between_stamps(box_room, stamp_at):
+    """A turn that grows by 2.3 degrees a sweep, so that half a sweep makes more than a degree."""
+    way = turning(4.0)
+    scans = [stamped(scan, stamp_at) for scan in box_room.as_scans(box_room.sweeps_along(6, way))]
+    motions = estimates(scans, Told(np.eye(4)))
+    for number in range(2, 6):
+        T = way(0.1 * (np.array([number - 1, number]) - 0.5 + stamp_at))
+        between_stamps = inverse(T[0]) @ T[1]
+        assert_close(motions[number], between_stamps, 0.3, 0.02)
+        middles = way(0.1 * np.array([number - 1.0, number]))
+        lag = errors(motions[number], inverse(middles[0]) @ middles[1])[0]
+        assert lag > 0.9 if stamp_at != 0.5 else lag < 0.3
+
+
+def turning(acceleration: float) -> Callable[[FloatArray], FloatArray]:
+    """Poses on a turn about z that grows evenly, rad/s^2."""
+
+    def poses(times: FloatArray) -> FloatArray:
+        angle = 0.5 * acceleration * times**2
+        zero = np.zeros_like(angle)
+        return exp(np.stack([zero, zero, angle, zero, zero, zero], axis=-1))
+
+    return poses
+
+
+def test_covariances_are_symmetric_and_positive(box_room):
+    for motion in estimates(box_room.scans(4, TWIST), Told(moved(wrong=WRONG)))[1:]:
+        assert motion.covariance is not None
+        np.testing.assert_allclose(motion.covariance, motion.covariance.T, rtol=1e-6, atol=1e-12)
+        assert np.linalg.eigvalsh(motion.covariance).min() > 0.0
+        error = log(inverse(motion.T_prev_curr) @ moved())
+        assert (np.abs(error) < 3.0 * np.sqrt(np.diag(motion.covariance))).all()
+
+
+@pytest.mark.parametrize(("turned", "along"), [(0.0, 3), (0.5 * math.pi, 4)])
+def test_between_two_walls_the_covariance_along_them_is_the_networks(walls, turned, along):
+    """For a sensor turned by 90 degrees they go along y."""
+    scans = near(walls.scans(2, STILL, exp((0.0, 0.0, turned, 0.0, 0.0, 0.0))))
+    unsure, sure = (sigmas(scans, Told(np.eye(4), log_sigma=math.log(sigma_m))) for sigma_m in (3.0, 0.01))
+    assert unsure[along] == pytest.approx(3.0, rel=0.2)
+    assert sure[along] < 0.05
+    assert unsure[7 - along] < 0.05  # across
+
+
+def test_the_covariance_is_of_a_change_from_the_right(walls):
+    """Turned by 90 degrees in between: x of the previous frame is -y of the current one."""
+    quarter = exp((0.0, 0.0, 0.5 * math.pi, 0.0, 0.0, 0.0))
+    first, second = near([*walls.scans(1, STILL), *walls.scans(1, STILL, quarter)])
+    found = sigmas([Scan(first.points, 0.0), Scan(second.points, 0.1)], Told(quarter, log_sigma=math.log(3.0)))
+    assert found[4] == pytest.approx(3.0, rel=0.2)
+    assert found[3] < 0.05
+
+
+@pytest.fixture(scope="module")
+def walls(box_room):
+    """Two walls along x, and nothing else."""
+    return type(box_room)((-np.inf, -2.0, -np.inf), (np.inf, 2.0, np.inf))
+
+
+def near(scans: list[Scan]) -> list[Scan]:
+    """What is within 12 m; farther off, the two walls meet in one neighbourhood, which looks like a wall across."""
+    return [scan.select(np.linalg.norm(scan.points, axis=1) < 12.0) for scan in scans]
+
+
+def sigmas(scans: list[Scan], network: Told) -> FloatArray:
+    """(6,) standard deviations of the last motion, rotation first."""
+    motion = estimates(scans, network)[-1]
+    assert motion.failure is None
+    assert motion.covariance is not None
+    return np.sqrt(np.diag(motion.covariance))
+
+
+def test_the_number_of_threads_is_as_it_was_before(box_room):
+    network = Told(moved())
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        estimates(box_room.scans(2, TWIST), network, threads=1)
+        assert network.threads == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_two_runs_are_alike(box_room):
+    scans = box_room.scans(3, TWIST)
+    first, second = (estimates(scans, Told(moved(wrong=WRONG))) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        assert np.array_equal(a.T_prev_curr, b.T_prev_curr)
+        assert a.points_used == b.points_used
+    assert first[-1].covariance is not None
+    assert second[-1].covariance is not None
+    assert np.array_equal(first[-1].covariance, second[-1].covariance)
+
+
+def test_motions_are_rigid_to_the_last_digit(box_room):
+    for motion in estimates(box_room.scans(3, TWIST), Told(moved(wrong=WRONG))):
+        R = motion.T_prev_curr[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_half_precision_reaches_the_network_alone(box_room):
+    motions = estimates(box_room.scans(2, TWIST), Told(moved(wrong=WRONG)), bfloat16=True)
+    assert_close(motions[1], moved())
+
+
+def test_alignment_is_set_by_the_configuration(box_room):
+    guess = moved(wrong=(0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
+    options = {"alignment": AlignmentConfig(iterations=0), "least_explained": 0.0}
+    motions = estimates([stamped(scan, 0.5) for scan in box_room.scans(2, TWIST)], Told(guess), **options)
+    np.testing.assert_allclose(motions[1].T_prev_curr, guess, atol=1e-6)
