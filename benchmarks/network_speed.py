@@ -11,6 +11,7 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 from statistics import median
+from typing import Literal
 
 import torch
 from mapping_accuracy import simulate
@@ -21,6 +22,14 @@ from odometry.learned_config import LearnedConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig, NetworkName
 from odometry.networks import make_network
 from odometry.sweep_images import Imager
+
+Change = Literal["", "channels last", "bfloat16"]
+_VARIANTS: tuple[tuple[str, NetworkName, Change], ...] = (
+    ("delora", "delora", ""),
+    ("correlation", "correlation", ""),
+    ("correlation, channels last", "correlation", "channels last"),
+    ("correlation, bfloat16", "correlation", "bfloat16"),
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -36,25 +45,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     size = f"{options.rows} x {options.columns}"
     print(f"A pair of {size} images, {options.threads} threads\n")
     print("| network | parameters | wall, ms | CPU, ms | times faster |\n| --- | --- | --- | --- | --- |")
-    timings = {}
-    for name in ("delora", "correlation"):
-        count, wall, cpu = _time_network(name, options)
-        timings[name] = wall
-        print(f"| {name} | {count:,} | {wall:.1f} | {cpu:.1f} | {timings['delora'] / wall:.1f} |", flush=True)
+    slowest = None
+    for label, name, change in _VARIANTS:
+        count, wall, cpu = _time_network(name, change, options)
+        slowest = slowest or wall
+        print(f"| {label} | {count:,} | {wall:.1f} | {cpu:.1f} | {slowest / wall:.1f} |", flush=True)
     print(f"\nStages of the learned odometry, {options.sensor} in an office\n")
     print("| stage | wall, ms | CPU, ms |\n| --- | --- | --- |")
-    for name, stage in _stages(options).items():
+    for label, stage in _stages(options).items():
         wall, cpu = _timed(stage, options.repeats)
-        print(f"| {name} | {wall:.1f} | {cpu:.1f} |", flush=True)
+        print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
 
 
-def _time_network(name: NetworkName, options: argparse.Namespace) -> tuple[int, float, float]:
+def _time_network(name: NetworkName, change: Change, options: argparse.Namespace) -> tuple[int, float, float]:
     """Parameters, wall and processor milliseconds of one scan and one pair."""
     sizes = CorrelationConfig(rows=options.rows)
     network = make_network(NetworkConfig(name=name, correlation=sizes)).eval()
     points = torch.randn(1, 3, options.rows, options.columns) * 10.0
     normals = torch.nn.functional.normalize(torch.randn_like(points), dim=1)
-    with torch.inference_mode():
+    if change == "channels last":
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        points, normals = (x.contiguous(memory_format=torch.channels_last) for x in (points, normals))
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=change == "bfloat16"):
         earlier = network.encode(points, normals)  # type: ignore[operator]
         wall, cpu = _timed(lambda: network(earlier, network.encode(points, normals)), options.repeats)  # type: ignore[operator]
     return sum(p.numel() for p in network.parameters()), wall, cpu

@@ -17,7 +17,9 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         prior: T_odom_lidar, for the method `external`.
 
     Raises:
-        ConfigError: the method is `external` and there is no prior, or the other way round.
+        ConfigError: the method is `external` and there is no prior, or the other way round; or the learned odometry's
+            device is not there, or its weights did not come along.
+        InputError: the learned odometry's weights are no weights.
     """
     if (config.method == "external") != (prior is not None):
         raise ConfigError("a prior trajectory and odometry.method=external go together; give both or neither")
@@ -42,4 +44,10 @@ def _make_learned(config: LearnedConfig) -> Odometry:
     from odometry.networks import PairNetwork
 
     checkpoint = load_checkpoint(config.weights or default_weights())
-    return LearnedOdometry(cast(PairNetwork, network_of(checkpoint)), checkpoint.images, config)
+    network = network_of(checkpoint)
+    try:
+        network = network.to(config.device)
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts that it has it
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"odometry.learned.device={config.device}: torch cannot use it ({reason})") from error
+    return LearnedOdometry(cast(PairNetwork, network), checkpoint.images, config)

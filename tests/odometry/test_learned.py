@@ -10,14 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
 from odometry.alignment_config import AlignmentConfig
+from odometry.config import OdometryConfig
 from odometry.correlation import Estimate
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned import LearnedOdometry
 from odometry.learned_config import LearnedConfig
+from odometry.registry import make_odometry
 
 IMAGES = ImageConfig(rows=16, columns=360)
 TWIST = (0.05, -0.05, 0.5, 1.0, 0.3, 0.1)  # rad/s, m/s
@@ -264,6 +267,19 @@ def test_motions_are_rigid_to_the_last_digit(box_room):
 def test_half_precision_reaches_the_network_alone(box_room):
     motions = estimates(box_room.scans(2, TWIST), Told(moved(wrong=WRONG)), bfloat16=True)
     assert_close(motions[1], moved())
+
+
+def test_the_learned_odometry_is_the_default(box_room):
+    odometry = make_odometry(OdometryConfig())
+    assert isinstance(odometry, LearnedOdometry)
+    motions = [odometry.estimate(scan) for scan in box_room.scans(2, TWIST)]
+    odometry.close()
+    assert motions[1].failure is None
+
+
+def test_a_device_that_is_not_there_is_named():
+    with pytest.raises(ConfigError, match=r"^odometry\.learned\.device=nowhere: torch cannot use it"):
+        make_odometry(OdometryConfig(learned=LearnedConfig(device="nowhere")))
 
 
 def test_alignment_is_set_by_the_configuration(box_room):
