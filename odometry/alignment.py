@@ -20,6 +20,8 @@ _ARRIVED = 1e-4
 _MOST_GRAZING = 0.2
 # Part of the best known direction's information that counts as none.
 _NEXT_TO_NOTHING = 0.02
+# Part of a scan that another must have in view for the two to tell.
+_MUCH_IN_VIEW = 0.5
 # Information that keeps the normal equations solvable where neither the images nor a guess say anything.
 _LEAST_INFORMATION = 1e-3
 
@@ -92,11 +94,12 @@ class _Cloud:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Points moved to the previous frame, the planes they are held against, and which pairs count."""
+    """Points moved to the previous frame, the planes they are held against, which are in view, and which count."""
 
     moved: Tensor
     normals: Tensor
     residuals: Tensor
+    inside: Tensor
     kept: Tensor
 
 
@@ -203,9 +206,10 @@ def _pair(
     squared = seen.square().sum(-1)
     across = (seen * planes).sum(-1).abs().maximum(_MOST_GRAZING * squared.sqrt())
     gate = config.gate_m + config.gate_share * squared / across.clamp(min=1e-6) + scale_m
-    kept = source.valid & inside & (difference.square().sum(-1) < gate * gate)
+    inside &= source.valid
+    kept = inside & (difference.square().sum(-1) < gate * gate)
     kept &= ((source.normals @ T[:, :3, :3].mT) * planes).sum(-1) > config.least_cosine
-    return _Pairs(seen, planes, residuals, kept)
+    return _Pairs(seen, planes, residuals, inside, kept)
 
 
 def _place(points: Tensor, target: SweepImages) -> tuple[Tensor, Tensor]:
@@ -263,17 +267,20 @@ def _judge(T: Tensor, source: _Cloud, target: SweepImages, interval_s: Tensor, c
     H, _ = _normal_equations(pairs, near.to(T.dtype))
     squares = (pairs.residuals.square() * near).sum(-1)
     share = matched / source.valid.sum(-1).clamp(min=1)
-    explained, weakest = _explained(source.normals @ T[:, :3, :3].mT, source.valid, near)
+    # What leaves the other image's view on the way says nothing, unless it is most of the scan.
+    explained, weakest = _explained(source.normals @ T[:, :3, :3].mT, pairs.inside, near)
+    in_view = pairs.inside.sum(-1) / source.valid.sum(-1).clamp(min=1)
+    explained = explained * (in_view / _MUCH_IN_VIEW).clamp(max=1.0)
     return Aligned(T, H, share, explained, weakest, (squares / matched.clamp(min=1)).sqrt(), matched)
 
 
-def _explained(normals: Tensor, valid: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """The least ratio (B,), over directions (B, 3), of the information of the points that lie well to that of all.
+def _explained(normals: Tensor, inside: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """The least ratio (B,), over directions (B, 3), of the information of points that lie well to that of all in view.
 
     The smallest generalised eigenvalue of the two sums of squared normals (B, N, 3). To both a little is added, so that
     directions of which hardly any point says anything do not count as missed.
     """
-    everything = (normals * valid[..., None]).mT @ normals
+    everything = (normals * inside[..., None]).mT @ normals
     matched = (normals * near[..., None]).mT @ normals
     largest = everything.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1.0)
     little = (_NEXT_TO_NOTHING * largest)[:, None, None] * torch.eye(3, dtype=normals.dtype, device=normals.device)

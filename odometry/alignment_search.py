@@ -20,8 +20,8 @@ def align_best(
     interval_s: Tensor,
     config: AlignmentConfig,
     information: Tensor | None = None,
-) -> Aligned:
-    """The alignment of one scan on another (B = 1) that explains most.
+) -> tuple[Aligned, bool]:
+    """The alignment of one scan on another (B = 1) that explains most, and whether it began from the first guess.
 
     Guesses that differ are tried roughly, of which the best is refined; a later one must do clearly better. Where the
     scans still agree on too little, steps along the direction in doubt are tried.
@@ -33,12 +33,14 @@ def align_best(
         information: (1, 6, 6) inverse covariance of the first guess.
     """
     choice = _choose(guesses, current, previous, interval_s, config)
-    best = align(guesses[choice], current, previous, interval_s, config, information if choice == slice(0, 1) else None)
+    is_first = choice == slice(0, 1)
+    best = align(guesses[choice], current, previous, interval_s, config, information if is_first else None)
     if float(best.explained) >= config.doubtful or not config.search_m:
-        return best
+        return best, is_first
     found = try_guesses(_along(best, config.search_m), current, previous, interval_s, config)
     other = align(found, current, previous, interval_s, config)
-    return other if float(other.explained) > float(best.explained) + config.clearly_better else best
+    is_better = float(other.explained) > float(best.explained) + config.clearly_better
+    return (other, False) if is_better else (best, is_first)
 
 
 def _choose(

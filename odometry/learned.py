@@ -96,14 +96,15 @@ class LearnedOdometry:
     def _align(self, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
         """From the network's guess, or going on as before, or further afield; and the information about it."""
         guess = self._network(last.features, sweep.features)
-        information = torch.diag_embed((-2.0 * guess.log_sigma).exp())
+        information = torch.diag_embed((-2.0 * guess.log_sigma).exp()) / self._config.caution**2
         guesses = guess.T_prev_curr
         if self._T_last is not None:
             guesses = torch.cat([guesses, torch.from_numpy(self._T_last).to(guesses)[None]])
         config = self._config.alignment
-        aligned = align_best(guesses, sweep.images, last.images, guesses.new_tensor([interval_s]), config, information)
-        variance = config.residual_m**2 / config.independent_share
-        return aligned, (information + aligned.information / variance)[0]
+        interval = guesses.new_tensor([interval_s])
+        aligned, is_guessed = align_best(guesses, sweep.images, last.images, interval, config, information)
+        seen = aligned.information * (config.independent_share / config.residual_m**2)
+        return aligned, (seen + information if is_guessed else seen)[0]
 
     def _between_stamps(self, last: _Sweep, sweep: _Sweep, T_prev_curr: FloatArray) -> FloatArray:
         """The motion between the scans' stamps, from that between the middles of their sweeps.

@@ -45,7 +45,7 @@ def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
 
 def _planes(images: Tensor, config: NormalConfig, gate_m: float, columns: int) -> Tensor:
     """Normals (B, 3, H, W) from neighbourhoods of one size, zero where they are no planes."""
-    count, covariance = _scatter(images, config.rows, columns, gate_m)
+    count, nearest_m2, covariance = _scatter(images, config.rows, columns, gate_m)
     size = covariance[0] + covariance[1] + covariance[2]
     scaled = covariance / size.clamp(min=_TINY)
     smallest, middle, largest = _eigenvalues(scaled)
@@ -53,15 +53,18 @@ def _planes(images: Tensor, config: NormalConfig, gate_m: float, columns: int) -
     planar = (smallest <= config.max_flatness * middle) & (middle >= config.min_spread * largest)
     planar &= middle * size > count * (_NARROWEST * images[:, 3]).square()
     planar &= (count >= config.min_neighbours) & (images[:, 3] > 0.0)
+    # Far down a corridor both walls lie at one range with nothing between: no plane goes from one to the other.
+    planar &= nearest_m2 <= (2.0 * config.gate_m) ** 2
     away = (normals * images[:, :3]).sum(dim=1)
     planar &= away.abs() >= _MOST_GRAZING * images[:, 3]
     return normals * torch.where(planar, -away.sign(), 0.0)[:, None]
 
 
-def _scatter(images: Tensor, rows: int, columns: int, gate_m: float) -> tuple[Tensor, Tensor]:
-    """Numbers of neighbours (B, H, W) and their scatter matrices (6, B, H, W): xx, yy, zz, xy, yz, xz about the mean.
+def _scatter(images: Tensor, rows: int, columns: int, gate_m: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers of neighbours (B, H, W), squared distances to the nearest, and their scatter about the mean.
 
-    Sums are of differences to the pixel itself: coordinates of tens of metres would leave no digits to float32.
+    The scatter matrices are (6, B, H, W): xx, yy, zz, xy, yz, xz. Sums are of differences to the pixel itself:
+    coordinates of tens of metres would leave no digits to float32.
     """
     height, width = images.shape[2:]
     # (4, B, H, W), as all below treats channels alike
@@ -70,13 +73,16 @@ def _scatter(images: Tensor, rows: int, columns: int, gate_m: float) -> tuple[Te
     padded = functional.pad(padded, (0, 0, rows, rows)).transpose(0, 1).contiguous()
     # Nothing is near to infinity, so one comparison tests both the gate and whether there is a neighbour.
     padded[3].masked_fill_(padded[3] <= 0.0, math.inf)
-    count = torch.zeros_like(centre[3])
+    count, nearest_m2 = torch.zeros_like(centre[3]), torch.full_like(centre[3], math.inf)
     sums, products = torch.zeros_like(centre[:3]), centre.new_zeros(6, *centre.shape[1:])
     for down in range(2 * rows + 1):
         for right in range(2 * columns + 1):
             around = padded[:, :, down : down + height, right : right + width]
-            near = ((around[3] - centre[3]).abs_() <= gate_m).float()
-            offset = (around[:3] - centre[:3]).mul_(near)
+            is_near = (around[3] - centre[3]).abs_() <= gate_m
+            near, offset = is_near.float(), around[:3] - centre[:3]
+            if (down, right) != (rows, columns):
+                torch.minimum(nearest_m2, offset.square().sum(0).masked_fill_(~is_near, math.inf), out=nearest_m2)
+            offset.mul_(near)
             count += near
             sums += offset
             products[:3].addcmul_(offset, offset)
@@ -86,7 +92,7 @@ def _scatter(images: Tensor, rows: int, columns: int, gate_m: float) -> tuple[Te
     products[:3].addcmul_(sums, mean, value=-1.0)
     products[3:5].addcmul_(sums[:2], mean[1:], value=-1.0)
     products[5].addcmul_(sums[0], mean[2], value=-1.0)
-    return count, products
+    return count, nearest_m2, products
 
 
 def _eigenvalues(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:

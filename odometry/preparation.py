@@ -91,7 +91,7 @@ def _align_all(images: SweepImages, interval_s: Tensor) -> Aligned:
 
 def _align_one(T_last: Tensor, current: SweepImages, previous: SweepImages, interval_s: Tensor) -> Aligned:
     """From the last motion and from rest; from many turns unless that is good, or the sensor was turning."""
-    best = align_best(torch.stack([T_last, torch.eye(4)]), current, previous, interval_s, _FINE)
+    best, _ = align_best(torch.stack([T_last, torch.eye(4)]), current, previous, interval_s, _FINE)
     was_turning = float(log(T_last)[:3].norm()) > _TURNING
     if float(best.explained) >= _FINE.doubtful and not was_turning:
         return best

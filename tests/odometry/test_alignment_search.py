@@ -34,7 +34,7 @@ def moved(along_m: float) -> Tensor:
 def one_on_the_other(sweeps: SweepImages, guesses: Tensor, information: Tensor | None = None, **options) -> Aligned:
     """The second of two sweeps on the first."""
     current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
-    return align_best(guesses, current, previous, INTERVAL_S, AlignmentConfig(**options), information)
+    return align_best(guesses, current, previous, INTERVAL_S, AlignmentConfig(**options), information)[0]
 
 
 def wrong_by_m(aligned: Aligned) -> float:
