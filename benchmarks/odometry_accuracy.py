@@ -28,12 +28,6 @@ from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
-_UNREFINED = LearnedConfig(alignment=AlignmentConfig(iterations=0, doubtful=0.0), least_explained=0.0, least_points=6)
-_METHODS = {
-    "network alone": OdometryConfig(learned=_UNREFINED),
-    "learned": OdometryConfig(),
-    "KISS-ICP": OdometryConfig(method="kiss-icp"),
-}
 _COVERED_95 = float(chi2.ppf(0.95, 6))
 _BEYOND_TRUTH_S = 0.2
 
@@ -55,23 +49,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser)
+    parser.add_argument("--weights", type=Path, help="of the learned odometry, instead of the program's own")
     options = parser.parse_args(arguments)
     columns = ("recording", "step, m", "turn, deg", "method", "rotation, deg", "translation, cm", "% of the step")
     print_row([*columns, "ATE, m", "failed", "covered, %", "CPU, ms a scan"])
     print_row(["---"] * 12)
+    methods = _methods(options.weights)
     for source in options.sources:
-        _print(read(source))
+        _print(read(source), methods)
     for world in options.worlds:
         for motion in options.motions:
-            _print(simulate(world, motion, options.sensor, options.scans, options.seed))
+            _print(simulate(world, motion, options.sensor, options.scans, options.seed), methods)
 
 
-def _print(recorded: Recorded) -> None:
+def _methods(weights: Path | None) -> dict[str, OdometryConfig]:
+    unrefined = AlignmentConfig(iterations=0, doubtful=0.0)
+    alone = LearnedConfig(weights=weights, alignment=unrefined, least_explained=0.0, least_points=6)
+    return {
+        "network alone": OdometryConfig(learned=alone),
+        "learned": OdometryConfig(learned=LearnedConfig(weights=weights)),
+        "KISS-ICP": OdometryConfig(method="kiss-icp"),
+    }
+
+
+def _print(recorded: Recorded, methods: dict[str, OdometryConfig]) -> None:
     stamps = np.array([scan.stamp for scan in recorded.scans])
     truth = Trajectory(stamps, recorded.truth.at(stamps, _BEYOND_TRUTH_S))
     motions = truth.relative_motions()
     step, turn = _rms(np.linalg.norm(motions[:, :3, 3], axis=1)), np.rad2deg(_rms(rotation_angle(motions)))
-    for name, config in _METHODS.items():
+    for name, config in methods.items():
         errors = _try(config, recorded, truth)
         covered = "" if errors.covered_percent is None else f"{errors.covered_percent:.0f}"
         motion = [f"{errors.rotation_deg:.2f}", f"{100.0 * errors.translation_m:.1f}"]
