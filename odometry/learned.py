@@ -56,7 +56,7 @@ class LearnedOdometry:
         self._imager = Imager(images, config.device)
         self._config = config
         self._last: _Sweep | None = None
-        self._T_last: FloatArray | None = None  # the last motion, between the middles of sweeps
+        self._velocity: FloatArray | None = None  # (6,) from the middle of the last sweep but one to that of the last
         self._T_middle_stamp = np.eye(4)  # of the last scan: from its stamp to the middle of its sweep
 
     def estimate(self, scan: Scan) -> Motion:
@@ -86,11 +86,12 @@ class LearnedOdometry:
         T_prev_curr = orthonormalize(aligned.T_prev_curr[0].double().numpy(force=True))
         matched, explained = int(aligned.matched), float(aligned.explained)
         if explained < self._config.least_explained or matched < self._config.least_points:
-            self._T_last, self._T_middle_stamp = None, np.eye(4)
+            self._velocity, self._T_middle_stamp = None, np.eye(4)
             return Motion(np.eye(4), 0, f"the scan does not fit the last one: {_misfit(matched, explained)}")
-        covariance = _covariance(T_prev_curr, information, self._T_last)
+        as_before = None if self._velocity is None else exp(self._velocity * interval_s)
+        covariance = _covariance(T_prev_curr, information, as_before)
         motion = self._between_stamps(last, sweep, T_prev_curr)
-        self._T_last = T_prev_curr
+        self._velocity = log(T_prev_curr) / interval_s
         return Motion(motion, matched, covariance=covariance)
 
     def _align(self, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
@@ -98,8 +99,9 @@ class LearnedOdometry:
         guess = self._network(last.features, sweep.features)
         information = torch.diag_embed((-2.0 * guess.log_sigma).exp()) / self._config.caution**2
         guesses = guess.T_prev_curr
-        if self._T_last is not None:
-            guesses = torch.cat([guesses, torch.from_numpy(self._T_last).to(guesses)[None]])
+        if self._velocity is not None:
+            as_before = torch.from_numpy(exp(self._velocity * interval_s)).to(guesses)
+            guesses = torch.cat([guesses, as_before[None]])
         config = self._config.alignment
         interval = guesses.new_tensor([interval_s])
         aligned, is_guessed = align_best(guesses, sweep.images, last.images, interval, config, information)
@@ -113,7 +115,7 @@ class LearnedOdometry:
         at the stamps, so that stamps at the start of sweeps do not make the odometry run half a sweep ahead.
         """
         twist = log(T_prev_curr) / (sweep.middle - last.middle)
-        if self._T_last is None:  # nothing is known of the motion before
+        if self._velocity is None:  # nothing is known of the motion before
             self._T_middle_stamp = exp(twist * (last.stamp - last.middle))
         T_middle_stamp = self._T_middle_stamp
         # The stamp mostly lies between the two middles, on the way from one to the other.
@@ -126,7 +128,7 @@ def _misfit(matched: int, explained: float) -> str:
     return f"{matched} points do, which is {100.0 * explained:.0f} % of what it says of one direction"
 
 
-def _covariance(T_prev_curr: FloatArray, information: Tensor, T_last: FloatArray | None) -> FloatArray:
+def _covariance(T_prev_curr: FloatArray, information: Tensor, as_before: FloatArray | None) -> FloatArray:
     """(6, 6) of the error `xi` in T_true = T_prev_curr @ exp(xi), rotation first.
 
     The information is that of a change from the left. To its inverse comes what a change of motion may hide within
@@ -136,8 +138,8 @@ def _covariance(T_prev_curr: FloatArray, information: Tensor, T_last: FloatArray
     A = adjoint(inverse(T_prev_curr))
     covariance = A @ left @ A.T + np.diag(_LEAST_SIGMA**2)
     covariance[3:, 3:] += np.eye(3) * (_HELD_BACK * np.linalg.norm(T_prev_curr[:3, 3])) ** 2
-    if T_last is not None:
-        covariance += np.diag((_HIDDEN_SHARE * log(inverse(T_last) @ T_prev_curr)) ** 2)
+    if as_before is not None:
+        covariance += np.diag((_HIDDEN_SHARE * log(inverse(as_before) @ T_prev_curr)) ** 2)
     return np.asarray(covariance, dtype=np.float64)
 
 
