@@ -144,6 +144,15 @@ def test_a_bad_guess_gives_way_to_the_last_motion(box_room):
     assert alone[1].failure is not None or errors(alone[1], moved(fast))[0] > 10.0
 
 
+def test_the_last_motion_is_scaled_to_the_time_that_went_by(box_room):
+    fast = (0.0, 0.0, math.radians(100.0), 1.5, 0.0, 0.0)
+    far_off = exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0))
+    scans = box_room.scans(5, fast)
+    received = [*scans[:3], scans[4]]  # one was dropped
+    motions = estimates(received, Told(moved(fast), moved(fast), far_off), alignment={"search_m": ()})
+    assert_close(motions[3], moved(fast) @ moved(fast), 0.5, 0.04)
+
+
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_an_even_motion_is_the_same_wherever_the_stamps_are(box_room, stamp_at):
     scans = [stamped(scan, stamp_at) for scan in box_room.scans(4, TWIST)]
