@@ -100,4 +100,4 @@ def _lines(demo: Demo) -> Iterator[str]:
     yield f"replay    rerun {demo.out / REPLAY}"
     yield ""
     yield f"Open {demo.out / REPORT_HTML} in a browser. KISS-ICP expects the robot to go on moving as it did, and a"
-    yield "turn on the spot breaks that; laid on the map, every sweep tells by itself how the sensor moved."
+    yield "turn on the spot breaks that; the network sees a turn whatever its size, and the map corrects the rest."

@@ -61,9 +61,9 @@ class Aligned:
         information: (B, 6, 6) of the images alone, rotation first, for a change of `T_prev_curr` from the left, if
             points scattered independently by 1 m about their planes; divide by their variance.
         share: (B,) of the points with a normal that lie on the other image.
-        explained: (B,) of what the current scan says about the direction of translation that fares worst, the part said
-            by points that lie on the other image. Most of a street looks the same a metre on, and lies well on itself;
-            what would tell does not. 1 where the scan says next to nothing of any direction.
+        explained: (B,) of what the current scan's points in view of the other image say about the direction of
+            translation that fares worst, the part said by those that lie on it. Most of a street looks the same a
+            metre on, and lies well on itself; what would tell does not. 1 where nothing would tell.
         weakest: (B, 3) that direction, unit, in the previous frame.
         residual_m: (B,) root mean square distance of those from the planes.
         matched: (B,) how many they are.
@@ -76,10 +76,6 @@ class Aligned:
     weakest: Tensor
     residual_m: Tensor
     matched: Tensor
-
-    def select(self, chosen: Tensor | slice) -> "Aligned":
-        """Some of the pairs."""
-        return Aligned(*(value[chosen] for value in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

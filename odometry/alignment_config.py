@@ -15,7 +15,7 @@ class AlignmentConfig(BaseModel):
     coarse_m: float = Field(0.5, gt=0.0, description="scale of the robust weights in the first step")
     fine_m: float = Field(0.05, gt=0.0, description="and in the last ones")
     gate_m: float = Field(0.2, gt=0.0, description="distance of a point from its pixel's, at the sensor")
-    gate_share: float = Field(0.04, ge=0.0, description="what each metre of range adds to it")
+    gate_share: float = Field(0.04, ge=0.0, description="what each metre of range adds, facing the beam")
     least_cosine: float = Field(0.8, ge=0.0, le=1.0, description="between the normals of a pair")
     residual_m: float = Field(0.03, gt=0.0, description="standard deviation of points about their planes")
     independent_share: float = Field(0.05, gt=0.0, le=1.0, description="of the points whose errors are independent")
