@@ -1,8 +1,7 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
-from typing import Self
-
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
 from mapping.feature_config import FeatureConfig

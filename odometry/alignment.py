@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from odometry.alignment_config import AlignmentConfig
+from odometry.normals import has_normal
 from odometry.projection import ImageGrid
 from odometry.torch_geometry import exp, inverse, log, skew, transform_points
 
@@ -137,7 +138,7 @@ def _sample(images: SweepImages, column_step: int) -> _Cloud:
     points = images.points[..., ::column_step].flatten(2).mT  # (B, 3, H, W') -> (B, N, 3)
     normals = images.normals[..., ::column_step].flatten(2).mT
     offsets = images.offsets[..., ::column_step].flatten(1)
-    valid = normals.square().sum(-1) > 0.5
+    valid = has_normal(normals, -1)
     if len(points) == 1:  # what does not take part need not be there
         chosen = valid[0].nonzero()[:, 0]
         points, normals, offsets, valid = (values[:, chosen] for values in (points, normals, offsets, valid))
@@ -151,11 +152,11 @@ def _filled(images: SweepImages, columns: int) -> SweepImages:
     """
     size, _, height, width = images.points.shape
     pixel = torch.arange(height * width, device=images.points.device).view(1, height, width).expand(size, -1, -1)
-    has_normal = images.normals.square().sum(1) > 0.5
-    filled, nearest = has_normal, pixel
+    own = has_normal(images.normals, 1)
+    filled, nearest = own, pixel
     for distance in range(1, columns + 1):
         for step in (distance, -distance):
-            wanted = ~filled & has_normal.roll(step, -1)
+            wanted = ~filled & own.roll(step, -1)
             nearest = torch.where(wanted, pixel.roll(step, -1), nearest)
             filled = filled | wanted
     nearest = nearest.flatten(1)

@@ -37,10 +37,22 @@ def align_best(
     best = align(guesses[choice], current, previous, interval_s, config, information if is_first else None)
     if float(best.explained) >= config.doubtful or not config.search_m:
         return best, is_first
-    found = try_guesses(_along(best, config.search_m), current, previous, interval_s, config)
+    other = try_instead(best, _along(best, config.search_m), current, previous, interval_s, config)
+    return (best, is_first) if other is None else (other, False)
+
+
+def try_instead(
+    best: Aligned,
+    guesses: Tensor,
+    current: SweepImages,
+    previous: SweepImages,
+    interval_s: Tensor,
+    config: AlignmentConfig,
+) -> Aligned | None:
+    """The alignment from the most promising of many guesses (K, 4, 4), if it does clearly better than the best."""
+    found = try_guesses(guesses, current, previous, interval_s, config)
     other = align(found, current, previous, interval_s, config)
-    is_better = float(other.explained) > float(best.explained) + config.clearly_better
-    return (other, False) if is_better else (best, is_first)
+    return other if float(other.explained) > float(best.explained) + config.clearly_better else None
 
 
 def _choose(

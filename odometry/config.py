@@ -1,8 +1,9 @@
 """Settings of the odometry methods; light, so that reading a configuration imports no method."""
 
-from typing import Literal, Self
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
 from odometry.learned_config import LearnedConfig

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from odometry.network_config import CorrelationConfig
-from odometry.torch_geometry import exp, full_precision
+from odometry.normals import has_normal
+from odometry.torch_geometry import exp, full_precision, turn_about_z
 
 INPUT_CHANNELS = 9
 # Standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.
@@ -97,7 +98,6 @@ def column_channels(points: Tensor, normals: Tensor) -> Tensor:
     safe = level.clamp(min=1e-6)
     outwards = (normals[:, 0] * x + normals[:, 1] * y) / safe
     sideways = (normals[:, 1] * x - normals[:, 0] * y) / safe
-    has_normal = (normals.square().sum(1) > 0.5).to(points.dtype)
     channels = (
         torch.log1p(level) - 2.0 * seen,
         2.0 * torch.atan2(z, safe) * seen,
@@ -107,7 +107,7 @@ def column_channels(points: Tensor, normals: Tensor) -> Tensor:
         outwards,
         sideways,
         normals[:, 2],
-        has_normal,
+        has_normal(normals, 1).to(points.dtype),
     )
     return torch.stack(channels, dim=1)
 
@@ -189,9 +189,7 @@ def _fraction(turns: Tensor, shift: Tensor) -> Tensor:
 def _turn(columns: Tensor, width: int) -> Tensor:
     """(B, 4, 4) turns about z by so many of `width` columns."""
     angle = columns * (2.0 * math.pi / width)
-    angle = torch.where(angle > math.pi, angle - 2.0 * math.pi, angle)
-    zero = torch.zeros_like(angle)
-    return exp(torch.stack([zero, zero, angle, zero, zero, zero], dim=-1))
+    return turn_about_z(torch.where(angle > math.pi, angle - 2.0 * math.pi, angle))
 
 
 def _shift_columns(features: Tensor, shift: Tensor) -> Tensor:

@@ -16,6 +16,11 @@ _MOST_GRAZING = 0.04
 _TINY = 1e-30
 
 
+def has_normal(normals: Tensor, dim: int) -> Tensor:
+    """Which pixels or points have a normal: those where there is none hold zeros along the dimension of x, y and z."""
+    return normals.square().sum(dim=dim) > 0.5
+
+
 @torch.no_grad()
 def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
     """Unit normals (B, 3, H, W) float32 that face the sensor, zero where the neighbourhood is no plane.
@@ -38,7 +43,7 @@ def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
     images = images[:, :4].float()
     normals = _planes(images, config, config.gate_m, config.columns)
     if config.wide_gate_m is not None:
-        missing = (normals.square().sum(dim=1, keepdim=True) < 0.5) & (images[:, 3:] > 0.0)
+        missing = ~has_normal(normals, 1)[:, None] & (images[:, 3:] > 0.0)
         normals = torch.where(missing, _planes(images, config, config.wide_gate_m, config.wide_columns), normals)
     return normals
 

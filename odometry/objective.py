@@ -9,6 +9,7 @@ from torch.nn import functional
 
 from odometry.correlation import Estimate
 from odometry.losses import Surfaces, geometric_loss
+from odometry.normals import has_normal
 from odometry.pairs import PairBatch
 from odometry.torch_geometry import inverse, log
 from odometry.training_config import TrainingConfig
@@ -94,8 +95,7 @@ def _surfaces(images: Tensor, most: int | None = None, generator: Generator | No
     """The pixels of images (B, 6, H, W), or as many of them with a normal as are wanted, drawn at random."""
     values = images.flatten(2).mT  # (B, N, 6)
     if most is not None and most < values.shape[1]:
-        has_normal = values[..., 3:].square().sum(-1) > 0.5
-        order = torch.rand(has_normal.shape, generator=generator).to(values.device) + has_normal
+        order = torch.rand(values.shape[:2], generator=generator).to(values.device) + has_normal(values[..., 3:], -1)
         values = values.gather(1, order.topk(most, dim=1).indices[..., None].expand(-1, -1, 6))
     points, normals = values[..., :3], values[..., 3:]
-    return Surfaces(points, normals, normals.square().sum(-1) > 0.5)
+    return Surfaces(points, normals, has_normal(normals, -1))

@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from odometry.alignment import SweepImages
 from odometry.preparation import PreparedRecording, compensated
 from odometry.projection import mirror, rotate_columns
-from odometry.torch_geometry import inverse, log, make_transform
+from odometry.torch_geometry import inverse, log, turn_about_z
 from odometry.training_config import AugmentationConfig
 
 # A prime that keeps the random streams of steps and processes apart.
@@ -157,11 +157,7 @@ def _rotated(images: Tensor, columns: Tensor) -> Tensor:
 
 
 def _turns(columns: Tensor, width: int) -> Tensor:
-    angle = columns.double() * (2.0 * math.pi / width)
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    rows = [[angle.cos(), -angle.sin(), zero], [angle.sin(), angle.cos(), zero], [zero, zero, one]]
-    R = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2).float()
-    return make_transform(R, torch.zeros(len(columns), 3))
+    return turn_about_z(columns.double() * (2.0 * math.pi / width)).float()
 
 
 def _mirrored(batch: PairBatch, config: AugmentationConfig, generator: Generator) -> PairBatch:

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from lidarslam.core.scan import Scan
-from odometry.alignment import Aligned, SweepImages, align, compensate
+from odometry.alignment import Aligned, SweepImages, compensate
 from odometry.alignment_config import AlignmentConfig
-from odometry.alignment_search import align_best, try_guesses
+from odometry.alignment_search import align_best, try_instead
 from odometry.image_config import ImageConfig
 from odometry.sweep_images import Imager, middle_offset_s
-from odometry.torch_geometry import exp, log
+from odometry.torch_geometry import log, turn_about_z
 
 # Scans that are made into images, and pairs that are aligned, at a time: what fits a CPU's cache.
 _AT_ONCE = 8
@@ -95,16 +95,12 @@ def _align_one(T_last: Tensor, current: SweepImages, previous: SweepImages, inte
     was_turning = float(log(T_last)[:3].norm()) > _TURNING
     if float(best.explained) >= _FINE.doubtful and not was_turning:
         return best
-    found = try_guesses(_turned(T_last), current, previous, interval_s, _FINE)
-    other = align(found, current, previous, interval_s, _FINE)
-    return other if float(other.explained) > float(best.explained) + _FINE.clearly_better else best
+    return try_instead(best, _turned(T_last), current, previous, interval_s, _FINE) or best
 
 
 def _turned(T_last: Tensor) -> Tensor:
     """(K, 4, 4) the last motion with other turns about z."""
-    xi = torch.zeros(len(_TURNS_DEG), 6)
-    xi[:, 2] = torch.deg2rad(torch.tensor(_TURNS_DEG))
-    return exp(xi) @ T_last
+    return turn_about_z(torch.deg2rad(torch.tensor(_TURNS_DEG))) @ T_last
 
 
 def compensated(images: SweepImages, velocity: Tensor) -> SweepImages:

@@ -75,6 +75,12 @@ def exp(xi: Tensor) -> Tensor:
     return make_transform(identity + s * K + c * K2, (V @ v[..., None])[..., 0])
 
 
+def turn_about_z(angle: Tensor) -> Tensor:
+    """Transforms (..., 4, 4) that turn by angles (...) about z, radians, from x towards y where positive."""
+    zero = torch.zeros_like(angle)
+    return exp(torch.stack([zero, zero, angle, zero, zero, zero], dim=-1))
+
+
 def log(T: Tensor) -> Tensor:
     """SE(3) logarithm (..., 6) of transforms (..., 4, 4), rotation first; the inverse of `exp` for angles below pi."""
     omega = _rotation_vector(quaternion_from_rotation(T[..., :3, :3]))
