@@ -22,6 +22,7 @@ from odometry.learned_config import LearnedConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig, NetworkName
 from odometry.networks import make_network
 from odometry.sweep_images import Imager
+from odometry.sweeps import SweepPairs
 
 Change = Literal["", "channels last", "bfloat16"]
 _VARIANTS: tuple[tuple[str, NetworkName, Change], ...] = (
@@ -81,7 +82,7 @@ def _stages(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
     config = LearnedConfig().alignment
     return {
         "image and normals": lambda: imager.images([scans[1]]),
-        "alignment": lambda: align(T, current, previous, interval, config),
+        "alignment": lambda: align(T, SweepPairs(current, previous, interval), config),
     }
 
 

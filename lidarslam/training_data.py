@@ -18,9 +18,9 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.run import in_order
 from lidarslam.simulation.mixture import mixture
 from lidarslam.train_config import SimulatedConfig
-from odometry.alignment import SweepImages
 from odometry.image_config import ImageConfig
 from odometry.preparation import PreparedRecording, prepare
+from odometry.sweeps import SweepImages
 from odometry.tensor_file import Kind, read_tensor_file, write_tensor_file
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.

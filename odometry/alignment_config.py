@@ -19,6 +19,10 @@ class AlignmentConfig(BaseModel):
     least_cosine: float = Field(0.8, ge=0.0, le=1.0, description="between the normals of a pair")
     residual_m: float = Field(0.03, gt=0.0, description="standard deviation of points about their planes")
     independent_share: float = Field(0.05, gt=0.0, le=1.0, description="of the points whose errors are independent")
+    surprise_rad_s: float = Field(
+        0.3, gt=0.0, description="standard deviation of changes of velocity within a pair of sweeps that are unexpected"
+    )
+    surprise_m_s: float = Field(0.5, gt=0.0, description="and of those of the translation")
     doubtful: float = Field(
         0.45, ge=0.0, le=1.0, description="of what a scan says that the two agree on; below, other guesses are tried"
     )
@@ -27,3 +31,8 @@ class AlignmentConfig(BaseModel):
         (0.8, 1.6, 2.4, 3.2), description="distances, to either side, that are tried along the direction in doubt"
     )
     largest_step: float = Field(0.3, gt=0.0, description="of one Gauss-Newton step, radians and metres")
+
+    @property
+    def information_per_m2(self) -> float:
+        """What one point says. Neighbouring pixels share their errors, so that it is less than its scatter tells."""
+        return self.independent_share / self.residual_m**2

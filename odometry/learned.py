@@ -13,22 +13,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, orthonormalize
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, orthonormalize
 from lidarslam.core.scan import Scan
-from odometry.alignment import Aligned, SweepImages
+from odometry.alignment import Aligned
 from odometry.alignment_search import align_best
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
 from odometry.networks import PairNetwork
+from odometry.retiming import Retimer
 from odometry.sweep_images import Imager, middle_offset_s
+from odometry.sweeps import LastMotion, SweepImages, SweepPairs
+from odometry.torch_geometry import exp
 
 # No motion is better than this, whatever the residuals say: rotation in radians, translation in metres. What bends one
 # sweep bends the next, and whoever fuses motions takes their errors as independent.
 _LEAST_SIGMA = np.array([np.deg2rad(0.5)] * 3 + [0.03] * 3)
 # Rings of points on the ground go along with the sensor and hold alignment back, by a part of the way.
 _HELD_BACK = 0.2
-# Part of a change of motion from one pair to the next that may hide within a sweep.
+# Part of the change of motion within a pair of sweeps that may not be even.
 _HIDDEN_SHARE = 0.25
 
 
@@ -56,8 +59,7 @@ class LearnedOdometry:
         self._imager = Imager(images, config.device)
         self._config = config
         self._last: _Sweep | None = None
-        self._velocity: FloatArray | None = None  # (6,) from the middle of the last sweep but one to that of the last
-        self._T_middle_stamp = np.eye(4)  # of the last scan: from its stamp to the middle of its sweep
+        self._way = Retimer()
 
     def estimate(self, scan: Scan) -> Motion:
         """The motion since the last scan that had points."""
@@ -86,12 +88,12 @@ class LearnedOdometry:
         T_prev_curr = orthonormalize(aligned.T_prev_curr[0].double().numpy(force=True))
         matched, explained = int(aligned.matched), float(aligned.explained)
         if explained < self._config.least_explained or matched < self._config.least_points:
-            self._velocity, self._T_middle_stamp = None, np.eye(4)
+            self._way.forget()
             return Motion(np.eye(4), 0, f"the scan does not fit the last one: {_misfit(matched, explained)}")
-        as_before = None if self._velocity is None else exp(self._velocity * interval_s)
-        covariance = _covariance(T_prev_curr, information, as_before)
-        motion = self._between_stamps(last, sweep, T_prev_curr)
-        self._velocity = log(T_prev_curr) / interval_s
+        bend = aligned.bend[0].double().numpy(force=True)
+        covariance = _covariance(T_prev_curr, information, bend * interval_s)
+        stamps = (last.stamp, sweep.stamp)
+        motion = self._way.between_stamps(T_prev_curr, bend, (last.middle, sweep.middle), stamps)
         return Motion(motion, matched, covariance=covariance)
 
     def _align(self, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
@@ -99,48 +101,32 @@ class LearnedOdometry:
         guess = self._network(last.features, sweep.features)
         information = torch.diag_embed((-2.0 * guess.log_sigma).exp()) / self._config.caution**2
         guesses = guess.T_prev_curr
-        if self._velocity is not None:
-            as_before = torch.from_numpy(exp(self._velocity * interval_s)).to(guesses)
-            guesses = torch.cat([guesses, as_before[None]])
-        config = self._config.alignment
-        interval = guesses.new_tensor([interval_s])
-        aligned, is_guessed = align_best(guesses, sweep.images, last.images, interval, config, information)
-        seen = aligned.information * (config.independent_share / config.residual_m**2)
+        interval, before = guesses.new_tensor([interval_s]), None
+        if self._way.last is not None:
+            velocity = torch.from_numpy(self._way.last.velocity).to(guesses)[None]
+            before = LastMotion(velocity, guesses.new_tensor([self._way.last.interval_s]))
+            guesses = torch.cat([guesses, exp(velocity * interval_s)])
+        sweeps = SweepPairs(sweep.images, last.images, interval, before)
+        aligned, is_guessed = align_best(guesses, sweeps, self._config.alignment, information)
+        seen = aligned.information * self._config.alignment.information_per_m2
         return aligned, (seen + information if is_guessed else seen)[0]
-
-    def _between_stamps(self, last: _Sweep, sweep: _Sweep, T_prev_curr: FloatArray) -> FloatArray:
-        """The motion between the scans' stamps, from that between the middles of their sweeps.
-
-        What two scans show of a motion belongs to the middles of their sweeps. Poses are interpolated between those
-        at the stamps, so that stamps at the start of sweeps do not make the odometry run half a sweep ahead.
-        """
-        twist = log(T_prev_curr) / (sweep.middle - last.middle)
-        if self._velocity is None:  # nothing is known of the motion before
-            self._T_middle_stamp = exp(twist * (last.stamp - last.middle))
-        T_middle_stamp = self._T_middle_stamp
-        # The stamp mostly lies between the two middles, on the way from one to the other.
-        T_last_middle_stamp = exp(twist * (sweep.stamp - last.middle))
-        self._T_middle_stamp = inverse(T_prev_curr) @ T_last_middle_stamp
-        return np.asarray(inverse(T_middle_stamp) @ T_last_middle_stamp, dtype=np.float64)
 
 
 def _misfit(matched: int, explained: float) -> str:
     return f"{matched} points do, which is {100.0 * explained:.0f} % of what it says of one direction"
 
 
-def _covariance(T_prev_curr: FloatArray, information: Tensor, as_before: FloatArray | None) -> FloatArray:
+def _covariance(T_prev_curr: FloatArray, information: Tensor, bent: FloatArray) -> FloatArray:
     """(6, 6) of the error `xi` in T_true = T_prev_curr @ exp(xi), rotation first.
 
-    The information is that of a change from the left. To its inverse comes what a change of motion may hide within
-    a sweep, which alignment takes as even.
+    The information is that of a change from the left. To its inverse comes a part of the change of motion (6,) within
+    a pair of sweeps, which is taken as even.
     """
     left = np.linalg.inv(information.double().numpy(force=True) + 1e-6 * np.eye(6))
     A = adjoint(inverse(T_prev_curr))
     covariance = A @ left @ A.T + np.diag(_LEAST_SIGMA**2)
     covariance[3:, 3:] += np.eye(3) * (_HELD_BACK * np.linalg.norm(T_prev_curr[:3, 3])) ** 2
-    if as_before is not None:
-        covariance += np.diag((_HIDDEN_SHARE * log(inverse(as_before) @ T_prev_curr)) ** 2)
-    return np.asarray(covariance, dtype=np.float64)
+    return np.asarray(covariance + np.diag((_HIDDEN_SHARE * bent) ** 2), dtype=np.float64)
 
 
 @contextmanager

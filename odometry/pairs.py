@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from odometry.alignment import SweepImages
 from odometry.preparation import PreparedRecording, compensated
 from odometry.projection import mirror, rotate_columns
+from odometry.sweeps import SweepImages
 from odometry.torch_geometry import inverse, log, turn_about_z
 from odometry.training_config import AugmentationConfig
 
@@ -135,6 +135,7 @@ def _turned(batch: PairBatch, config: AugmentationConfig, generator: Generator) 
     """Both scans turned about z by whole columns, the current one by some more."""
     size, width = len(batch.previous), batch.previous.shape[-1]
     both = torch.randint(width, (size,), generator=generator)
+    both = torch.where(torch.rand(size, generator=generator) < config.heading, both, 0)
     more = torch.randn(size, generator=generator) * (config.roll_deg * width / 360.0)
     anywhere = torch.rand(size, generator=generator) < config.any_roll
     more = torch.where(anywhere, torch.randint(width, (size,), generator=generator).float(), more.round())

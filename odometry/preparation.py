@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from lidarslam.core.scan import Scan
-from odometry.alignment import Aligned, SweepImages, compensate
+from odometry.alignment import Aligned
 from odometry.alignment_config import AlignmentConfig
 from odometry.alignment_search import align_best, try_instead
 from odometry.image_config import ImageConfig
 from odometry.sweep_images import Imager, middle_offset_s
+from odometry.sweeps import LastMotion, SweepImages, SweepPairs, compensate, consecutive
 from odometry.torch_geometry import log, turn_about_z
 
 # Scans that are made into images, and pairs that are aligned, at a time: what fits a CPU's cache.
@@ -80,22 +81,25 @@ def _believed(aligned: Aligned) -> Tensor:
 def _align_all(images: SweepImages, interval_s: Tensor) -> Aligned:
     """Every scan on the one before it: from the last motion and from rest, and unless that is good from many turns."""
     found: list[Aligned] = []
-    T_last = torch.eye(4)
+    T_last, last = torch.eye(4), None
     for number in range(len(images) - 1):
-        current, previous = images.select(slice(number + 1, number + 2)), images.select(slice(number, number + 1))
-        best = _align_one(T_last, current, previous, interval_s[number : number + 1])
-        T_last = best.T_prev_curr[0] if _believed(best) else torch.eye(4)
+        interval = interval_s[number : number + 1]
+        best = _align_one(T_last, consecutive(images, number, interval, last))
+        T_last, last = torch.eye(4), None
+        if _believed(best):
+            T_last = best.T_prev_curr[0]
+            last = LastMotion(log(best.T_prev_curr) / interval[:, None], interval)
         found.append(best)
     return Aligned(*(torch.cat([getattr(one, name) for one in found]) for name in vars(found[0])))
 
 
-def _align_one(T_last: Tensor, current: SweepImages, previous: SweepImages, interval_s: Tensor) -> Aligned:
+def _align_one(T_last: Tensor, sweeps: SweepPairs) -> Aligned:
     """From the last motion and from rest; from many turns unless that is good, or the sensor was turning."""
-    best, _ = align_best(torch.stack([T_last, torch.eye(4)]), current, previous, interval_s, _FINE)
+    best, _ = align_best(torch.stack([T_last, torch.eye(4)]), sweeps, _FINE)
     was_turning = float(log(T_last)[:3].norm()) > _TURNING
     if float(best.explained) >= _FINE.doubtful and not was_turning:
         return best
-    return try_instead(best, _turned(T_last), current, previous, interval_s, _FINE) or best
+    return try_instead(best, _turned(T_last), sweeps, _FINE) or best
 
 
 def _turned(T_last: Tensor) -> Tensor:

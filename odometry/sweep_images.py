@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from lidarslam.core.scan import Scan
-from odometry.alignment import SweepImages
 from odometry.image_config import ImageConfig
 from odometry.normals import surface_normals
 from odometry.projection import ImageGrid, project
+from odometry.sweeps import SweepImages
 
 # A scan of fewer points, as of a covered sensor, does not tell which elevations the sensor sees.
 _ENOUGH_POINTS = 200

@@ -22,6 +22,7 @@ class AugmentationConfig(BaseModel):
 
     max_gap: int = Field(3, ge=1, description="steps from one scan of a pair to the other, 1 to this many")
     reverse: float = Field(0.5, ge=0.0, le=1.0, description="the later scan comes first")
+    heading: float = Field(1.0, ge=0.0, le=1.0, description="both scans are turned about z by the same angle, any")
     roll: float = Field(0.8, ge=0.0, le=1.0, description="the current scan is turned about z by whole columns")
     roll_deg: float = Field(12.0, ge=0.0, description="standard deviation of most of these turns")
     any_roll: float = Field(

@@ -9,8 +9,8 @@ import torch
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from odometry.alignment import SweepImages
 from odometry.preparation import PreparedRecording
+from odometry.sweeps import SweepImages
 
 _LOW, _HIGH = np.deg2rad(-18.0), np.deg2rad(18.0)
 

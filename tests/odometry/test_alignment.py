@@ -3,12 +3,16 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from odometry.alignment import Aligned, SweepImages, align, compensate
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import exp as exp_of
+from odometry.alignment import Aligned, align
 from odometry.alignment_config import AlignmentConfig
+from odometry.sweeps import LastMotion, SweepImages, SweepPairs, compensate, consecutive
 from odometry.torch_geometry import exp, inverse, log, transform_points
 
 CONFIG = AlignmentConfig()
@@ -36,8 +40,7 @@ def errors(T: Tensor, truth: Tensor) -> tuple[float, float]:
 
 def one_on_the_other(sweeps: SweepImages, T: Tensor, **options: object) -> Aligned:
     """The second of two sweeps on the first."""
-    config = AlignmentConfig.model_validate(options)
-    return align(T, sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1)), INTERVAL_S, config)
+    return align(T, consecutive(sweeps, 0, INTERVAL_S), AlignmentConfig.model_validate(options))
 
 
 def together(sweeps: list[SweepImages]) -> SweepImages:
@@ -77,9 +80,7 @@ def test_turning_sweeps_are_compensated(box_room):
 def test_the_interval_tells_how_fast_the_motion_is(box_room):
     """Were the sweeps half as far apart, the body would move twice as fast in them."""
     sweeps = box_room.sweeps(2, TURNING)
-    found = align(
-        guess(TURNING), sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1)), 0.5 * INTERVAL_S, AlignmentConfig()
-    )
+    found = align(guess(TURNING), consecutive(sweeps, 0, 0.5 * INTERVAL_S), CONFIG)
     assert errors(found.T_prev_curr, moved(TURNING))[0] > 0.1
 
 
@@ -88,7 +89,7 @@ def test_items_of_a_batch_are_on_their_own(box_room):
     sweeps = [box_room.sweeps(2, twist) for twist in twists]
     current, previous = (together([one.select(slice(i, i + 1)) for one in sweeps]) for i in (1, 0))
     guesses = torch.cat([guess(twist) for twist in twists])
-    batch = align(guesses, current, previous, INTERVAL_S.expand(3), CONFIG)
+    batch = align(guesses, SweepPairs(current, previous, INTERVAL_S.expand(3)), CONFIG)
     assert errors(batch.T_prev_curr, torch.cat([moved(twist) for twist in twists])) < (0.03, 0.002)
     for i, twist in enumerate(twists):
         alone = one_on_the_other(sweeps[i], guess(twist))
@@ -105,11 +106,10 @@ def test_without_a_step_the_guess_is_the_answer(box_room):
 
 def test_a_guess_is_held_as_firmly_as_its_information_says(box_room):
     sweeps = box_room.sweeps(2, TWIST)
-    current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
     close = guess(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
-    certain = align(close, current, previous, INTERVAL_S, CONFIG, 1e9 * torch.eye(6)[None])
+    certain = align(close, consecutive(sweeps, 0, INTERVAL_S), CONFIG, 1e9 * torch.eye(6)[None])
     assert errors(certain.T_prev_curr, close) < (0.01, 5e-4)
-    uncertain = align(close, current, previous, INTERVAL_S, CONFIG, 1e-3 * torch.eye(6)[None])
+    uncertain = align(close, consecutive(sweeps, 0, INTERVAL_S), CONFIG, 1e-3 * torch.eye(6)[None])
     assert errors(uncertain.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
 
 
@@ -120,7 +120,7 @@ def test_the_information_of_a_guess_is_of_changes_from_the_left(box_room):
     T = guess(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
     holds_x = torch.zeros(1, 6, 6)
     holds_x[:, 3, 3] = 1e9
-    found = align(T, sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1)), INTERVAL_S, CONFIG, holds_x)
+    found = align(T, consecutive(sweeps, 0, INTERVAL_S), CONFIG, holds_x)
     away = found.T_prev_curr[0, :3, 3] - moved(twist)[0, :3, 3]
     # What is held wrongly pulls a little at the rest.
     assert float(away[0] - T[0, 0, 3] + moved(twist)[0, 0, 3]) == pytest.approx(0.0, abs=1e-4)
@@ -131,9 +131,8 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
     """The walls say nothing of x; all else is found."""
     twist, wrong = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0), (0.01, 0.01, 0.02, 0.10, 0.06, 0.05)
     sweeps = corridor.sweeps(2, twist)
-    current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
     T = guess(twist, wrong)
-    kept = align(T, current, previous, INTERVAL_S, CONFIG, torch.eye(6)[None])
+    kept = align(T, consecutive(sweeps, 0, INTERVAL_S), CONFIG, torch.eye(6)[None])
     error = log(kept.T_prev_curr @ inverse(moved(twist)))[0]
     # Turning it back about the origin moves it along x by less than a millimetre.
     torch.testing.assert_close(kept.T_prev_curr[0, 0, 3], T[0, 0, 3], rtol=0, atol=1e-3)
@@ -144,7 +143,7 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
 
 def test_information_is_weak_along_a_corridor(corridor):
     twist = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0)
-    found = one_on_the_other(corridor.sweeps(2, twist), moved(twist))
+    found = one_on_the_other(corridor.sweeps(2, twist, rolling=False), moved(twist))
     information = found.information[0]
     assert information[3, 3] < 1e-6 * information[4, 4]
     assert information[5, 5] > 100.0
@@ -154,7 +153,7 @@ def test_information_is_weak_along_a_corridor(corridor):
 
 def test_share_and_residual_tell_what_does_not_fit(box_room, corridor):
     room, street = box_room.sweeps(1, TWIST), corridor.sweeps(1, TWIST)
-    unrelated = align(torch.eye(4)[None], street, room, INTERVAL_S, CONFIG)
+    unrelated = align(torch.eye(4)[None], SweepPairs(street, room, INTERVAL_S), CONFIG)
     assert unrelated.share < 0.3
     beside = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST), iterations=0)
     fits = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
@@ -204,7 +203,7 @@ def test_empty_images_move_nothing(box_room, empty):
     )  # fmt: skip
     current = full if empty == "previous" else nothing
     previous = full if empty == "current" else nothing
-    found = align(guess(TWIST), current, previous, INTERVAL_S, CONFIG)
+    found = align(guess(TWIST), SweepPairs(current, previous, INTERVAL_S), CONFIG)
     torch.testing.assert_close(found.T_prev_curr, guess(TWIST))
     assert (float(found.share), float(found.residual_m), int(found.matched)) == (0.0, 0.0, 0)
     assert not found.information.any()
@@ -236,3 +235,64 @@ def test_compensation_is_the_exponential_to_second_order(is_direction):
         difference = (compensate(points, offsets, velocity, is_direction)[0] - exact).norm(dim=-1)
         assert difference.max() < accuracy
         assert difference.max() > 0.5 * accuracy  # else the docstring says too little
+
+
+def speeding_up(times: FloatArray) -> FloatArray:
+    """Poses on a turn and a way ahead that grow evenly, from rest at 0.1 s before the middle of the first sweep."""
+    half = 0.5 * (times + 0.1) ** 2
+    return exp_of(np.multiply.outer(half, np.array(ACCELERATION)))
+
+
+ACCELERATION = (1.0, 0.5, 8.0, 2.0, 0.5, 0.0)  # rad/s^2, m/s^2: 4.6 degrees more from sweep to sweep
+
+
+def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room):
+    sweeps = box_room.sweeps_along(3, speeding_up)
+    T = torch.from_numpy(speeding_up(np.array([0.0, 0.1, 0.2]))).float()
+    before, motion = inverse(T[:1]) @ T[1:2], inverse(T[1:2]) @ T[2:]
+    velocity = log(before) / INTERVAL_S[:, None]
+    half_a_change = 0.05 * torch.tensor([ACCELERATION])
+    off = exp(torch.tensor([[0.02, 0.0, -0.02, 0.05, 0.03, 0.0]])) @ motion
+    for last in (None, LastMotion(velocity, INTERVAL_S)):
+        found = align(off, consecutive(sweeps, 1, INTERVAL_S, last), CONFIG)
+        assert errors(found.T_prev_curr, motion) < (0.06, 0.004)
+        torch.testing.assert_close(found.bend, half_a_change, rtol=0, atol=0.06)
+    # Held at none, the motion is off by more.
+    even = CONFIG.model_copy(update={"surprise_rad_s": 1e-4, "surprise_m_s": 1e-4})
+    stiff = align(off, consecutive(sweeps, 1, INTERVAL_S), even)
+    assert not stiff.bend.abs().max() > 1e-2
+    assert errors(stiff.T_prev_curr, motion)[0] > 3.0 * errors(found.T_prev_curr, motion)[0]
+    # Held at what the motion before tells, it is nearly as good.
+    told = align(off, consecutive(sweeps, 1, INTERVAL_S, LastMotion(velocity, INTERVAL_S)), even)
+    assert errors(told.T_prev_curr, motion) < (0.06, 0.004)
+
+
+def test_the_last_motion_may_have_taken_longer(box_room):
+    """The change of velocity is shared out by time: over 0.3 s a third as fast as over 0.1 s."""
+    sweeps = box_room.sweeps(2, TWIST)
+    stiff = CONFIG.model_copy(update={"surprise_rad_s": 1e-4, "surprise_m_s": 1e-4, "iterations": 0})
+    rest = torch.zeros(1, 6)
+    for interval_s, share in ((0.1, 0.5), (0.3, 0.25)):
+        last = LastMotion(rest, torch.tensor([interval_s]))
+        found = align(moved(TWIST), consecutive(sweeps, 0, INTERVAL_S, last), stiff)
+        torch.testing.assert_close(found.bend, share * torch.tensor([TWIST]), rtol=0, atol=1e-5)
+
+
+def test_sweeps_seen_at_once_cannot_be_bent(box_room):
+    sweeps = box_room.sweeps(2, TWIST, rolling=False)
+    found = one_on_the_other(sweeps, guess(TWIST))
+    assert not found.bend.any()
+
+
+def test_what_a_bend_could_be_as_well_is_not_known(box_room):
+    """A wall that is seen for a moment tells where it is, not how fast it got there."""
+    sweeps = box_room.sweeps(2, TWIST)
+    early = sweeps.offsets < -0.04
+    part = replace(sweeps, normals=sweeps.normals * early[:, None])
+    options = {"iterations": 0}
+    loose, firm = (
+        one_on_the_other(part, moved(TWIST), surprise_rad_s=s, surprise_m_s=s, **options).information[0]
+        for s in (10.0, 1e-4)
+    )
+    assert torch.linalg.eigvalsh(firm.double() - loose.double()).min() > -1e-3 * firm.trace()
+    assert loose[5, 5] < 0.2 * firm[5, 5]

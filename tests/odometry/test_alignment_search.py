@@ -5,9 +5,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.alignment import Aligned, SweepImages, align
+from odometry.alignment import Aligned, align
 from odometry.alignment_config import AlignmentConfig
 from odometry.alignment_search import align_best, try_guesses
+from odometry.sweeps import SweepImages, consecutive
 from odometry.torch_geometry import exp, inverse, log
 
 CONFIG = AlignmentConfig()
@@ -33,8 +34,7 @@ def moved(along_m: float) -> Tensor:
 
 def one_on_the_other(sweeps: SweepImages, guesses: Tensor, information: Tensor | None = None, **options) -> Aligned:
     """The second of two sweeps on the first."""
-    current, previous = sweeps.select(slice(1, 2)), sweeps.select(slice(0, 1))
-    return align_best(guesses, current, previous, INTERVAL_S, AlignmentConfig(**options), information)[0]
+    return align_best(guesses, consecutive(sweeps, 0, INTERVAL_S), AlignmentConfig(**options), information)[0]
 
 
 def wrong_by_m(aligned: Aligned) -> float:
@@ -42,7 +42,7 @@ def wrong_by_m(aligned: Aligned) -> float:
 
 
 def test_alignment_from_rest_stays_there_and_knows_it(street):
-    found = align(REST, street.select(slice(1, 2)), street.select(slice(0, 1)), INTERVAL_S, CONFIG)
+    found = align(REST, consecutive(street, 0, INTERVAL_S), CONFIG)
     assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
     assert found.share > 0.3  # the ground and the walls go along
     assert found.explained < CONFIG.doubtful - 0.2
@@ -61,7 +61,7 @@ def test_no_steps_are_tried_where_there_are_none(street):
 
 def test_a_good_alignment_is_not_searched_around(street):
     found = one_on_the_other(street, moved(1.35))
-    alone = align(moved(1.35), street.select(slice(1, 2)), street.select(slice(0, 1)), INTERVAL_S, CONFIG)
+    alone = align(moved(1.35), consecutive(street, 0, INTERVAL_S), CONFIG)
     assert torch.equal(found.T_prev_curr, alone.T_prev_curr)
 
 
@@ -96,6 +96,6 @@ def test_information_is_about_the_first_guess_alone(street, corridor):
 
 def test_the_best_of_many_guesses_is_found_roughly(street):
     guesses = torch.cat([moved(0.1 * x) for x in (-20, -10, 0, 13, 25)])
-    found = try_guesses(guesses, street.select(slice(1, 2)), street.select(slice(0, 1)), INTERVAL_S, CONFIG)
+    found = try_guesses(guesses, consecutive(street, 0, INTERVAL_S), CONFIG)
     assert found.shape == (1, 4, 4)
     assert float(found[0, 0, 3]) == pytest.approx(1.4, abs=0.05)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -160,17 +159,6 @@ def test_an_even_motion_is_the_same_wherever_the_stamps_are(box_room, stamp_at):
         assert_close(motion, moved())
 
 
-def test_stamps_in_the_middle_leave_what_alignment_found(box_room):
-    sweeps = box_room.sweeps_along(4, turning(6.0))
-    middle = [stamped(scan, 0.5) for scan in box_room.as_scans(sweeps)]
-    start = box_room.as_scans(sweeps)
-    at_middle, at_start = (estimates(scans, Told(np.eye(4)))[1:] for scans in (middle, start))
-    # From start to start it is half of one and half of the next, but for the first.
-    for (before, after), motion in zip(pairwise(at_middle), at_start[1:], strict=True):
-        halves = [0.5 * log(part.T_prev_curr) for part in (before, after)]
-        np.testing.assert_allclose(motion.T_prev_curr, exp(halves[0]) @ exp(halves[1]), atol=1e-6)
-
-
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_motions_are_those_between_stamps(box_room, stamp_at):
     """A turn that grows by 2.3 degrees a sweep, so that half a sweep makes more than a degree."""
@@ -180,10 +168,10 @@ def test_motions_are_those_between_stamps(box_room, stamp_at):
     for number in range(2, 6):
         T = way(0.1 * (np.array([number - 1, number]) - 0.5 + stamp_at))
         between_stamps = inverse(T[0]) @ T[1]
-        assert_close(motions[number], between_stamps, 0.3, 0.02)
+        assert_close(motions[number], between_stamps, 0.05, 0.003)
         middles = way(0.1 * np.array([number - 1.0, number]))
         lag = errors(motions[number], inverse(middles[0]) @ middles[1])[0]
-        assert lag > 0.9 if stamp_at != 0.5 else lag < 0.3
+        assert lag > 0.9 if stamp_at != 0.5 else lag < 0.05
 
 
 def turning(acceleration: float) -> Callable[[FloatArray], FloatArray]:

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lidarslam.core.scan import Scan
-from odometry.alignment import SweepImages
 from odometry.image_config import ImageConfig
 from odometry.preparation import compensated, prepare
+from odometry.sweeps import SweepImages
 from odometry.torch_geometry import exp, inverse, log
 
 CONFIG = ImageConfig(rows=16, columns=360)
