@@ -84,6 +84,9 @@ class MappingConfig(BaseModel):
     prior_translation_m: float = Field(
         0.15, gt=0.0, description="standard deviation of an odometry's translation, along each axis"
     )
+    prior_caution: float = Field(
+        10.0, gt=0.0, description="factor on the standard deviations that an odometry gives itself: its errors repeat"
+    )
     features: FeatureConfig = FeatureConfig()
     refinement: RefinementConfig = RefinementConfig()
     tracking: TrackingConfig = TrackingConfig()

@@ -147,9 +147,12 @@ def predict(state: State, stamp: float, prior: Prior, carrier: Carrier, config: 
 
 
 def _uncertainty(prior: Prior, config: MappingConfig) -> FloatArray:
-    """(6, 6) covariance of the odometry's motion: its own word, else the configuration's."""
+    """(6, 6) covariance of the odometry's motion: its own word, else the configuration's.
+
+    Its errors go together from scan to scan, while the state that it is fused with takes each for a new one.
+    """
     if prior.covariance is not None:
-        return prior.covariance
+        return np.asarray(config.prior_caution**2 * prior.covariance, dtype=np.float64)
     sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
     return np.asarray(np.diag(sigmas**2), dtype=np.float64)
 

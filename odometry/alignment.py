@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lidarslam.core import geometry
 from odometry.alignment_config import AlignmentConfig
 from odometry.pairing import Cloud, Movement, Pairs, filled, pair, sample
 from odometry.sweeps import SweepImages, SweepPairs
-from odometry.torch_geometry import exp, inverse, log
+from odometry.torch_geometry import inverse
 
 # A pair whose motion changes by less than this in a step has arrived: rotation in radians, translation in metres.
 _ARRIVED = 1e-4
@@ -95,7 +96,7 @@ def align(
 
 def _movement(state: _State, sweeps: SweepPairs) -> Movement:
     """The change of velocity goes on as before, but for the surprise."""
-    velocity = log(state.T_prev_curr) / sweeps.interval_s[:, None]
+    velocity = _log(state.T_prev_curr) / sweeps.interval_s[:, None]
     bend = state.surprise
     if sweeps.last is not None:
         share = sweeps.interval_s / (sweeps.interval_s + sweeps.last.interval_s)
@@ -132,14 +133,24 @@ def _step(
     H[:, 6:, 6:] += expected
     g[:, 6:] += state.surprise.double() @ expected
     if guess_information is not None:
-        away = log(state.T_prev_curr @ inverse(guess))
+        away = _log(state.T_prev_curr @ inverse(guess))
         H[:, :6, :6] += guess_information
         g[:, :6] += (guess_information @ away[..., None])[..., 0]
     H += _LEAST_INFORMATION * torch.eye(12, dtype=H.dtype, device=H.device)
     delta = -torch.linalg.solve(H, g[..., None])[..., 0].to(guess.dtype)
     step, change = delta[:, :6], delta[:, 6:]
     step = step * (config.largest_step / step.abs().amax(-1, keepdim=True).clamp(min=config.largest_step))
-    return _State(exp(step) @ state.T_prev_curr, state.surprise + change), float(step.abs().max())
+    return _State(_exp(step) @ state.T_prev_curr, state.surprise + change), float(step.abs().max())
+
+
+def _log(T: Tensor) -> Tensor:
+    """Twists (B, 6) of motions (B, 4, 4); of so few, NumPy is several times as fast as torch."""
+    return torch.from_numpy(geometry.log(T.double().numpy(force=True))).to(T)
+
+
+def _exp(twist: Tensor) -> Tensor:
+    """Motions (B, 4, 4) of twists (B, 6)."""
+    return torch.from_numpy(geometry.exp(twist.double().numpy(force=True))).to(twist)
 
 
 def _expected(config: AlignmentConfig, like: Tensor) -> Tensor:

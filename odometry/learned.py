@@ -26,13 +26,13 @@ from odometry.sweep_images import Imager, middle_offset_s
 from odometry.sweeps import LastMotion, SweepImages, SweepPairs
 from odometry.torch_geometry import exp
 
-# No motion is better than this, whatever the residuals say: rotation in radians, translation in metres. What bends one
-# sweep bends the next, and whoever fuses motions takes their errors as independent.
-_LEAST_SIGMA = np.array([np.deg2rad(0.5)] * 3 + [0.03] * 3)
+# What comes on top of what the residuals say, so that about 90, 98 and 99.5 % of errors lie within one, two and three
+# standard deviations (errors have longer tails than a normal distribution's): rotation in radians, translation in metres.
+_LEAST_SIGMA = np.array([np.deg2rad(0.05)] * 3 + [0.003] * 3)
 # Rings of points on the ground go along with the sensor and hold alignment back, by a part of the way.
-_HELD_BACK = 0.2
+_HELD_BACK = 0.02
 # Part of the change of motion within a pair of sweeps that may not be even.
-_HIDDEN_SHARE = 0.25
+_HIDDEN_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,13 @@ VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s
 MOVED = exp(0.1 * VELOCITY)
 # What the odometry says differs from going on by 3 degrees and 20 cm.
 OFF = np.array([0.03, -0.03, 0.03, 0.1, -0.1, 0.15])
+AS_TOLD = MappingConfig(prior_caution=1.0)
 
 
 def predicted(prior: Prior, config: MappingConfig | None = None, pose: FloatArray | None = None) -> Prediction:
     known = np.diag(np.array([0.02] * 3 + [0.05] * 3 + [0.5] * 3 + [1.0] * 3) ** 2)
     state = State(5.0, np.eye(4) if pose is None else pose, VELOCITY, known, seen_until_s=0.1)
-    return predict(state, 5.1, prior, Carrier(), config or MappingConfig())
+    return predict(state, 5.1, prior, Carrier(), config or AS_TOLD)
 
 
 def step(prediction: Prediction) -> FloatArray:
@@ -59,12 +60,20 @@ def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
         assert np.delete(sigmas, 3).max() < 2e-4
 
 
+def test_an_odometry_is_believed_less_than_it_says_by_the_caution() -> None:
+    motion = MOVED @ exp(OFF)
+    cautious = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.01)), MappingConfig(prior_caution=5.0))
+    told = predicted(Prior(motion, VELOCITY + 1.0, isotropic(0.05)))
+    for name, value in vars(cautious).items():
+        np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
+
+
 def test_an_odometry_that_does_not_say_is_believed_as_configured() -> None:
     config = MappingConfig(prior_rotation_deg=2.0, prior_translation_m=0.3)
     sigmas = np.array([np.deg2rad(2.0)] * 3 + [0.3] * 3)
     motion = MOVED @ exp(OFF)
     silent = predicted(Prior(motion, VELOCITY + 1.0), config)
-    told = predicted(Prior(motion, VELOCITY + 1.0, np.diag(sigmas**2)), MappingConfig())
+    told = predicted(Prior(motion, VELOCITY + 1.0, np.diag(sigmas**2)))
     for name, value in vars(silent).items():
         np.testing.assert_allclose(value, getattr(told, name), atol=1e-12)
     other = predicted(Prior(motion, VELOCITY + 1.0), MappingConfig(prior_translation_m=0.01))
