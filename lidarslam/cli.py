@@ -201,7 +201,7 @@ def info(
     "--mapping/--no-mapping", default=None, help="Lay every scan on the map of those before.  [default: mapping]"
 )
 @click.option(
-    "--pose-graph/--no-pose-graph", default=False, help="Close loops in a pose graph.  [default: no-pose-graph]"
+    "--pose-graph/--no-pose-graph", default=None, help="Close loops in a pose graph.  [default: no-pose-graph]"
 )
 @click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan.")
 @click.option("--stop", type=click.IntRange(min=0), help="Scan to stop before.")
@@ -229,9 +229,9 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
         options.pop("weights"),
         options["prior"],
         options.pop("mapping"),
+        options.pop("pose_graph"),
         options.pop("settings"),
     )
-    _refuse_missing_parts(options.pop("pose_graph"))
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     config = _resolve(options.pop("config_file"), settings, **reader)
     _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
@@ -246,7 +246,12 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
 
 
 def _method_settings(
-    odometry: str | None, weights: Path | None, prior: Path | None, mapping: bool | None, settings: tuple[str, ...]
+    odometry: str | None,
+    weights: Path | None,
+    prior: Path | None,
+    mapping: bool | None,
+    pose_graph: bool | None,
+    settings: tuple[str, ...],
 ) -> tuple[str, ...]:
     from lidarslam.config import setting
 
@@ -262,14 +267,8 @@ def _method_settings(
         odometry = "external"
     if odometry is not None:
         settings = (*settings, f"odometry.method={odometry}")
-    return settings if mapping is None else (*settings, f"mapping.enabled={str(mapping).lower()}")
-
-
-def _refuse_missing_parts(pose_graph: bool) -> None:
-    from lidarslam.core.errors import ConfigError
-
-    if pose_graph:
-        raise ConfigError("the pose graph is not part of this version; run with --no-pose-graph")
+    switches = {"mapping.enabled": mapping, "pose_graph.enabled": pose_graph}
+    return (*settings, *(f"{key}={str(on).lower()}" for key, on in switches.items() if on is not None))
 
 
 def _worlds() -> Iterable[str]:

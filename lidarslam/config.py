@@ -17,6 +17,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run_directory import RUN_SECTION
 from lidarslam.training_directory import SOURCES_SECTION
 from mapping.config import GlobalMapConfig, MappingConfig
+from mapping.graph_config import SlamGraphConfig
 from odometry.config import OdometryConfig
 
 # PyYAML lets Python's own errors through for what has the form or the tag of a date or a number: 2021-13-45.
@@ -46,6 +47,7 @@ class Config(BaseModel):
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()
     mapping: MappingConfig = MappingConfig()
+    pose_graph: SlamGraphConfig = SlamGraphConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
 

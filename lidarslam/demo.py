@@ -22,7 +22,7 @@ from lidarslam.simulation.record import record
 from lidarslam.simulation.recording_request import RecordRequest
 
 RECORDING, REPLAY = "recording", "demo.rrd"
-METHODS = "learned+map,kiss-icp"
+METHODS = "learned+map+graph,kiss-icp"
 _NAME = "office"
 
 

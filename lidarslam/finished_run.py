@@ -1,6 +1,7 @@
 """Runs read back from disk."""
 
 import csv
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,12 +26,14 @@ class FinishedRun:
         trajectory: the final poses.
         lost: (N,) which of them were lost.
         map_points: (M, 3) in the world, none when the map is missing.
+        loops: (L, 2) pairs of scans between which loops were closed.
     """
 
     name: str
     trajectory: Trajectory
     lost: NDArray[np.bool_]
     map_points: FloatArray
+    loops: NDArray[np.intp]
 
 
 def load_run(path: Path) -> FinishedRun:
@@ -43,7 +46,11 @@ def load_run(path: Path) -> FinishedRun:
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
     trajectory = read_tum(path / files.TRAJECTORY_TUM)
     return FinishedRun(
-        path.resolve().name, trajectory, _lost(path / files.SCANS_CSV, trajectory), load_map(path).points
+        path.resolve().name,
+        trajectory,
+        _lost(path / files.SCANS_CSV, trajectory),
+        load_map(path).points,
+        _loops(path / files.SUMMARY, len(trajectory)),
     )
 
 
@@ -81,6 +88,19 @@ def _require_cloud(file: Path) -> None:
 
 def _unreadable(file: Path) -> InputError:
     return InputError(f"{file}: not a readable point cloud; expected a .ply or .pcd file with points")
+
+
+def _loops(summary: Path, scans: int) -> NDArray[np.intp]:
+    """The loops that a run closed; none for a run without a graph."""
+    if not summary.is_file():
+        return np.empty((0, 2), dtype=np.intp)
+    try:
+        graph = json.loads(summary.read_text(encoding="utf-8")).get("pose_graph") or {"loops": []}
+        pairs = [(loop["first_scan"], loop["second_scan"]) for loop in graph["loops"] if loop["accepted"]]
+        loops = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{summary}: not a run's summary ({error}); make the run again") from error
+    return loops[((loops >= 0) & (loops < scans)).all(axis=1)]
 
 
 def _lost(scans_csv: Path, trajectory: Trajectory) -> NDArray[np.bool_]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import get_args
 
-from lidarslam.config import Config
 from lidarslam.core.errors import ConfigError
 from odometry.config import OdometryName
 
@@ -56,10 +55,7 @@ def _settings(name: str, odometry: str, match: re.Match[str]) -> Iterator[str]:
     if match["voxel"] is not None:
         yield f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, odometry, match['voxel'])!r}"
     yield f"mapping.enabled={str(match['map'] is not None).lower()}"
-    if "pose_graph" in Config.model_fields:
-        yield f"pose_graph.enabled={str(match['graph'] is not None).lower()}"
-    elif match["graph"]:
-        raise ConfigError(f"{name}: the pose graph is not part of this version")
+    yield f"pose_graph.enabled={str(match['graph'] is not None).lower()}"
 
 
 def _voxel_size_m(name: str, odometry: str, text: str) -> float:

@@ -2,14 +2,15 @@
 
 One scan's motion must be known before the next can be estimated. What follows from a motion (laying the scan on the map
 or holding it against the one before, and adding it to the global map) happens on a second thread meanwhile, one scan
-later, when the motion after the scan is known as well.
+later, when the motion after the scan is known as well. A pose graph, where there is one, follows on a third.
 """
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -22,10 +23,13 @@ from lidarslam.core.tracking import Status
 from lidarslam.localisation import Estimated, Localised, Localiser, SweepMotion
 from mapping.config import GlobalMapConfig
 from mapping.global_map import GlobalMap, voxel_size_for
+from mapping.graph_scan import GraphScan
 from odometry.interface import Odometry
 
 # How many scans the second thread may lag behind: the map now and then takes as long as several scans to tidy up.
 _MAX_BEHIND = 8
+# And the third: a loop may take as long as all the scans up to the next keyframe.
+_MAX_BEHIND_GRAPH = 64
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
@@ -82,22 +86,48 @@ class _Compensated:
     T_world_lidar: FloatArray
 
 
-class Pipeline:
-    """Turns a stream of scans into a stream of results and a global map."""
+class Follower(Protocol):
+    """Sees everything that a run comes to, scan by scan: what the scan before showed, then the next scan."""
 
-    def __init__(self, odometry: Odometry, localiser: Localiser, config: GlobalMapConfig) -> None:
+    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
+        """Points (N, 3) of the latest scan, in its LiDAR frame, that belong in the map."""
+
+    def add(self, scan: GraphScan) -> None:
+        """The next scan."""
+
+
+class Pipeline:
+    """Turns a stream of scans into a stream of results and a global map.
+
+    Args:
+        odometry, localiser: where scans are.
+        config: of the global map.
+        graph: follows what comes of it on a thread of its own, and is up to date when the last result has come.
+    """
+
+    def __init__(
+        self, odometry: Odometry, localiser: Localiser, config: GlobalMapConfig, graph: Follower | None = None
+    ) -> None:
         self._odometry = odometry
         self._localiser = localiser
         self._config = config
+        self._graph = None if graph is None else _Behind(graph)
         self._voxel_size_m = config.voxel_size_m
         self._waiting: _Compensated | None = None
         self.global_map: GlobalMap | None = None
 
-    def run(self, scans: Iterable[Scan]) -> Iterator[ScanResult]:
+    def run(self, scans: Iterable[Scan]) -> Generator[ScanResult, None, None]:
         """Process the scans in order; each result comes while later scans' odometry is at work.
 
         An error of the scans' reader is raised after the results of the scans before it.
         """
+        try:
+            yield from self._results(scans)
+        finally:
+            if self._graph is not None:
+                self._graph.finish()
+
+    def _results(self, scans: Iterable[Scan]) -> Iterator[ScanResult]:
         jobs: deque[Future[ScanResult]] = deque()
         error: Exception | None = None
         # Matrices here are small: a BLAS of several threads spends its time on waiting, and takes it from the others.
@@ -145,6 +175,8 @@ class Pipeline:
         self._add_waiting(localised.status)
         if localised.belongs_in_map:  # a pose that is not believed must not draw walls
             self._waiting = _Compensated(thinned, localised.motion, points, localised.T_world_lidar)
+        if self._graph is not None:
+            self._graph.add(_graph_scan(timed.estimated, localised, points))
         followed_ms = {"deskew": _ms(found, compensated), "map": _ms(compensated, time.perf_counter())}
         return _result(scan, localised, points, timed.stage_ms | localised.stage_ms | followed_ms)
 
@@ -169,6 +201,31 @@ class Pipeline:
         if self.global_map is None:
             self.global_map = GlobalMap(self._voxel_size_m)
         self.global_map.add(points, scan.T_world_lidar)
+        if self._graph is not None:
+            self._graph.draw(points, scan.T_world_lidar, self._voxel_size_m)
+
+
+class _Behind:
+    """Lets a follower work on a thread of its own, and wait no longer than is good for the memory."""
+
+    def __init__(self, follower: Follower) -> None:
+        self._follower = follower
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graph")
+        self._jobs: deque[Future[None]] = deque()
+
+    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
+        self._jobs.append(self._pool.submit(self._follower.draw, points, T_world_lidar, voxel_size_m))
+
+    def add(self, scan: GraphScan) -> None:
+        self._jobs.append(self._pool.submit(self._follower.add, scan))
+        while len(self._jobs) > _MAX_BEHIND_GRAPH:
+            self._jobs.popleft().result()
+
+    def finish(self) -> None:
+        """Wait until all is done; an error of the follower's is raised."""
+        while self._jobs:
+            self._jobs.popleft().result()
+        self._pool.shutdown()
 
 
 def _with_next(items: Iterable[_Timed]) -> Iterator[tuple[_Timed, _Timed | None]]:
@@ -204,6 +261,19 @@ def _result(scan: Scan, localised: Localised, points: FloatArray, stage_ms: dict
         degenerate=localised.degenerate,
         covariance=localised.covariance,
         stage_ms=stage_ms,
+    )
+
+
+def _graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:
+    measured = estimated.interval_s is not None
+    return GraphScan(
+        T_world_lidar=localised.T_world_lidar,
+        points=points,
+        covariance=localised.covariance,
+        T_prev_curr=estimated.motion.T_prev_curr if measured else None,
+        motion_covariance=estimated.motion.covariance if measured else None,
+        lost=localised.status is Status.LOST,
+        belongs_in_map=localised.belongs_in_map,
     )
 
 

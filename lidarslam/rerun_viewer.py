@@ -11,6 +11,7 @@ from urllib.parse import quote
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from evaluation.error_colours import error_colours
 from evaluation.map_metrics import CloudErrors, MapComparison
@@ -35,6 +36,8 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
 _REFERENCE_COLOUR = (0, 158, 115)
 _SCAN_COLOUR = (240, 228, 66)
+_CLOSED_COLOUR = (86, 180, 233)
+_LOOP_COLOUR = (204, 121, 167)
 _RUN_COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0))
 # Negative radii are in points on the screen, whatever the zoom.
 _PATH_RADIUS, _SCAN_RADIUS, _MAP_RADIUS = -3.0, -1.5, -1.0
@@ -104,6 +107,14 @@ class RerunViewer:
         cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
         self._recording.log("world/map", cloud)
 
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], map_points: FloatArray) -> None:
+        """The corrected path beside the one that was seen to grow, the loops, and the map drawn anew."""
+        path = rr.LineStrips3D([positions], colors=[_CLOSED_COLOUR], radii=_PATH_RADIUS, labels=["loops closed"])
+        self._recording.log("world/closed/trajectory", path)
+        self._recording.log("world/closed/loops", _loop_lines(positions, np.array(loops, dtype=np.intp).reshape(-1, 2)))
+        self._last_position = positions[-1]
+        self.show_map(map_points)
+
     def close(self) -> None:
         """Wait until everything is written; a window that went away does not fail the run."""
         try:
@@ -162,6 +173,11 @@ def _blueprint() -> rrb.Blueprint:
         rrb.TimePanel(timeline=_SCAN_TIMELINE, state="collapsed"),
         collapse_panels=True,
     )
+
+
+def _loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3D:
+    """A line from scan to scan for each of the loops (L, 2)."""
+    return rr.LineStrips3D(list(positions[loops]), colors=[_LOOP_COLOUR], radii=_PATH_RADIUS)
 
 
 def _every_nth(points: FloatArray, count: int) -> FloatArray:
@@ -240,6 +256,8 @@ def _log_run(
     recording.log([*entity, "trajectory"], path, static=True)
     lost = rr.Points3D(positions[run.lost], colors=[_STATUS_COLOURS[Status.LOST]], radii=2.0 * _PATH_RADIUS)
     recording.log([*entity, "lost"], lost, static=True)
+    if len(run.loops):
+        recording.log([*entity, "loops"], _loop_lines(positions, run.loops), static=True)
     points = _every_nth(run.map_points, config.map_points)
     cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
     recording.log([*entity, "map"], cloud, static=True)

@@ -2,11 +2,11 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from lidarslam.core.trajectory_io import format_kitti, format_tum, read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.localisation import Localiser, OdometryAlone, ScanToMap
+from lidarslam.loop_closing import GraphOutcome, begin_graph, finish_graph
 from lidarslam.pipeline import Pipeline, ScanResult
 from lidarslam.prefetch import prefetch
 from lidarslam.run_directory import RunDirectory
@@ -28,12 +29,16 @@ from lidarslam.scan_log import ScanLog
 from lidarslam.summary import RunSummary, summarise
 from lidarslam.viewer import NullViewer, Viewer
 from mapping.config import GlobalMapConfig
+from mapping.g2o import format_g2o
 from mapping.global_map import GlobalMap
 from mapping.map_io import write_cloud
 from mapping.mapper import Mapper
 from odometry.consistency import ConsistencyCheck
 from odometry.interface import Odometry
 from odometry.registry import make_odometry
+
+if TYPE_CHECKING:
+    from mapping.slam_graph import SlamGraph
 
 RerunMode = Literal["off", "save", "spawn"]
 
@@ -107,19 +112,26 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
         log = stack.enter_context(ScanLog.open(directory))
         truth = _ground_truth(recording, log)
-        pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
+        graph = begin_graph(config, directory.path)
+        if graph is not None:
+            stack.callback(graph.close)
+        pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
         scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
         with _viewing(request, recording, directory) as viewer:
             watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
             stopped = _process(pipeline, scans, watch)
+            closed = _close_loops(graph, pipeline.global_map, log, viewer)
         if not len(log):
             raise InputError(f"{request.source}: no scan could be used{f': {stopped}' if stopped else ''}")
         directory.write_text(files.CONFIG, dump_yaml(config, _describe(request)))
+        global_map = pipeline.global_map if closed is None else closed.global_map
+        if closed is not None:
+            directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
         metrics = _write_trajectories(directory, recording.T_cam_lidar, truth, log)
-        map_points = _write_map(directory, pipeline.global_map, config.global_map, request.pcd)
-        voxel_size_m = None if pipeline.global_map is None else pipeline.global_map.voxel_size_m
+        map_points = _write_map(directory, global_map, config.global_map, request.pcd)
+        voxel_size_m = None if global_map is None else global_map.voxel_size_m
         skipped = 0 if stopped else len(chosen) - len(log)
-        summary = summarise(log, watch.total_ms, map_points, voxel_size_m, skipped)
+        summary = summarise(log, watch.total_ms, map_points, voxel_size_m, skipped, closed)
         directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, stopped)
 
@@ -159,10 +171,11 @@ def _process(pipeline: Pipeline, scans: Iterable[Scan], watch: _Watch) -> str | 
     """Take every scan through the pipeline; why it ended early, None when it did not."""
     finished = time.perf_counter()
     try:
-        for result in pipeline.run(prefetch(scans)):
-            watch.see(result, pipeline.global_map)
-            last, finished = finished, time.perf_counter()
-            watch.total_ms.append(1e3 * (finished - last))
+        with closing(pipeline.run(prefetch(scans))) as results:
+            for result in results:
+                watch.see(result, pipeline.global_map)
+                last, finished = finished, time.perf_counter()
+                watch.total_ms.append(1e3 * (finished - last))
     except (InputError, KeyboardInterrupt) as error:
         reason = str(error) or "interrupted"
         watch.log.warn(f"stopped after {len(watch.log)} scans: {reason}")
@@ -170,6 +183,20 @@ def _process(pipeline: Pipeline, scans: Iterable[Scan], watch: _Watch) -> str | 
         watch.total_ms.extend([0.0] * (len(watch.log) - len(watch.total_ms)))
         return reason
     return None
+
+
+def _close_loops(
+    graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog, viewer: Viewer
+) -> GraphOutcome | None:
+    """Correct what was logged, once all scans are there."""
+    if graph is None or global_map is None or not len(log):
+        return None
+    closed = finish_graph(graph, len(log), global_map.voxel_size_m)
+    if closed is not None:
+        log.correct(closed.T_world_lidar)
+        pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
+        viewer.show_closed(log.trajectory.positions, pairs, closed.global_map.points())
+    return closed
 
 
 def _ground_truth(recording: Recording, log: ScanLog) -> Trajectory | None:

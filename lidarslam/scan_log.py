@@ -82,6 +82,12 @@ class ScanLog:
         """Keep a sentence for the summary."""
         self.warnings.append(message)
 
+    def correct(self, T_world_lidar: FloatArray) -> None:
+        """Take other poses (N, 4, 4), one for each scan, as the final ones."""
+        if T_world_lidar.shape != (len(self), 4, 4):
+            raise ValueError(f"expected a pose for each of {len(self)} scans, got {T_world_lidar.shape}")
+        self._T_world_lidar = list(T_world_lidar)
+
     @property
     def trajectory(self) -> Trajectory:
         """The final poses."""

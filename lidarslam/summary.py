@@ -2,13 +2,16 @@
 
 import resource
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
+from lidarslam.loop_closing import GraphOutcome, LoopReport
 from lidarslam.pipeline import STAGES
 from lidarslam.scan_log import ScanLog
 
@@ -20,6 +23,11 @@ class Milliseconds:
     median: float
     p95: float
 
+    @classmethod
+    def of(cls, values: Sequence[float] | FloatArray) -> "Milliseconds":
+        """Of times that were measured, at least one."""
+        return cls(float(np.median(values)), float(np.percentile(values, 95.0)))
+
 
 @dataclass(frozen=True)
 class LostStretch:
@@ -30,6 +38,34 @@ class LostStretch:
     first_stamp: float
     last_stamp: float
     reason: str
+
+
+@dataclass(frozen=True)
+class GraphSummary:
+    """The pose graph of a run.
+
+    Attributes:
+        keyframes, edges: how many.
+        loops: the closures, and what was looked at closely and refused.
+        largest_correction_m: by how much a scan's position changed.
+        ms_per_keyframe: on a thread of its own; None when there was none.
+    """
+
+    keyframes: int
+    edges: int
+    loops: tuple[LoopReport, ...]
+    largest_correction_m: float
+    ms_per_keyframe: Milliseconds | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The section of summary.json."""
+        return {
+            "keyframes": self.keyframes,
+            "edges": self.edges,
+            "largest_correction_m": self.largest_correction_m,
+            "ms_per_keyframe": None if self.ms_per_keyframe is None else vars(self.ms_per_keyframe),
+            "loops": [loop.to_json() for loop in self.loops],
+        }
 
 
 @dataclass(frozen=True)
@@ -49,10 +85,15 @@ class RunSummary:
     peak_rss_mb: float
     lost: tuple[LostStretch, ...]
     degraded_scans: int
-    loop_closures: int
+    graph: GraphSummary | None
     map_points: int
     map_voxel_size_m: float | None
     warnings: tuple[str, ...]
+
+    @property
+    def loop_closures(self) -> int:
+        """How many loops were closed."""
+        return 0 if self.graph is None else sum(loop.accepted for loop in self.graph.loops)
 
     @property
     def lost_scans(self) -> int:
@@ -73,6 +114,7 @@ class RunSummary:
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
             "loop_closures": self.loop_closures,
+            "pose_graph": None if self.graph is None else self.graph.to_json(),
             "map_points": self.map_points,
             "map_voxel_size_m": self.map_voxel_size_m,
             "warnings": list(self.warnings),
@@ -80,7 +122,12 @@ class RunSummary:
 
 
 def summarise(
-    log: ScanLog, total_ms: list[float], map_points: int, map_voxel_size_m: float | None, skipped: int
+    log: ScanLog,
+    total_ms: list[float],
+    map_points: int,
+    map_voxel_size_m: float | None,
+    skipped: int,
+    closed: GraphOutcome | None = None,
 ) -> RunSummary:
     """Sum a run up.
 
@@ -89,6 +136,7 @@ def summarise(
         total_ms: wall time of each scan, from the one before finished to this one finished.
         map_points, map_voxel_size_m: of the written map.
         skipped: scans that were asked for and did not come, or came with a stamp not after the one before.
+        closed: what its pose graph did to it, if it had one.
     """
     trajectory = log.trajectory
     stages = {"total": total_ms} | dict(zip(STAGES, np.array(log.stage_ms).T, strict=True))
@@ -98,18 +146,25 @@ def summarise(
         length_m=trajectory.length_m,
         duration_s=trajectory.duration_s,
         elapsed_s=elapsed_s,
-        ms_per_scan={
-            stage: Milliseconds(float(np.median(values)), float(np.percentile(values, 95.0)))
-            for stage, values in stages.items()
-        },
+        ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
         peak_rss_mb=_peak_rss_mb(),
         lost=_lost_stretches(log),
         degraded_scans=log.statuses.count(Status.DEGRADED),
-        loop_closures=0,
+        graph=None if closed is None else _graph_summary(closed),
         map_points=map_points,
         map_voxel_size_m=map_voxel_size_m,
         warnings=_warnings(log, skipped),
+    )
+
+
+def _graph_summary(closed: GraphOutcome) -> GraphSummary:
+    return GraphSummary(
+        keyframes=len(closed.graph.keys),
+        edges=len(closed.graph.edges),
+        loops=closed.loops,
+        largest_correction_m=closed.largest_correction_m,
+        ms_per_keyframe=Milliseconds.of(closed.keyframe_ms) if closed.keyframe_ms else None,
     )
 
 

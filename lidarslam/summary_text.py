@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidarslam.run import RunOutcome
 from lidarslam.run_directory import SCANS_CSV, SUMMARY
-from lidarslam.summary import RunSummary
+from lidarslam.summary import GraphSummary, RunSummary
 
 # Stretches of lost scans that are spelt out; summary.json has them all.
 _STRETCHES = 3
@@ -27,12 +27,22 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     else:
         points, voxel_cm = _count(summary.map_points, "point"), 100.0 * summary.map_voxel_size_m
         yield f"map of {points}, one in every voxel of {voxel_cm:.0f} cm"
+    if summary.graph is not None:
+        yield _loops(summary.graph)
     if outcome.metrics is not None:
         yield from _accuracy(outcome)
     for warning in summary.warnings:
         yield f"warning: {warning}"
     yield from _lost(summary)
     yield f"written to {out}"
+
+
+def _loops(graph: GraphSummary) -> str:
+    closed = sum(loop.accepted for loop in graph.loops)
+    moved = f", which moved poses by up to {graph.largest_correction_m:.2f} m" if closed else ""
+    refused = len(graph.loops) - closed
+    unsure = f" ({refused} more did not convince; {SUMMARY} says why)" if refused else ""
+    return f"{_count(graph.keyframes, 'keyframe')}, {_count(closed, 'loop')} closed{moved}{unsure}"
 
 
 def _count(number: int, noun: str) -> str:

@@ -1,5 +1,6 @@
 """What a run shows while it works; a run without a window uses `NullViewer`."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from lidarslam.core.geometry import FloatArray
@@ -22,6 +23,9 @@ class Viewer(Protocol):
     def show_map(self, points: FloatArray) -> None:
         """The points (N, 3) of the map so far, in the world."""
 
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], map_points: FloatArray) -> None:
+        """Where all scans (N, 3) are once loops are closed, between which scans these are, and the map (M, 3) then."""
+
     def close(self) -> None:
         """The run is over; everything shown is kept."""
 
@@ -40,6 +44,9 @@ class NullViewer:
         """Nothing."""
 
     def show_map(self, points: FloatArray) -> None:
+        """Nothing."""
+
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], map_points: FloatArray) -> None:
         """Nothing."""
 
     def close(self) -> None:

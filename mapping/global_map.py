@@ -37,6 +37,22 @@ class PointCloud:
 
 
 @dataclass(frozen=True, eq=False)
+class VoxelMeans:
+    """What a map has summed up, a row a voxel, in its own frame: float32, columns as in `_POSITION` and so on.
+
+    Attributes:
+        rows: (M, 7) mean point, mean direction it was seen from, number of points.
+    """
+
+    rows: NDArray[np.float32]
+
+    @property
+    def points(self) -> FloatArray:
+        """(M, 3)."""
+        return self.rows[:, _POSITION].astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
 class _Voxels:
     """Sums over points of one voxel each: keys (M,) int64, sums (M, 7) float32; once reduced, sorted and unique."""
 
@@ -78,15 +94,35 @@ class GlobalMap:
         if not len(points):
             return
         world = transform_points(T_world_lidar, points)
-        cells = np.floor(world / self.voxel_size_m)
-        sums = np.empty((len(points), 7), dtype=np.float32)
-        sums[:, _POSITION] = world - cells * self.voxel_size_m  # within the voxel, where float32 is exact enough
         towards_sensor = T_world_lidar[:3, 3] - world
-        sums[:, _VIEW] = towards_sensor / np.linalg.norm(towards_sensor, axis=1, keepdims=True)
-        sums[:, _COUNT] = 1.0
+        self._add(world, towards_sensor / np.linalg.norm(towards_sensor, axis=1, keepdims=True), np.ones(len(points)))
+
+    def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
+        """Add what another map has summed up, as if its points were added here."""
+        if len(means.rows):
+            views = means.rows[:, _VIEW].astype(np.float64) @ T_world_map[:3, :3].T
+            self._add(transform_points(T_world_map, means.points), views, means.rows[:, _COUNT].astype(np.float64))
+
+    def means(self) -> VoxelMeans:
+        """What has been summed up so far."""
+        voxels = self._well_seen(1)
+        rows = np.empty_like(voxels.sums)
+        rows[:, _POSITION] = self._means(voxels)
+        rows[:, _VIEW] = voxels.sums[:, _VIEW] / voxels.sums[:, _COUNT, None]
+        rows[:, _COUNT] = voxels.sums[:, _COUNT]
+        return VoxelMeans(rows)
+
+    def _add(self, world: FloatArray, views: FloatArray, counts: FloatArray) -> None:
+        """Points (N, 3), the directions they were seen from, and how many points each stands for."""
+        cells = np.floor(world / self.voxel_size_m)
+        sums = np.empty((len(world), 7), dtype=np.float32)
+        sums[:, _POSITION] = world - cells * self.voxel_size_m  # within the voxel, where float32 is exact enough
+        sums[:, _VIEW] = views
+        sums[:, :_COUNT] *= counts[:, None]
+        sums[:, _COUNT] = counts
         with self._lock:
             self._pending.append(_Voxels(_pack(cells), sums))
-            self._pending_size += len(points)
+            self._pending_size += len(world)
             if self._pending_size > max(_MIN_PENDING, len(self._merged.keys) // 2):
                 self._merge()
 

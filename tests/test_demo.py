@@ -16,10 +16,10 @@ def test_the_map_survives_the_turns_that_lose_kiss_icp(tmp_path: Path) -> None:
     assert kiss.status == "lost"
     assert kiss.metrics.errors.ate_rmse_m > 10.0 * ours.metrics.errors.ate_rmse_m
     assert ours.map_metrics is not None
-    assert [picture.name for picture in demo.pictures] == ["recording.png", "learned+map.png", "kiss-icp.png"]
+    assert [picture.name for picture in demo.pictures] == ["recording.png", "learned+map+graph.png", "kiss-icp.png"]
     assert all(picture.stat().st_size > 10_000 for picture in demo.pictures)
     for name in ("report.html", "report.md", "comparison.json", "demo.rrd"):
         assert (tmp_path / name).stat().st_size > 0
     text = format_demo(demo)
-    assert "learned+map" in text
+    assert "learned+map+graph" in text
     assert str(tmp_path / "report.html") in text

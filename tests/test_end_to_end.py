@@ -19,8 +19,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
+from lidarslam.finished_run import load_run
 from lidarslam.pipeline import ScanResult
 from lidarslam.run import RunRequest, execute, in_order
+from lidarslam.run_directory import FILES
+from mapping.g2o import read_g2o
 
 KISS_ICP = [
     "odometry.method=kiss-icp",
@@ -123,6 +126,27 @@ def test_scans_are_laid_on_the_map_by_default(
         rows = list(csv.DictReader(file))
     assert all(float(row["ms_refine"]) > 0.0 for row in rows)
     assert all(row["degenerate_directions"] == "" for row in rows)
+
+
+def test_a_pose_graph_is_built_when_it_is_asked_for(
+    recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
+) -> None:
+    """The room is too small for a loop: what the map said stays, and the map drawn from submaps is as exact."""
+    out = tmp_path / "run"
+    settings = (*MAPPING, "pose_graph.enabled=true", "pose_graph.keyframes.distance_m=0.4")
+    outcome = execute(RunRequest(recording, out, load_config(None, settings), rerun="save"), quiet)
+    assert outcome.metrics is not None
+    assert outcome.metrics.errors.ate_rmse_m < 0.005
+    graph = json.loads((out / "summary.json").read_text())["pose_graph"]
+    assert graph["keyframes"] == len(read_g2o(out / "pose_graph.g2o").keys) >= 3
+    assert graph["edges"] == len(read_g2o(out / "pose_graph.g2o").edges)
+    assert outcome.summary.loop_closures == 0
+    cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
+    distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))
+    assert np.percentile(distance, 95) < 0.02
+    assert sorted(path.name for path in out.iterdir()) == sorted(set(FILES) - {"map.pcd"})
+    run = load_run(out)
+    assert not len(run.loops)
 
 
 def test_a_wrong_odometry_is_corrected_by_the_map(recording: Path, tmp_path: Path, room_truth: Trajectory) -> None:

@@ -1,5 +1,6 @@
 """Runs read back: what is damaged is named."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -52,3 +53,20 @@ def test_a_file_that_is_no_cloud(tmp_path: Path, name: str, capfd: pytest.Captur
     with pytest.raises(InputError, match=f"{name}: not a readable point cloud"):
         load_map(tmp_path / name)
     assert capfd.readouterr().err == ""
+
+
+def test_loops_are_those_that_were_closed(tmp_path: Path) -> None:
+    write_tum(tmp_path / "trajectory.tum", Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1))))
+    loops = [
+        {"first_scan": 0, "second_scan": 2, "accepted": True},
+        {"first_scan": 1, "second_scan": 2, "accepted": False},
+        {"first_scan": 1, "second_scan": 3, "accepted": True},  # a run that was interrupted knows no such scan
+    ]
+    (tmp_path / "summary.json").write_text(json.dumps({"pose_graph": {"loops": loops}}))
+    np.testing.assert_array_equal(load_run(tmp_path).loops, [[0, 2]])
+    (tmp_path / "summary.json").write_text(json.dumps({"pose_graph": None}))
+    assert load_run(tmp_path).loops.shape == (0, 2)
+    for damaged in ("{", "[]", '{"pose_graph": {"loops": [{}]}}'):
+        (tmp_path / "summary.json").write_text(damaged)
+        with pytest.raises(InputError, match="not a run's summary"):
+            load_run(tmp_path)

@@ -17,7 +17,7 @@ from lidarslam.rerun_viewer import show_runs
 @pytest.fixture
 def finished() -> FinishedRun:
     trajectory = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
-    return FinishedRun("my run", trajectory, np.zeros(3, dtype=np.bool_), np.eye(3))
+    return FinishedRun("my run", trajectory, np.zeros(3, dtype=np.bool_), np.eye(3), np.array([[0, 2]]))
 
 
 def test_a_name_with_a_space_is_one_entity(

@@ -18,7 +18,7 @@ def test_one_of_a_thing_is_singular() -> None:
         peak_rss_mb=1.0,
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),
         degraded_scans=0,
-        loop_closures=0,
+        graph=None,
         map_points=1,
         map_voxel_size_m=0.1,
         warnings=(),

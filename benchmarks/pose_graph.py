@@ -1,0 +1,302 @@
+"""The pose graph beside GTSAM's own optimiser, on KITTI 00 with true and false loops, and how long it takes.
+
+    python benchmarks/pose_graph.py --parking-garage parking-garage.g2o
+    python benchmarks/pose_graph.py --kitti-00 kiss_icp_kitti_00
+    python benchmarks/pose_graph.py --keyframes 5000 --loops 500
+
+Prints a Markdown table for each:
+
+- a g2o file optimised, written and read again, and the same file read and optimised by GTSAM alone. The errors are half
+  the sum of squared residuals, of all edges;
+- KISS-ICP's trajectory on KITTI 00, with loops made up from the truth: pairs of keyframes whose true positions are
+  near and whose stamps are not, the motion between them the truth's, wrong by random errors. ATE in metres after SE(3)
+  alignment, over all scans, without and with false loops between random pairs. The folder holds
+  `estimate_kitti.txt` and `ground_truth_kitti.txt`;
+- a simulated drive round and round the blocks of a town, added keyframe by keyframe.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from mapping_accuracy import print_row
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from evaluation.trajectory_metrics import evaluate_trajectory
+from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
+from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.core.trajectory_io import read_kitti_poses
+from mapping.correction import corrected
+from mapping.g2o import Edge, GraphFile, format_g2o, read_g2o
+from mapping.pose_graph import Optimised, PoseGraph
+from mapping.pose_graph_config import PoseGraphConfig
+
+SCAN_S = 0.1
+# KISS-ICP's drift on KITTI 00, 0.53 % and 0.0019 degrees a metre, mostly over some 300 m, as a random walk.
+DRIFT_M, DRIFT_DEG = 0.05, 0.033  # for the root of a metre
+# How the drift of two thousand learned pairs compares with that of registration to the map.
+LOOSER = 5.0
+LOOP_M, LOOP_DEG = 0.1, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Keyframes as an odometry saw them, and where they were.
+
+    Attributes:
+        poses, truth: (N, 4, 4).
+        covariances: (N - 1, 6, 6) of the motions from each keyframe to the next.
+    """
+
+    poses: FloatArray
+    truth: FloatArray
+    covariances: FloatArray
+
+    def chain_edges(self, looser: float | None = None) -> list[Edge]:
+        """The motions between neighbours; with `looser`, those of a worse odometry beside them."""
+        motions = inverse(self.poses[:-1]) @ self.poses[1:]
+        edges = []
+        for key, (motion, covariance) in enumerate(zip(motions, self.covariances, strict=True)):
+            edges.append(Edge(key, key + 1, motion, covariance, "refinement"))
+            if looser is not None:
+                edges.append(Edge(key, key + 1, motion, looser**2 * covariance, "odometry"))
+        return edges
+
+
+def covariance(rotation_deg: float, translation_m: float) -> FloatArray:
+    """(6, 6) with the same deviation about each axis, and along each."""
+    return np.diag(np.square([np.deg2rad(rotation_deg)] * 3 + [translation_m] * 3))
+
+
+def true_loops(scene: Scene, pairs: NDArray[np.intp], rng: np.random.Generator) -> list[Edge]:
+    """Loops between the pairs (L, 2) of keyframes, the truth's motion with noise on it."""
+    noise = covariance(LOOP_DEG, LOOP_M)
+    errors = exp(rng.normal(size=(len(pairs), 6)) * np.sqrt(np.diag(noise)))
+    motions = inverse(scene.truth[pairs[:, 0]]) @ scene.truth[pairs[:, 1]] @ errors
+    return [Edge(int(a), int(b), motion, noise, "loop") for (a, b), motion in zip(pairs, motions, strict=True)]
+
+
+def false_loops(keyframes: int, count: int, rng: np.random.Generator) -> list[Edge]:
+    """Random pairs of keyframes said to be at the same place, a few metres apart and turned at random."""
+    pairs = np.sort(np.array([rng.choice(keyframes, 2, replace=False) for _ in range(count)]).reshape(-1, 2), axis=1)
+    xi = rng.normal(size=(count, 6)) * [0.05, 0.05, 1.0, 2.0, 2.0, 0.2]
+    return [
+        Edge(int(a), int(b), motion, covariance(LOOP_DEG, LOOP_M), "loop")
+        for (a, b), motion in zip(pairs, exp(xi), strict=True)
+    ]
+
+
+def revisits(truth: FloatArray, scans: NDArray[np.intp], within_m: float, apart_s: float) -> NDArray[np.intp]:
+    """For each keyframe that came back to an earlier one, the nearest such (L, 2), earlier first."""
+    pairs = cKDTree(truth[:, :3, 3]).query_pairs(within_m, output_type="ndarray")
+    pairs = pairs[(scans[pairs[:, 1]] - scans[pairs[:, 0]]) * SCAN_S > apart_s]
+    distances = np.linalg.norm(truth[pairs[:, 0], :3, 3] - truth[pairs[:, 1], :3, 3], axis=1)
+    pairs = pairs[np.lexsort((distances, pairs[:, 1]))]
+    return pairs[np.unique(pairs[:, 1], return_index=True)[1]]
+
+
+def every(poses: FloatArray, step_m: float) -> NDArray[np.intp]:
+    """Rows of poses (M, 4, 4) about so far apart along the path, the first among them."""
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    return np.unique(np.searchsorted(path, np.arange(0.0, path[-1], step_m)))
+
+
+def make_graph(poses: FloatArray, edges: Sequence[Edge], keys: Sequence[int] | None = None) -> PoseGraph:
+    """All poses and edges in a graph with default settings."""
+    graph = PoseGraph(PoseGraphConfig())
+    for key, pose in zip(keys or range(len(poses)), poses, strict=True):
+        graph.add_pose(key, pose)
+    for edge in edges:
+        graph.add_edge(edge)
+    return graph
+
+
+def compare_with_gtsam(path: Path) -> None:
+    """A g2o file: ours, and GTSAM's reader with its Levenberg-Marquardt."""
+    print_row(["", "read, s", "error before", "error after", "optimise, s", "loops believed"])
+    print_row(["---"] * 6)
+    start = time.perf_counter()
+    read = read_g2o(path)
+    seconds = time.perf_counter() - start
+    graph = make_graph(read.poses, read.edges, read.keys.tolist())
+    optimised, optimise_s = timed_optimise(graph)
+    errors = [f"{optimised.error_before:.6g}", f"{optimised.error_after:.8f}"]
+    believed = f"{optimised.loop_weights.sum():.0f} of {len(optimised.loop_weights)}"
+    print_row(["ours", f"{seconds:.2f}", *errors, f"{optimise_s:.2f}", believed])
+    print_row(["GTSAM", *gtsam_alone(path), "all"])
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "optimised.g2o"
+        copy.write_text(format_g2o(GraphFile(read.keys, optimised.poses, read.edges)), encoding="utf-8")
+        again = read_g2o(copy)
+    same = np.array_equal(again.keys, read.keys) and len(again.edges) == len(read.edges)
+    poses_to = np.abs(again.poses - optimised.poses).max()
+    motions_to = max(
+        float(np.abs(a.T_first_second - b.T_first_second).max()) for a, b in zip(again.edges, read.edges, strict=True)
+    )
+    print(
+        f"\nWritten and read again, same keys and edges: {same}; poses to {poses_to:.1e}, motions to {motions_to:.1e}"
+    )
+
+
+def gtsam_alone(path: Path) -> list[str]:
+    """Seconds to read, error before and after, seconds to optimise."""
+    start = time.perf_counter()
+    graph, values = gtsam.readG2o(str(path), True)
+    read_s = time.perf_counter() - start
+    before = graph.error(values)
+    held = gtsam.NonlinearFactorGraph(graph)
+    first = min(values.keys())
+    held.add(gtsam.PriorFactorPose3(first, values.atPose3(first), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    start = time.perf_counter()
+    result = gtsam.LevenbergMarquardtOptimizer(held, values).optimize()
+    return [f"{read_s:.2f}", f"{before:.6g}", f"{graph.error(result):.8f}", f"{time.perf_counter() - start:.2f}"]
+
+
+def timed_optimise(graph: PoseGraph) -> tuple[Optimised, float]:
+    """The optimised graph, and the seconds it took."""
+    start = time.perf_counter()
+    optimised = graph.optimise()
+    return optimised, time.perf_counter() - start
+
+
+def close_kitti(folder: Path, step_m: float, seed: int, false_percents: Sequence[float]) -> None:
+    """KITTI 00 with loops from the truth."""
+    estimate, truth = (read_kitti_poses(folder / f"{name}_kitti.txt") for name in ("estimate", "ground_truth"))
+    scans = every(estimate, step_m)
+    poses = estimate[scans]
+    lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    scene = Scene(poses, truth[scans], lengths[:, None, None] * covariance(DRIFT_DEG, DRIFT_M))
+    pairs = revisits(scene.truth, scans, within_m=4.0, apart_s=30.0)
+    print_row(["loops", "false ones", "ATE before", "iSAM2", "optimised", "s", "true believed", "false believed"])
+    print_row(["---"] * 8)
+    for percent in false_percents:
+        rng = np.random.default_rng(seed)
+        loops = true_loops(scene, pairs, rng)
+        lies = false_loops(len(scans), round(percent / 100.0 * len(loops)), rng)
+        every_loop = sorted([(e, True) for e in loops] + [(e, False) for e in lies], key=lambda pair: pair[0].second)
+        edges = [edge for edge, _ in every_loop]
+        graph, _ = grow(scene, edges, looser=None)
+        online = ate(corrected(estimate, scans, graph.poses()), truth)
+        optimised, seconds = timed_optimise(graph)
+        is_true = np.array([honest for _, honest in every_loop])
+        print_row([
+            str(len(edges)), str(len(lies)), f"{ate(estimate, truth):.3f}", f"{online:.3f}",
+            f"{ate(corrected(estimate, scans, optimised.poses), truth):.3f}", f"{seconds:.1f}",
+            f"{optimised.loop_weights[is_true].sum():.0f}", f"{optimised.loop_weights[~is_true].sum():.0f}",
+        ])  # fmt: skip
+
+
+def ate(poses: FloatArray, truth: FloatArray) -> float:
+    """In metres after SE(3) alignment."""
+    stamps = SCAN_S * np.arange(len(poses), dtype=np.float64)
+    return evaluate_trajectory(Trajectory(stamps, poses), Trajectory(stamps, truth)).errors.ate_rmse_m
+
+
+def grow(scene: Scene, loops: Sequence[Edge], looser: float | None) -> tuple[PoseGraph, FloatArray]:
+    """A graph grown keyframe by keyframe with iSAM2, and the seconds (N,) of each update."""
+    graph = PoseGraph(PoseGraphConfig())
+    chained: dict[int, list[Edge]] = {}
+    closing: dict[int, list[Edge]] = {}
+    for edge in scene.chain_edges(looser):
+        chained.setdefault(edge.second, []).append(edge)
+    for edge in loops:
+        closing.setdefault(edge.second, []).append(edge)
+    seconds = np.zeros(len(scene.poses))
+    for key, pose in enumerate(scene.poses):
+        start = time.perf_counter()
+        motions = chained.get(key, [])
+        graph.add_pose(key, graph.pose(key - 1) @ motions[0].T_first_second if motions else pose)
+        for edge in motions + closing.get(key, []):
+            graph.add_edge(edge)
+        graph.update()
+        seconds[key] = time.perf_counter() - start
+    return graph, seconds
+
+
+def drive_round_town(keyframes: int, rng: np.random.Generator) -> Scene:
+    """Keyframes 2 m apart on the streets of a grid, blocks of 60 m, a turn to the left or right at random corners."""
+    block, half = 30, 5
+    turns = np.zeros((keyframes - 1, 6))
+    turns[:, 3] = 2.0
+    place, heading = np.zeros(2), 0
+    for corner in range(block, keyframes - 1, block):
+        place = place + _ahead(heading)
+        choices = [turn for turn in (-1, 0, 1) if np.abs(place + _ahead(heading + turn)).max() <= half]
+        turn = int(rng.choice(choices))
+        heading += turn
+        turns[corner, 2] = turn * np.pi / 2
+        turns[corner, 3:5] = 0.0 if turn else turns[corner, 3:5]
+    truth = chain(np.eye(4), exp(turns))
+    noise = covariance(0.05, 0.02)
+    wrong = exp(turns) @ exp(rng.normal(size=turns.shape) * np.sqrt(np.diag(noise)))
+    return Scene(chain(np.eye(4), wrong), truth, np.tile(noise, (keyframes - 1, 1, 1)))
+
+
+def _ahead(heading: int) -> FloatArray:
+    return np.array([np.cos(heading * np.pi / 2), np.sin(heading * np.pi / 2)]).round()
+
+
+def measure_time(keyframes: int, loops: int, seed: int) -> None:
+    """The time of a simulated graph's parts."""
+    rng = np.random.default_rng(seed)
+    scene = drive_round_town(keyframes, rng)
+    pairs = revisits(scene.truth, 20 * np.arange(keyframes), within_m=3.0, apart_s=30.0)
+    pairs = pairs[np.sort(rng.choice(len(pairs), min(loops, len(pairs)), replace=False))]
+    graph, seconds = grow(scene, true_loops(scene, pairs, rng), LOOSER)
+    online = graph.poses()
+    optimised, batch_s = timed_optimise(graph)
+    start = time.perf_counter()
+    graph.covariances(range(keyframes))
+    marginals_s = time.perf_counter() - start
+    apart = inverse(online) @ optimised.poses
+    cells = {
+        "keyframes": str(keyframes),
+        "edges": str(2 * (keyframes - 1) + len(pairs)),
+        "loops": str(len(pairs)),
+        "iSAM2 in all, s": f"{seconds.sum():.1f}",
+        "an update, ms: median, p95, most": ", ".join(f"{1e3 * x:.1f}" for x in np.quantile(seconds, [0.5, 0.95, 1.0])),
+        "optimise, s": f"{batch_s:.1f}",
+        "all covariances, s": f"{marginals_s:.2f}",
+        "loops believed": f"{optimised.loop_weights.sum():.0f}",
+        "wrong before, m": f"{rms(scene.poses, scene.truth):.2f}",
+        "after": f"{rms(optimised.poses, scene.truth):.3f}",
+        "iSAM2 from that, m / deg": f"{np.linalg.norm(apart[:, :3, 3], axis=1).max():.1e}"
+        f" / {np.rad2deg(rotation_angle(apart).max()):.1e}",
+    }
+    print_row(list(cells))
+    print_row(["---"] * len(cells))
+    print_row(list(cells.values()))
+
+
+def rms(poses: FloatArray, truth: FloatArray) -> float:
+    """Root mean square distance, without alignment: both begin at the same pose."""
+    return float(np.sqrt(np.mean(np.sum((poses[:, :3, 3] - truth[:, :3, 3]) ** 2, axis=1))))
+
+
+def main() -> None:
+    """Parse the command line and print what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parking-garage", type=Path, metavar="FILE", help="a g2o file")
+    parser.add_argument("--kitti-00", type=Path, metavar="DIR", help="KISS-ICP's trajectory and the truth")
+    parser.add_argument("--step-m", type=float, default=2.0, help="between keyframes on KITTI 00")
+    parser.add_argument("--false-percent", type=float, nargs="+", default=[0.0, 10.0, 30.0], help="of the true loops")
+    parser.add_argument("--keyframes", type=int, default=0, help="of the simulated drive")
+    parser.add_argument("--loops", type=int, default=500, help="likewise")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    if arguments.parking_garage:
+        compare_with_gtsam(arguments.parking_garage)
+    if arguments.kitti_00:
+        close_kitti(arguments.kitti_00, arguments.step_m, arguments.seed, arguments.false_percent)
+    if arguments.keyframes:
+        measure_time(arguments.keyframes, arguments.loops, arguments.seed)
+
+
+if __name__ == "__main__":
+    main()

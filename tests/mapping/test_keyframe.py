@@ -1,0 +1,66 @@
+"""When the next keyframe is due."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from mapping.graph_config import KeyframeConfig
+from mapping.keyframe import KeyframeSelector
+
+
+@pytest.fixture
+def hall(rng: np.random.Generator) -> FloatArray:
+    """Points on a circle of walls 8 m away."""
+    angle, height = rng.uniform(-np.pi, np.pi, 4000), rng.uniform(-1.0, 2.0, 4000)
+    return np.stack([8.0 * np.cos(angle), 8.0 * np.sin(angle), height], axis=1)
+
+
+def selector(points: FloatArray, **options: float | None) -> KeyframeSelector:
+    chosen = KeyframeSelector(KeyframeConfig.model_validate(options))
+    assert chosen.is_due(np.eye(4), points)
+    chosen.take(np.eye(4), points)
+    return chosen
+
+
+def moved(x: float = 0.0, turn_deg: float = 0.0) -> FloatArray:
+    return exp([0.0, 0.0, np.deg2rad(turn_deg), x, 0.0, 0.0])
+
+
+def test_the_way_to_the_next_follows_the_scene(hall: FloatArray) -> None:
+    """A quarter of 8 m; in a hall four times as large it would be 4 m at most, in a shaft 0.5 m at least."""
+    for scale, distance_m in ((1.0, 2.05), (4.0, 4.0), (0.1, 0.5)):
+        chosen = selector(scale * hall, least_overlap=0.0)
+        assert not chosen.is_due(moved(0.97 * distance_m), scale * hall)
+        assert chosen.is_due(moved(1.03 * distance_m), scale * hall)
+
+
+def test_the_way_can_be_set(hall: FloatArray) -> None:
+    chosen = selector(hall, distance_m=3.0, least_overlap=0.0)
+    assert not chosen.is_due(moved(2.9), hall)
+    assert chosen.is_due(moved(3.0), hall)
+
+
+def test_a_turn_on_the_spot_makes_a_keyframe(hall: FloatArray) -> None:
+    chosen = selector(hall, turn_deg=30.0)
+    assert not chosen.is_due(moved(turn_deg=29.0), hall)
+    assert chosen.is_due(moved(turn_deg=-31.0), hall)
+
+
+def test_a_scan_that_sees_other_things_is_due(hall: FloatArray) -> None:
+    """Half of it elsewhere: through a door, say."""
+    chosen = selector(hall, least_overlap=0.6)
+    beyond = hall + np.where(hall[:, :1] > 0.0, [[10.0, 0.0, 0.0]], 0.0)
+    assert not chosen.is_due(moved(0.1), hall)
+    assert chosen.is_due(moved(0.1), beyond)
+    assert not selector(hall, least_overlap=0.4).is_due(moved(0.1), beyond)
+
+
+def test_noise_is_no_new_sight(hall: FloatArray, rng: np.random.Generator) -> None:
+    chosen = selector(hall, least_overlap=0.95)
+    assert not chosen.is_due(np.eye(4), hall + rng.normal(0.0, 0.05, hall.shape))
+
+
+def test_a_scan_without_points_is_judged_by_its_pose(hall: FloatArray) -> None:
+    chosen = selector(hall)
+    assert not chosen.is_due(moved(0.1), np.empty((0, 3)))
+    assert chosen.is_due(moved(5.0), np.empty((0, 3)))

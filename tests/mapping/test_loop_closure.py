@@ -1,0 +1,227 @@
+"""A hall gone round twice, with drift; sessions without relation; rooms that are all the same; a planted falsehood."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mapping.loop_closure as module
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.trajectory import chain
+from mapping.loop_closure import LoopClosure, LoopDetector, Submap
+from mapping.loop_config import LoopConfig
+
+SEEN_M = 11.0
+UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])
+# The hall is small beside the way round it.
+CONFIG = LoopConfig(min_way_ranges=1.5)
+
+
+def box_points(boxes, rng: np.random.Generator) -> FloatArray:
+    parts = []
+    for centre, half in boxes:
+        c, h = np.array(centre, dtype=float), np.array(half, dtype=float)
+        for axis in range(3):
+            u, v = [a for a in range(3) if a != axis]
+            for side in (-1.0, 1.0):
+                p = rng.uniform(-1.0, 1.0, (int(4.0 * h[u] * h[v] / 0.035), 3)) * h
+                p[:, axis] = side * h[axis] + rng.normal(0.0, 0.005, len(p))
+                parts.append(c + p)
+    return np.concatenate(parts)
+
+
+@pytest.fixture(scope="module")
+def hall() -> FloatArray:
+    """36 x 28 x 4 m with boxes of all sizes along the walls and in the middle."""
+    rng = np.random.default_rng(3)
+    boxes = [((0, 0, 2), (18, 14, 2))]
+    for _ in range(24):
+        x, y = rng.uniform((-17, -13), (17, 13))
+        if not (6.0 < max(abs(x), abs(y) + 2.0) < 12.5):
+            half = rng.uniform(0.3, 1.4, 3)
+            boxes.append(((x, y, half[2]), half))
+    return box_points(boxes, rng)
+
+
+def round_trip(laps: float, step_m: float = 2.0) -> FloatArray:
+    """Poses (K, 4, 4) round an ellipse, facing along."""
+    angles = np.arange(0.0, laps * 2.0 * np.pi, step_m / 8.5)
+    xy = np.stack([10.0 * np.cos(angles), 7.0 * np.sin(angles)], axis=1)
+    yaw = np.arctan2(7.0 * np.cos(angles), -10.0 * np.sin(angles))
+    zeros = np.zeros(len(angles))
+    R = exp(np.stack([zeros, zeros, yaw, zeros, zeros, zeros], axis=1))[:, :3, :3]
+    return make_transform(R, np.column_stack([xy, np.full(len(xy), 1.5)]))
+
+
+def submaps_of(points: FloatArray, truth: FloatArray, session: int = 0, first: int = 0) -> list[Submap]:
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+    rng = np.random.default_rng(session)
+    made = []
+    for i, T in enumerate(truth):
+        seen = transform_points(inverse(T), points[rng.random(len(points)) < 0.5])
+        made.append(Submap(first + i, session, float(way[i]), seen[np.linalg.norm(seen, axis=1) < SEEN_M]))
+    return made
+
+
+def drifted(truth: FloatArray) -> FloatArray:
+    """1 degree in 100 m to the left, and lengths 0.5 % too long."""
+    motions = inverse(truth[:-1]) @ truth[1:]
+    motions[:, :3, 3] *= 1.005
+    length = np.linalg.norm(motions[:, :3, 3], axis=1)
+    error = np.zeros((len(motions), 6))
+    error[:, 2] = np.deg2rad(1.0) / 100.0 * length
+    return chain(truth[0], motions @ exp(error))
+
+
+def detect(submaps, estimates, config: LoopConfig = CONFIG) -> tuple[list[LoopClosure], LoopDetector]:
+    detector = LoopDetector(config)
+    closures = [c for s in submaps for c in detector.add(s, estimates[: s.index + 1])]
+    return closures + detector.finish(), detector
+
+
+def accepted(closures: list[LoopClosure]) -> list[LoopClosure]:
+    return [closure for closure in closures if closure.verdict == "accepted"]
+
+
+def assert_right(closures: list[LoopClosure], truth: FloatArray) -> None:
+    for closure in closures:
+        error = inverse(inverse(truth[closure.first]) @ truth[closure.second]) @ closure.T_first_second
+        # Neighbours lie where the drifting estimates have them.
+        assert np.linalg.norm(error[:3, 3]) < 0.04
+        assert np.rad2deg(rotation_angle(error)) < 0.2
+
+
+@pytest.fixture(scope="module")
+def twice(hall) -> tuple[list[Submap], FloatArray]:
+    truth = round_trip(1.4)
+    return submaps_of(hall, truth), truth
+
+
+def test_a_lap_is_closed_in_spite_of_drift(twice):
+    submaps, truth = twice
+    found = accepted(detect(submaps, drifted(truth))[0])
+    assert len(found) >= 5
+    assert_right(found, truth)
+    assert all(c.first < c.second and c.reason == "" for c in found)
+    assert any(c.found_by == "nearby" for c in found)
+    assert found[-1].consistent > 0
+    assert all(submaps[c.second].way_m - submaps[c.first].way_m > CONFIG.min_way_m for c in found)
+
+
+def test_a_lap_is_closed_by_appearance_alone(twice):
+    submaps, truth = twice
+    found = accepted(detect(submaps, drifted(truth), CONFIG.model_copy(update={"nearby_candidates": 0}))[0])
+    assert len(found) >= CONFIG.agreeing + 1
+    assert_right(found, truth)
+    assert all(c.found_by == "appearance" and c.consistent >= CONFIG.agreeing for c in found)
+
+
+def test_nothing_is_closed_on_a_way_without_return(hall):
+    truth = round_trip(0.45)
+    closures, _ = detect(submaps_of(hall, truth), truth)
+    assert accepted(closures) == []
+
+
+def test_closures_keep_their_distance(twice):
+    submaps, truth = twice
+    config = CONFIG.model_copy(update={"spacing_m": 7.0})
+    found = accepted(detect(submaps, drifted(truth), config)[0])
+    ways = np.array([submaps[c.second].way_m for c in found])
+    assert len(ways) >= 2
+    assert (np.diff(ways) >= 7.0).all()
+
+
+@pytest.mark.parametrize(
+    "mount",
+    [
+        pytest.param(np.eye(4), id="upright", marks=pytest.mark.slow),
+        pytest.param(UPSIDE_DOWN, id="upside down"),
+        pytest.param(exp([0.1, 0.35, 0, 0, 0, 0]), id="tilted", marks=pytest.mark.slow),
+    ],
+)
+def test_sessions_are_joined_whatever_their_worlds_and_mounts(hall, mount):
+    first, second = round_trip(0.6), round_trip(0.9)[9:] @ exp([0, 0, 0.2, 0.3, -0.2, 0.0]) @ mount
+    submaps = submaps_of(hall, first, 0) + submaps_of(hall, second, 1, len(first))
+    unrelated = exp([0.1, 0.2, 2.0, 300.0, 5.0, -9.0])
+    closures, _ = detect(submaps, np.concatenate([first, unrelated @ second]))
+    found = accepted(closures)
+    assert len(found) >= CONFIG.agreeing + 1
+    assert_right(found, np.concatenate([first, second]))
+    assert all(c.first < len(first) <= c.second for c in found)
+    assert all(c.consistent >= CONFIG.agreeing for c in found)
+
+
+def test_upside_down_all_the_way(hall):
+    truth = round_trip(1.2) @ UPSIDE_DOWN
+    found = accepted(detect(submaps_of(hall, truth), drifted(truth))[0])
+    assert len(found) >= 2
+    assert_right(found, truth)
+
+
+@pytest.mark.parametrize("config", [CONFIG, CONFIG.model_copy(update={"min_similarity": -1.0, "min_way_m": 1.0})])
+def test_rooms_that_are_all_the_same_are_not_taken_for_one(config):
+    """One room after the other, each exactly like the last: everything fits, and drift explains none of it."""
+    rng = np.random.default_rng(0)
+    room = box_points([((0, 0, 1.5), (5, 4, 1.5)), ((3, 2, 0.6), (0.6, 1, 0.6)), ((-4, -1, 0.9), (0.7, 0.4, 0.9))], rng)
+    stands = make_transform(np.eye(3), np.array([[-2.0, -1.0, 1.3], [0.0, 0.5, 1.3], [2.0, -1.0, 1.3]]))
+    truth, submaps = [], []
+    for number in range(6):
+        for s in range(3):
+            T = stands[s].copy()
+            seen = transform_points(inverse(T), room[rng.random(len(room)) < 0.7])
+            submaps.append(Submap(len(submaps), 0, 12.0 * number + 2.0 * s, seen))
+            T[0, 3] += 12.0 * number
+            truth.append(T)
+    closures, _ = detect(submaps, np.stack(truth), config.model_copy(update={"min_way_ranges": 0.5}))
+    assert all(c.first // 3 == c.second // 3 for c in accepted(closures))
+
+
+def test_a_planted_falsehood_is_refused(twice, monkeypatch):
+    submaps, truth = twice
+    honest, calls = module.verify, []
+
+    def lying(target, source, guess):
+        found = honest(target, source, guess)
+        calls.append(found)
+        if found is None or len(calls) not in (6, 7):
+            return found
+        return replace(found, T_target_source=found.T_target_source @ exp([0, 0, 0, 1.2, 0.0, 0.0]))
+
+    monkeypatch.setattr(module, "verify", lying)
+    closures, _ = detect(submaps, drifted(truth))
+    assert len(calls) > 7
+    assert len(accepted(closures)) >= 4
+    assert_right(accepted(closures), truth)
+    assert any(c.verdict == "rejected" and c.reason for c in closures)
+
+
+def test_what_drift_cannot_explain_is_refused(twice):
+    submaps, truth = twice
+    config = LoopConfig(min_way_ranges=1.5, drift_percent=0.01, drift_deg_per_100m=0.02)
+    estimates = drifted(drifted(truth))
+    closures, _ = detect(submaps, estimates, config)
+    assert accepted(closures) == []
+
+
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_empty_and_tiny_submaps_close_nothing(count):
+    detector = LoopDetector(LoopConfig())
+    points = np.random.default_rng(0).uniform(-5.0, 5.0, (count, 3))
+    for i in range(12):
+        assert detector.add(Submap(i, 0, 10.0 * i, points), np.tile(np.eye(4), (i + 1, 1, 1))) == []
+    assert detector.finish() == []
+
+
+def test_keyframes_come_one_by_one():
+    detector = LoopDetector(LoopConfig())
+    with pytest.raises(ValueError, match="keyframe 0"):
+        detector.add(Submap(1, 0, 0.0, np.zeros((0, 3))), np.tile(np.eye(4), (2, 1, 1)))
+    with pytest.raises(ValueError, match="poses"):
+        detector.add(Submap(0, 0, 0.0, np.zeros((0, 3))), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_memory_of_a_keyframe_is_bounded(twice):
+    submaps, truth = twice
+    _, detector = detect(submaps[:6], truth)
+    assert min(len(s.points) for s in submaps[:6]) > 5_000
+    assert 20_000 < detector.nbytes / 6 < 80_000

@@ -1,0 +1,150 @@
+"""Rooms of boxes, sampled as points, laid on themselves from wrong guesses; corridors and other rooms."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle, transform_points
+from mapping.loop_config import LoopConfig
+from mapping.loop_verification import Place, judge, verify
+from mapping.place_recognition import Patch, make_patch
+
+CONFIG = LoopConfig()
+# Centre and half sizes; the sensor stands inside.
+ROOM = [((0, 0, 1.5), (5, 4, 1.5)), ((3.2, 2.1, 0.6), (0.5, 1.1, 0.6)), ((-4.4, -1.5, 0.9), (0.6, 0.4, 0.9))]
+OTHER_FURNITURE = [
+    ((-1.2, 2.4, 0.9), (0.8, 0.5, 0.9)),
+    ((2.6, -1.5, 1.4), (0.6, 2.4, 1.4)),
+    ((-3.6, 0, 1), (0.9, 2, 1)),
+]
+OTHER_ROOM = [((0, 0, 1.5), (5, 4, 1.5)), *OTHER_FURNITURE]
+CORRIDOR = [((0, 0, 1.3), (60, 1.2, 1.3))]
+
+
+def box_points(boxes, spacing_m: float, rng: np.random.Generator, noise_m: float = 0.005) -> FloatArray:
+    """Points (N, 3) on the faces of boxes, inside or outside alike."""
+    parts = []
+    for centre, half in boxes:
+        c, h = np.array(centre, dtype=float), np.array(half, dtype=float)
+        for axis in range(3):
+            u, v = [a for a in range(3) if a != axis]
+            count = int(4.0 * h[u] * h[v] / spacing_m**2)
+            for side in (-1.0, 1.0):
+                p = rng.uniform(-1.0, 1.0, (count, 3)) * h
+                p[:, axis] = side * h[axis] + rng.normal(0.0, noise_m, count)
+                parts.append(c + p)
+    return np.concatenate(parts)
+
+
+def patch_from(boxes, T_world_lidar: FloatArray, seed: int, spacing_m: float = 0.08, reach_m: float = 25.0) -> Patch:
+    points = box_points(boxes, spacing_m, np.random.default_rng(seed))
+    points = transform_points(inverse(T_world_lidar), points)
+    points = points[np.linalg.norm(points, axis=1) < reach_m]
+    return make_patch(points, CONFIG.min_range_m, CONFIG.max_range_m, CONFIG.cells_per_range, CONFIG.max_points)
+
+
+def pose(x: float, y: float, yaw_deg: float, z: float = 1.3) -> FloatArray:
+    return make_transform(exp([0, 0, np.deg2rad(yaw_deg), 0, 0, 0])[:3, :3], [x, y, z])
+
+
+def place(boxes, T: FloatArray, seed: int) -> Place:
+    return Place.join(patch_from(boxes, T, seed))
+
+
+FIRST, SECOND = pose(0.5, -0.3, 10.0), pose(-0.4, 0.5, 160.0)
+TRUE = inverse(FIRST) @ SECOND
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[Place, Place]:
+    return place(ROOM, FIRST, 1), place(ROOM, SECOND, 2)
+
+
+@pytest.mark.parametrize("guess", [(0, 0, 20, 1.0, 0, 0), (0, 0, -20, 0, -1.0, 0), (3, -3, 15, -0.6, 0.6, 0.3)])
+def test_exact_from_a_guess_wrong_by_a_metre_and_twenty_degrees(room, guess):
+    off = np.array(guess, dtype=float)
+    off[:3] = np.deg2rad(off[:3])
+    found = verify(*room, TRUE @ exp(off))
+    assert found is not None
+    error = inverse(TRUE) @ found.T_target_source
+    assert np.linalg.norm(error[:3, 3]) < 0.01
+    assert np.rad2deg(rotation_angle(error)) < 0.1
+    assert found.objection(CONFIG) == ""
+    assert found.overlap > 0.9
+    assert found.explained > 0.9
+    assert found.undetermined == ()
+    assert found.residual_m < 0.02
+
+
+def test_covariance_has_floors_and_holds_the_error(room):
+    found = verify(*room, TRUE)
+    assert found is not None
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert (sigmas[:3] > np.deg2rad(0.1)).all()
+    assert (sigmas[3:] > 0.01).all()
+    assert (sigmas[3:] < 0.05).all()
+    xi = log(inverse(found.T_target_source) @ TRUE)
+    assert xi @ np.linalg.solve(found.covariance, xi) < 16.8
+
+
+def test_another_room_of_the_same_size_is_refused(room):
+    found = verify(room[0], place(OTHER_ROOM, SECOND, 3), TRUE)
+    assert found is not None
+    assert found.objection(CONFIG)
+    right = verify(*room, TRUE)
+    assert right is not None
+    assert found.overlap < right.overlap - 0.1
+
+
+def test_a_corridor_says_nothing_along_itself():
+    first, second = pose(0.0, 0.2, 0.0), pose(3.0, -0.2, 30.0)
+    found = verify(place(CORRIDOR, first, 1), place(CORRIDOR, second, 2), inverse(first) @ second)
+    assert found is not None
+    # In the second's frame the corridor runs at -30 degrees.
+    along = np.array([np.cos(np.deg2rad(30.0)), -np.sin(np.deg2rad(30.0)), 0.0])
+    across = np.array([along[1], -along[0], 0.0])
+    of_translation = found.covariance[3:, 3:]
+    assert np.sqrt(along @ of_translation @ along) > 1.0
+    assert np.sqrt(across @ of_translation @ across) < 0.05
+    assert found.undetermined
+    assert "too little tells" in found.objection(CONFIG)
+
+
+def doors(first_x: float):
+    """A corridor with closets that reach into it, every four metres but one."""
+    closets = [((x, 0.9, 1.3), (0.4, 0.3, 1.3)) for x in first_x + np.array([-12, -8, -4, 0, 4, 12])]
+    return [*CORRIDOR, *closets]
+
+
+def test_along_a_corridor_what_would_tell_must_fit():
+    first, second = pose(0.0, -0.3, 0.0), pose(0.3, -0.3, 0.0)
+
+    def stand(closets_from: float, T: FloatArray, seed: int) -> Place:
+        return Place.join(patch_from(doors(closets_from), T, seed, 0.06, 9.0))
+
+    target, source, elsewhere = stand(1.0, first, 1), stand(1.0, second, 2), stand(2.7, second, 2)
+    right = verify(target, source, inverse(first) @ second)
+    assert right is not None
+    assert right.objection(CONFIG) == ""
+    # Walls, floor and ceiling fit as well where the closets of one stand between those of the other.
+    wrong = judge(target, elsewhere, inverse(first) @ second)
+    assert wrong.overlap > CONFIG.min_overlap
+    assert wrong.explained < 0.3
+    assert "tell" in wrong.objection(CONFIG)
+
+
+def test_neighbours_help(room):
+    T_first_other = inverse(FIRST) @ pose(1.5, 0.8, 40.0)
+    alone, joined = room[0], Place.join(room[0].patch, [(T_first_other, patch_from(ROOM, pose(1.5, 0.8, 40.0), 5))])
+    assert len(joined.points) > len(alone.points)
+    found = verify(joined, room[1], TRUE)
+    assert found is not None
+    assert np.linalg.norm((inverse(TRUE) @ found.T_target_source)[:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize("count", [0, 1, 9, 30])
+def test_tiny_submaps_are_no_place(room, count):
+    points = np.random.default_rng(0).uniform(-3.0, 3.0, (count, 3))
+    tiny = Place.join(make_patch(points, 0.5, 60.0, 30.0, 2500))
+    for pair in ((tiny, room[0]), (room[0], tiny)):
+        found = verify(*pair, np.eye(4))
+        assert found is None or found.objection(CONFIG)
