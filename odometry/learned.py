@@ -26,8 +26,8 @@ from odometry.sweep_images import Imager, middle_offset_s
 from odometry.sweeps import LastMotion, SweepImages, SweepPairs
 from odometry.torch_geometry import exp
 
-# What comes on top of what the residuals say, so that about 90, 98 and 99.5 % of errors lie within one, two and three
-# standard deviations (errors have longer tails than a normal distribution's): rotation in radians, translation in metres.
+# What comes on top of what the residuals say, radians and metres, so that about 90, 98 and 99.5 % of errors lie within
+# one, two and three standard deviations: they have longer tails than a normal distribution's.
 _LEAST_SIGMA = np.array([np.deg2rad(0.05)] * 3 + [0.003] * 3)
 # Rings of points on the ground go along with the sensor and hold alignment back, by a part of the way.
 _HELD_BACK = 0.02

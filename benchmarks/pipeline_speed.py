@@ -1,0 +1,107 @@
+"""How long a whole run takes a scan, beside KISS-ICP's own loop on the same scans.
+
+    python benchmarks/pipeline_speed.py KITTI/sequences/04
+    python benchmarks/pipeline_speed.py --simulate hdl-64e:street:car --scans 100
+    python benchmarks/pipeline_speed.py --simulate vlp-16:office:handheld --scans 400
+
+Methods are named as for `lidarslam compare`. Ours go through the pipeline of `lidarslam run`, odometry on one thread
+and mapping on another, scans from memory; the global map, which KISS-ICP does not make, is included. KISS-ICP's
+`register_frame` runs in a plain loop with its defaults, on as many threads as it likes. Methods take turns for
+`--rounds` rounds. Wall time and processor time of all threads are over all scans but the first `--warm-up`, divided by
+their number; the ratio is to the KISS-ICP of the same round: its median, smallest and largest.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from mapping_accuracy import make_simulation, print_row
+
+from lidarslam.config import load_config
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.registry import open_recording
+from lidarslam.loop_closing import begin_graph, finish_graph
+from lidarslam.methods import parse_method
+from lidarslam.pipeline import Pipeline
+from lidarslam.run import in_order, make_localiser
+from odometry.registry import make_odometry
+
+_KISS = "KISS-ICP's own loop"
+Timer = Callable[[], tuple[float, float]]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a table for every recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings")
+    parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
+    parser.add_argument("--methods", nargs="+", default=["learned+map", "constant-velocity+map", "learned+map+graph"])
+    parser.add_argument("--scans", type=int, default=100)
+    parser.add_argument("--warm-up", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args(arguments)
+    for source in options.sources:
+        recording = open_recording(source)
+        _measure(recording.name, list(in_order(recording.scans(0, options.scans))), options)
+    for named in options.simulate:
+        sensor, world, motion = named.split(":")
+        _measure(named, list(make_simulation(world, motion, sensor, options.scans, 0).scans()), options)
+
+
+def _measure(name: str, scans: Sequence[Scan], options: argparse.Namespace) -> None:
+    methods = [_KISS, *options.methods]
+    seconds: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
+    for _ in range(options.rounds):
+        for method in methods:
+            run = _run_kiss if method == _KISS else _run_ours
+            seconds[method].append(run(method, scans, options.warm_up))
+    points = int(np.mean([len(scan) for scan in scans]))
+    print(f"\n{name}: {len(scans)} scans of {points:,} points, {options.rounds} rounds\n")
+    print_row(["method", "wall, ms a scan", "CPU, ms a scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"])
+    print_row(["---"] * 5)
+    counted = len(scans) - options.warm_up
+    kiss = np.array(seconds[_KISS])
+    for method in methods:
+        taken = np.array(seconds[method])
+        ratios = [f"{np.median(r):.2f} [{r.min():.2f}, {r.max():.2f}]" for r in (taken / kiss).T]
+        print_row([method, *(f"{1e3 * value / counted:.1f}" for value in np.median(taken, axis=0)), *ratios])
+
+
+def _run_ours(method: str, scans: Sequence[Scan], warm_up: int) -> tuple[float, float]:
+    config = load_config(None, parse_method(method).settings)
+    odometry, graph = make_odometry(config.odometry), begin_graph(config)
+    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
+    clock = _clock()
+    for number, _ in enumerate(pipeline.run(scans)):
+        if number + 1 == warm_up:
+            clock = _clock()
+    if graph is not None and pipeline.global_map is not None:
+        finish_graph(graph, len(scans), pipeline.global_map.voxel_size_m)
+        graph.close()
+    odometry.close()
+    return clock()
+
+
+def _run_kiss(method: str, scans: Sequence[Scan], warm_up: int) -> tuple[float, float]:  # noqa: ARG001
+    from kiss_icp.config.parser import load_config as load_kiss_config
+    from kiss_icp.kiss_icp import KissICP
+
+    kiss = KissICP(load_kiss_config(None))
+    clock = _clock()
+    for number, scan in enumerate(scans):
+        if number == warm_up:
+            clock = _clock()
+        kiss.register_frame(scan.points, np.empty(0) if scan.time_offsets is None else scan.time_offsets)
+    return clock()
+
+
+def _clock() -> Timer:
+    """Tells wall and processor seconds since now."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    return lambda: (time.perf_counter() - wall, time.process_time() - cpu)
+
+
+if __name__ == "__main__":
+    main()
