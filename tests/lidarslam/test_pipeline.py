@@ -1,5 +1,6 @@
 """Scans of known truth through the pipeline: poses, map, and what happens when tracking is lost."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.localisation import OdometryAlone
 from lidarslam.pipeline import Pipeline, ScanResult
 from mapping.config import GlobalMapConfig
+from mapping.graph_scan import GraphScan
 from odometry.config import ConsistencyConfig
 from odometry.consistency import ConsistencyCheck
 from odometry.external import ExternalOdometry
@@ -118,6 +120,78 @@ def test_an_error_of_a_reader_reaches_the_caller_after_the_scans_before_it(
         for result in make_pipeline(true_odometry).run(scans()):
             results.append(result)
     assert len(results) == 3
+
+
+class _Notes:
+    """A follower that writes down what it is told."""
+
+    def __init__(self, fails_at: int | None = None) -> None:
+        self.told: list[Any] = []
+        self.fails_at = fails_at
+
+    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
+        assert voxel_size_m == 0.1
+        self.told.append((len(points), T_world_lidar))
+
+    def add(self, scan: GraphScan) -> None:
+        if len(self.scans) == self.fails_at:
+            raise InputError("no room left")
+        self.told.append(scan)
+
+    @property
+    def scans(self) -> list[GraphScan]:
+        return [one for one in self.told if isinstance(one, GraphScan)]
+
+
+def followed(odometry: Any, follower: _Notes) -> Pipeline:
+    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), follower)
+
+
+def test_a_follower_sees_what_a_scan_showed_before_the_next(
+    true_odometry: ExternalOdometry, room_scans: list[Scan]
+) -> None:
+    notes = _Notes()
+    results = list(followed(true_odometry, notes).run(room_scans))
+    assert [isinstance(one, GraphScan) for one in notes.told] == [True, *([False, True] * 19), False]
+    for result, scan, drawn in zip(results, notes.scans, notes.told[1::2], strict=True):
+        assert scan.T_world_lidar is result.T_world_lidar
+        assert scan.belongs_in_map
+        assert not scan.lost
+        assert drawn[0] == len(result.points)
+        assert drawn[1] is result.T_world_lidar
+    np.testing.assert_allclose(
+        [scan.T_prev_curr for scan in notes.scans[1:]],
+        inverse(np.array([r.T_world_lidar for r in results[:-1]])) @ np.array([r.T_world_lidar for r in results[1:]]),
+        atol=1e-12,
+    )
+
+
+def test_a_follower_hears_of_a_lost_scan_and_does_not_draw_it(room_scans: list[Scan], room_truth: Trajectory) -> None:
+    notes = _Notes()
+    list(followed(_Astray(room_truth, 19, [0.0] * 6, "the sensor was covered"), notes).run(room_scans))
+    assert [scan.lost for scan in notes.scans] == [False] * 19 + [True]
+    assert notes.scans[19].T_prev_curr is None
+    assert isinstance(notes.told[-1], GraphScan)
+
+
+def test_an_error_of_a_follower_reaches_the_caller(true_odometry: ExternalOdometry, room_scans: list[Scan]) -> None:
+    with pytest.raises(InputError, match="no room left"):
+        list(followed(true_odometry, _Notes(fails_at=3)).run(room_scans))
+
+
+def test_a_follower_is_up_to_date_when_a_run_is_broken_off(
+    true_odometry: ExternalOdometry, room_scans: list[Scan]
+) -> None:
+    notes = _Notes()
+    results = followed(true_odometry, notes).run(room_scans)
+    for _ in range(5):
+        next(results)
+    results.close()
+    told = len(notes.told)
+    assert len(notes.scans) >= 5
+    assert not any(thread.name.startswith("graph") for thread in threading.enumerate())
+    assert told == len(notes.told)
 
 
 def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: Trajectory) -> None:

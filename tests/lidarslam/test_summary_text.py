@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
+from lidarslam.loop_closing import LoopReport
 from lidarslam.run import RunOutcome
-from lidarslam.summary import LostStretch, Milliseconds, RunSummary
+from lidarslam.summary import GraphSummary, LostStretch, Milliseconds, RunSummary
 from lidarslam.summary_text import format_outcome
 
 
-def test_one_of_a_thing_is_singular() -> None:
-    summary = RunSummary(
+def summary_of(graph: GraphSummary | None = None) -> RunSummary:
+    return RunSummary(
         scans=1,
         length_m=0.0,
         duration_s=0.0,
@@ -18,11 +19,27 @@ def test_one_of_a_thing_is_singular() -> None:
         peak_rss_mb=1.0,
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),
         degraded_scans=0,
-        graph=None,
+        graph=graph,
         map_points=1,
         map_voxel_size_m=0.1,
         warnings=(),
     )
-    text = format_outcome(Path("out"), RunOutcome(summary, None))
+
+
+def test_one_of_a_thing_is_singular() -> None:
+    text = format_outcome(Path("out"), RunOutcome(summary_of(), None))
     for words in ("1 scan, 0.0 m", "map of 1 point, one", "LOST on 1 more stretch\n", "lost on 4 of 1 scan;"):
         assert words in text
+
+
+def test_loops_are_counted_and_their_effect_is_said() -> None:
+    loops = [LoopReport(0, 9, accepted, "", "nearby", 0.9, 0.01, 0.8, 2, 1.0, 5.0) for accepted in (True, False, True)]
+    for chosen, words in (
+        (loops, "7 keyframes, 2 loops closed, which moved poses by up to 1.23 m (1 more did not convince;"),
+        (loops[:1], "7 keyframes, 1 loop closed, which moved poses by up to 1.23 m\n"),
+        ([], "7 keyframes, 0 loops closed\n"),
+    ):
+        summary = summary_of(GraphSummary(7, 12, tuple(chosen), 1.234, None))
+        assert words in format_outcome(Path("out"), RunOutcome(summary, None))
+        assert summary.to_json()["loop_closures"] == sum(loop.accepted for loop in chosen)
+        assert len(summary.to_json()["pose_graph"]["loops"]) == len(chosen)
