@@ -52,7 +52,8 @@ def _planes(images: Tensor, config: NormalConfig, gate_m: float, columns: int) -
     """Normals (B, 3, H, W) from neighbourhoods of one size, zero where they are no planes."""
     count, nearest_m2, covariance = _scatter(images, config.rows, columns, gate_m)
     size = covariance[0] + covariance[1] + covariance[2]
-    scaled = covariance / size.clamp(min=_TINY)
+    # Rounding may leave next to nothing, or less, of the scatter of points that are all but one.
+    scaled = torch.where(size > _TINY, covariance / size.clamp(min=_TINY), 0.0)
     smallest, middle, largest = _eigenvalues(scaled)
     normals = _null_vector(scaled, smallest)
     planar = (smallest <= config.max_flatness * middle) & (middle >= config.min_spread * largest)
@@ -62,7 +63,7 @@ def _planes(images: Tensor, config: NormalConfig, gate_m: float, columns: int) -
     planar &= nearest_m2 <= (2.0 * config.gate_m) ** 2
     away = (normals * images[:, :3]).sum(dim=1)
     planar &= away.abs() >= _MOST_GRAZING * images[:, 3]
-    return normals * torch.where(planar, -away.sign(), 0.0)[:, None]
+    return torch.where(planar[:, None], normals * -away.sign()[:, None], 0.0)
 
 
 def _scatter(images: Tensor, rows: int, columns: int, gate_m: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -267,3 +267,20 @@ def test_settings_out_of_range_are_refused() -> None:
     for setting in ({"gate_m": 0.0}, {"min_neighbours": 2}, {"max_flatness": 1.5}, {"gate": 0.5}):
         with pytest.raises(ValidationError):
             NormalConfig.model_validate(setting)
+
+
+@pytest.mark.parametrize("spread", ["near one another", "anywhere"])
+def test_normals_of_sparse_points_are_numbers(spread):
+    """One or two neighbours have a scatter that rounding may make less than nothing."""
+    g = torch.Generator().manual_seed(0)
+    azimuth = (torch.arange(180) + 0.5) * (2.0 * math.pi / 180.0)
+    elevation = torch.linspace(-0.3, 0.3, 16)[:, None].expand(16, 180)
+    rays = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
+    ranges = 0.5 + 0.01 * torch.randn(20, 1, 16, 180, generator=g)
+    if spread == "anywhere":
+        ranges = 10.0 ** (3.0 * torch.rand(20, 1, 16, 180, generator=g) - 1.0)
+    seen = torch.rand(20, 1, 16, 180, generator=g) < 0.15
+    normals = surface_normals(torch.cat([rays * ranges, ranges], dim=1) * seen, NormalConfig())
+    assert normals.isfinite().all()
+    length = normals.norm(dim=1)
+    assert ((length < 1e-6) | ((length - 1.0).abs() < 1e-4)).all()
