@@ -135,6 +135,18 @@ _reader_options = _options(
 )
 
 
+_odometry_options = _options(
+    click.option(
+        "--odometry",
+        type=click.Choice(["learned", "kiss-icp", "constant-velocity"]),
+        help="Where the motion between scans comes from.  [default: learned]",
+    ),
+    click.option(
+        "--weights", type=_FILE, metavar="FILE", help="Of the learned odometry.  [default: those of the program]"
+    ),
+)
+
+
 def _resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
     """The configuration, with the options that have a name of their own applied last."""
     from lidarslam.config import load_config, reader_settings
@@ -190,12 +202,7 @@ def info(
 )
 @_SOURCE
 @click.option("--out", type=_PATH, required=True, metavar="RUN", help="Directory that the results are written to.")
-@click.option(
-    "--odometry",
-    type=click.Choice(["learned", "kiss-icp", "constant-velocity"]),
-    help="Where the motion between scans comes from.  [default: learned]",
-)
-@click.option("--weights", type=_FILE, metavar="FILE", help="Of the learned odometry.  [default: those of the program]")
+@_odometry_options
 @click.option("--prior", type=_FILE, metavar="TUM_FILE", help="A trajectory of another program as the odometry.")
 @click.option(
     "--mapping/--no-mapping", default=None, help="Lay every scan on the map of those before.  [default: mapping]"
@@ -240,6 +247,47 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     click.echo(format_outcome(out, outcome))
     if outcome.stopped is not None:
         click.echo(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", err=True)
+        ctx.exit(EXIT_MENDABLE)
+    if outcome.summary.lost_scans:
+        ctx.exit(EXIT_LOST)
+
+
+@main.command(epilog="lidarslam merge ground_floor.mcap stairs.mcap --out building")
+@click.argument("sources", type=_PATH, nargs=-1, required=True, metavar="SOURCE...")
+@click.option("--out", type=_PATH, required=True, metavar="DIR", help="Directory of the merged map.")
+@_odometry_options
+@click.option("--pcd", is_flag=True, help="Write the maps as map.pcd too.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
+@_reader_options
+@_config_options
+@click.pass_context
+def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options: Any) -> None:
+    """Build one map of several recordings of a place.
+
+    Each recording is run by itself and finds itself in the earlier ones where both show the same places. DIR holds the
+    common map, and for each recording a run directory with its poses in the common frame. A recording that nothing
+    joins to the others is left out of the common map, and the exit status is 1.
+    """
+    from lidarslam.merge import MergeRequest
+    from lidarslam.merge import merge as execute
+    from lidarslam.merge_text import format_merge
+    from lidarslam.progress import show_progress
+
+    settings = _method_settings(
+        options.pop("odometry"), options.pop("weights"), None, None, None, options.pop("settings")
+    )
+    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
+    config = _resolve(options.pop("config_file"), settings, **reader)
+    for source in sources:
+        _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
+    click.echo(format_merge(out, outcome))
+    for line in outcome.stopped:
+        _tell(line)
+    apart = [recording for recording in outcome.apart if recording.directory is not None]
+    for recording in apart:
+        _tell(f"{recording.directory}: not joined to the others, left out of the common map")
+    if outcome.stopped or apart:
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.lost_scans:
         ctx.exit(EXIT_LOST)

@@ -97,8 +97,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     Raises:
         LidarSlamError: the source, the configuration or the output directory is not usable.
     """
-    if request.out.resolve() == request.source.resolve():
-        raise OutputError(f"{request.out}: is the recording itself; name another directory for the run")
+    require_apart(request.out, request.source)
     config = request.config
     recording = open_recording(request.source, config.reader)
     chosen = range(len(recording))[request.start : request.stop : request.step]
@@ -107,33 +106,105 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
             f"{request.source}: none of its {len(recording)} scans is left after --start, --stop and --step"
         )
     with ExitStack() as stack:
-        odometry = _make_odometry(config, request.prior)
+        odometry = open_odometry(config, request.prior)
         stack.callback(odometry.close)
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
         log = stack.enter_context(ScanLog.open(directory))
-        truth = _ground_truth(recording, log)
         graph = begin_graph(config, directory.path)
         if graph is not None:
             stack.callback(graph.close)
-        pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
-        scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
         with _viewing(request, recording, directory) as viewer:
-            watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
-            stopped = _process(pipeline, scans, watch)
-            closed = _close_loops(graph, pipeline.global_map, log, viewer)
-        if not len(log):
-            raise InputError(f"{request.source}: no scan could be used{f': {stopped}' if stopped else ''}")
-        directory.write_text(files.CONFIG, dump_yaml(config, _describe(request)))
-        global_map = pipeline.global_map if closed is None else closed.global_map
-        if closed is not None:
-            directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
-        metrics = _write_trajectories(directory, recording.T_cam_lidar, truth, log)
-        map_points = _write_map(directory, global_map, config.global_map, request.pcd)
-        voxel_size_m = None if global_map is None else global_map.voxel_size_m
-        skipped = 0 if stopped else len(chosen) - len(log)
-        summary = summarise(log, watch.total_ms, map_points, voxel_size_m, skipped, closed)
-        directory.write_json(files.SUMMARY, summary.to_json())
-    return RunOutcome(summary, metrics, stopped)
+            tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress)
+            closed = _close_loops(graph, tracked.global_map, log, viewer)
+        return write_results(directory, request, tracked, closed)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A recording that went through the pipeline.
+
+    Attributes:
+        recording, truth, log: what it was, its ground truth, what came of it.
+        asked: how many scans were asked for.
+        total_ms: wall time of each scan.
+        global_map: of the poses as they were found; None when no scan could be believed.
+        error: what ended it before its last scan, None when nothing did.
+    """
+
+    recording: Recording
+    truth: Trajectory | None
+    log: ScanLog
+    asked: int
+    total_ms: list[float]
+    global_map: GlobalMap | None
+    error: InputError | KeyboardInterrupt | None
+
+    @property
+    def stopped(self) -> str | None:
+        """Why it ended before its last scan."""
+        return None if self.error is None else _reason(self.error)
+
+
+class NoScanError(InputError):
+    """No scan of a recording could be used, because of an interruption or of the recording."""
+
+    def __init__(self, message: str, interrupted: bool) -> None:
+        super().__init__(message)
+        self.interrupted = interrupted
+
+
+def track(
+    request: RunRequest,
+    recording: Recording,
+    chosen: range,
+    odometry: Odometry,
+    log: ScanLog,
+    graph: "SlamGraph | None",
+    viewer: Viewer,
+    progress: Progress,
+) -> Tracked:
+    """Take the chosen scans of a recording through the pipeline, and log them; a graph follows.
+
+    Raises:
+        NoScanError: none could be used.
+    """
+    config, truth = request.config, _ground_truth(recording, log)
+    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
+    scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
+    watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
+    error = _process(pipeline, scans, watch)
+    if not len(log):
+        why = "" if error is None else f": {_reason(error)}"
+        raise NoScanError(f"{request.source}: no scan could be used{why}", isinstance(error, KeyboardInterrupt))
+    return Tracked(recording, truth, log, len(chosen), watch.total_ms, pipeline.global_map, error)
+
+
+def write_results(
+    directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None
+) -> RunOutcome:
+    """Write everything but the log of the scans: their poses are final by now, and a graph has drawn its map."""
+    config, log = request.config, tracked.log
+    directory.write_text(files.CONFIG, dump_yaml(config, _describe(request)))
+    global_map = tracked.global_map if closed is None else closed.global_map
+    if closed is not None:
+        directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
+    metrics = _write_trajectories(directory, tracked.recording.T_cam_lidar, tracked.truth, log)
+    map_points = write_map(directory, global_map, config.global_map, request.pcd)
+    voxel_size_m = None if global_map is None else global_map.voxel_size_m
+    skipped = 0 if tracked.stopped else tracked.asked - len(log)
+    summary = summarise(log, tracked.total_ms, map_points, voxel_size_m, skipped, closed)
+    directory.write_json(files.SUMMARY, summary.to_json())
+    return RunOutcome(summary, metrics, tracked.stopped)
+
+
+def require_apart(out: Path, source: Path) -> None:
+    """See that nothing is written into a recording.
+
+    Raises:
+        OutputError: it would be.
+    """
+    if out.resolve() == source.resolve():
+        raise OutputError(f"{out}: is the recording itself; name another directory for the run")
 
 
 def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
@@ -167,8 +238,8 @@ class _Watch:
         self.progress(index + 1, result)
 
 
-def _process(pipeline: Pipeline, scans: Iterable[Scan], watch: _Watch) -> str | None:
-    """Take every scan through the pipeline; why it ended early, None when it did not."""
+def _process(pipeline: Pipeline, scans: Iterable[Scan], watch: _Watch) -> InputError | KeyboardInterrupt | None:
+    """Take every scan through the pipeline; what ended it early, None when nothing did."""
     finished = time.perf_counter()
     try:
         with closing(pipeline.run(prefetch(scans))) as results:
@@ -177,12 +248,15 @@ def _process(pipeline: Pipeline, scans: Iterable[Scan], watch: _Watch) -> str | 
                 last, finished = finished, time.perf_counter()
                 watch.total_ms.append(1e3 * (finished - last))
     except (InputError, KeyboardInterrupt) as error:
-        reason = str(error) or "interrupted"
-        watch.log.warn(f"stopped after {len(watch.log)} scans: {reason}")
+        watch.log.warn(f"stopped after {len(watch.log)} scans: {_reason(error)}")
         # A scan may have been logged whose time was not.
         watch.total_ms.extend([0.0] * (len(watch.log) - len(watch.total_ms)))
-        return reason
+        return error
     return None
+
+
+def _reason(error: InputError | KeyboardInterrupt) -> str:
+    return str(error) or "interrupted"
 
 
 def _close_loops(
@@ -208,7 +282,12 @@ def _ground_truth(recording: Recording, log: ScanLog) -> Trajectory | None:
         return None
 
 
-def _make_odometry(config: Config, prior: Path | None) -> Odometry:
+def open_odometry(config: Config, prior: Path | None) -> Odometry:
+    """The odometry that is configured; whoever asks for it closes it.
+
+    Raises:
+        LidarSlamError: the configuration contradicts itself, or a file is not what it should be.
+    """
     method = config.odometry.method
     if method == "constant-velocity" and not config.mapping.enabled:
         raise ConfigError(
@@ -285,7 +364,7 @@ def _write_trajectories(
     return metrics
 
 
-def _write_map(directory: RunDirectory, global_map: GlobalMap | None, config: GlobalMapConfig, pcd: bool) -> int:
+def write_map(directory: RunDirectory, global_map: GlobalMap | None, config: GlobalMapConfig, pcd: bool) -> int:
     """Write the map, unless it is empty; how many points it has."""
     if global_map is None:
         return 0

@@ -111,6 +111,15 @@ class RunDirectory:
         self.write_text(name, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def remove_run(path: Path) -> None:
+    """Remove a run's files, and its directory when nothing else lies there; leave alone what is no run."""
+    if _is_run(path):
+        for name in FILES:
+            (path / name).unlink(missing_ok=True)
+        if not any(path.iterdir()):
+            path.rmdir()
+
+
 def _earlier_run(path: Path, overwrite: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
     present = [name for name in FILES if (path / name).exists()]

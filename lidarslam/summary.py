@@ -57,6 +57,22 @@ class GraphSummary:
     largest_correction_m: float
     ms_per_keyframe: Milliseconds | None
 
+    @classmethod
+    def of(cls, closed: GraphOutcome) -> "GraphSummary":
+        """Of what became of a graph."""
+        return cls(
+            keyframes=len(closed.graph.keys),
+            edges=len(closed.graph.edges),
+            loops=closed.loops,
+            largest_correction_m=closed.largest_correction_m,
+            ms_per_keyframe=Milliseconds.of(closed.keyframe_ms) if closed.keyframe_ms else None,
+        )
+
+    @property
+    def closed(self) -> int:
+        """How many loops were closed."""
+        return sum(loop.accepted for loop in self.loops)
+
     def to_json(self) -> dict[str, Any]:
         """The section of summary.json."""
         return {
@@ -93,7 +109,7 @@ class RunSummary:
     @property
     def loop_closures(self) -> int:
         """How many loops were closed."""
-        return 0 if self.graph is None else sum(loop.accepted for loop in self.graph.loops)
+        return 0 if self.graph is None else self.graph.closed
 
     @property
     def lost_scans(self) -> int:
@@ -113,6 +129,64 @@ class RunSummary:
             "lost_scans": self.lost_scans,
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
+            "loop_closures": self.loop_closures,
+            "pose_graph": None if self.graph is None else self.graph.to_json(),
+            "map_points": self.map_points,
+            "map_voxel_size_m": self.map_voxel_size_m,
+            "warnings": list(self.warnings),
+        }
+
+
+@dataclass(frozen=True)
+class MergedRecording:
+    """One of several recordings that were to become one map.
+
+    Attributes:
+        name: of the recording.
+        directory: of its run, beside the common map; None when there is none, for lack of a scan.
+        source: where it lies.
+        scans, length_m, lost_scans: of its run.
+        joined: whether its poses are in the common frame.
+    """
+
+    name: str
+    directory: str | None
+    source: str
+    scans: int
+    length_m: float
+    lost_scans: int
+    joined: bool
+
+
+@dataclass(frozen=True)
+class MergeSummary:
+    """What the summary.json of several recordings in one map holds."""
+
+    recordings: tuple[MergedRecording, ...]
+    elapsed_s: float
+    peak_rss_mb: float
+    graph: GraphSummary | None
+    map_points: int
+    map_voxel_size_m: float | None
+    warnings: tuple[str, ...]
+
+    @property
+    def loop_closures(self) -> int:
+        """How many loops were closed, within the recordings of the common map and between them."""
+        return 0 if self.graph is None else self.graph.closed
+
+    @property
+    def lost_scans(self) -> int:
+        """How many scans were lost, of all recordings."""
+        return sum(recording.lost_scans for recording in self.recordings)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        return {
+            "recordings": [vars(recording) for recording in self.recordings],
+            "elapsed_s": self.elapsed_s,
+            "peak_rss_mb": self.peak_rss_mb,
+            "lost_scans": self.lost_scans,
             "loop_closures": self.loop_closures,
             "pose_graph": None if self.graph is None else self.graph.to_json(),
             "map_points": self.map_points,
@@ -148,23 +222,13 @@ def summarise(
         elapsed_s=elapsed_s,
         ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
-        peak_rss_mb=_peak_rss_mb(),
+        peak_rss_mb=peak_rss_mb(),
         lost=_lost_stretches(log),
         degraded_scans=log.statuses.count(Status.DEGRADED),
-        graph=None if closed is None else _graph_summary(closed),
+        graph=None if closed is None else GraphSummary.of(closed),
         map_points=map_points,
         map_voxel_size_m=map_voxel_size_m,
         warnings=_warnings(log, skipped),
-    )
-
-
-def _graph_summary(closed: GraphOutcome) -> GraphSummary:
-    return GraphSummary(
-        keyframes=len(closed.graph.keys),
-        edges=len(closed.graph.edges),
-        loops=closed.loops,
-        largest_correction_m=closed.largest_correction_m,
-        ms_per_keyframe=Milliseconds.of(closed.keyframe_ms) if closed.keyframe_ms else None,
     )
 
 
@@ -192,7 +256,7 @@ def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _peak_rss_mb() -> float:
+def peak_rss_mb() -> float:
     """Peak memory of this process and its largest ended child; the kernel counts kilobytes, macOS bytes."""
     unit = 1.0 if sys.platform == "darwin" else 1024.0
     usages = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

@@ -4,10 +4,15 @@ Scans come with the poses that scan-to-map refinement gave them. Some become key
 the submap of each. Between keyframes the trajectory and the odometry are edges of the pose graph, and wherever a
 submap turns out to show a place seen before, so is the closure. In the end all of it is optimised together, the scans
 between keyframes follow, and the map is drawn anew from the submaps.
+
+Several recordings of one place may follow one another. No edge leads from one to the next; those that loops join end up
+in one frame.
 """
 
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +27,7 @@ from mapping.graph_scan import GraphScan
 from mapping.keyframe import KeyframeSelector
 from mapping.loop_closure import LoopClosure, LoopDetector, Submap
 from mapping.pose_graph import PoseGraph
+from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
 
 
@@ -30,11 +36,14 @@ class Corrected:
     """What the graph came to.
 
     Attributes:
-        T_world_lidar: (M, 4, 4) of all scans.
+        T_world_lidar: (M, 4, 4) of all scans, one recording's after the other's.
         keyframe_scans: (K,) which of them are keyframes.
         closures: all that were looked at closely, refused ones too; `believed` (same length) says which the optimiser
             kept in the end.
         graph: keyframes and edges, refused closures left out.
+        first_scans: (R,) where the scans of each recording begin.
+        frames: (R,) whose world each recording is in: that of the first of those that believed closures join it with,
+            which may be itself.
     """
 
     T_world_lidar: FloatArray
@@ -42,6 +51,13 @@ class Corrected:
     closures: tuple[LoopClosure, ...]
     believed: tuple[bool, ...]
     graph: GraphFile
+    first_scans: NDArray[np.intp]
+    frames: NDArray[np.intp]
+
+    @property
+    def keyframe_recordings(self) -> NDArray[np.intp]:
+        """(K,) which recording each keyframe is of."""
+        return _recordings_of(self.keyframe_scans, self.first_scans)
 
 
 class _Way:
@@ -66,7 +82,7 @@ class _Way:
 
 
 class SlamGraph:
-    """Follows a run, one scan after the other.
+    """Follows a run, one scan after the other, or several runs, one after the other.
 
     Args:
         config: how.
@@ -79,8 +95,10 @@ class SlamGraph:
         self._detector = LoopDetector(config.loops)
         self._graph = PoseGraph(config.optimiser)
         self._store = SubmapStore(directory)
+        self._is_submap_open = False  # is more to come of what is seen from the last keyframe?
         self._submap: GlobalMap | None = None  # of the last keyframe, in its frame
-        self.scan_poses: list[FloatArray] = []  # as refined
+        self.scan_poses: list[FloatArray] = []  # as refined, each recording's in its own world
+        self._first_scans = [0]
         self._keyframe_scans: list[int] = []
         self._keyframe_way_m: list[float] = []
         self._registered: list[FloatArray | None] = []  # covariance of each keyframe's pose
@@ -90,9 +108,16 @@ class SlamGraph:
         self._edges: list[Edge] = []
         self._closures: list[LoopClosure] = []
 
+    def begin_recording(self) -> None:
+        """The next scan is the first of another recording: nobody knows where it lies, nor how it got there."""
+        self._close_submap()
+        self._first_scans.append(len(self.scan_poses))
+        self._selector = KeyframeSelector(self._config.keyframes)
+        self._way, self._way_m, self._session = _Way(), 0.0, self._session + 1
+
     def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
         """Add points (N, 3) of the latest scan, at its pose as refined, to the submap of the last keyframe."""
-        if not self._keyframe_scans:
+        if not self._is_submap_open:
             return
         if self._submap is None:
             self._submap = GlobalMap(voxel_size_m)
@@ -101,7 +126,7 @@ class SlamGraph:
 
     def add(self, scan: GraphScan) -> None:
         """Take the next scan; what the one before showed has been drawn by now."""
-        if self.scan_poses:
+        if len(self.scan_poses) > self._first_scans[-1]:
             step_m = float(np.linalg.norm(scan.T_world_lidar[:3, 3] - self.scan_poses[-1][:3, 3]))
             self._way.go(scan, step_m)
             self._way_m += step_m
@@ -123,20 +148,47 @@ class SlamGraph:
         weights = iter(optimised.loop_weights)
         believed = tuple(c.verdict == "accepted" and bool(next(weights) > 0.5) for c in self._closures)
         loops = [_loop_edge(c) for c, kept in zip(self._closures, believed, strict=True) if kept]
-        keys = np.arange(len(self._keyframe_scans))
+        scans, firsts = np.array(self._keyframe_scans), np.array(self._first_scans)
+        recordings = _recordings_of(scans, firsts)
+        frames = _joined(recordings, len(firsts), loops)
+        poses = self._in_frames(optimised.poses, frames[recordings])
         return Corrected(
-            corrected(np.array(self.scan_poses), np.array(self._keyframe_scans), optimised.poses),
-            np.array(self._keyframe_scans),
+            self._correct_scans(poses, recordings),
+            scans,
             tuple(self._closures),
             believed,
-            GraphFile(keys, optimised.poses, (*self._edges, *loops)),
+            GraphFile(np.arange(len(scans)), poses, (*self._edges, *loops)),
+            firsts,
+            frames,
         )
 
-    def draw_map(self, result: Corrected, voxel_size_m: float) -> GlobalMap:
-        """All submaps at their keyframes' corrected poses."""
+    def _in_frames(self, poses: FloatArray, frames: NDArray[np.intp]) -> FloatArray:
+        """Move poses (K, 4, 4) in one piece for each frame (K,), so that its first keyframe is where it was refined.
+
+        What a closure moved stays there when the closure turns out to be wrong, and no edge takes it back.
+        """
+        moved = poses.copy()
+        for frame in np.unique(frames)[1:]:  # the graph holds the first
+            keys = np.flatnonzero(frames == frame)
+            T_frame_found = self.scan_poses[self._keyframe_scans[keys[0]]] @ inverse(poses[keys[0]])
+            moved[keys] = T_frame_found @ poses[keys]
+        return moved
+
+    def _correct_scans(self, poses: FloatArray, recordings: NDArray[np.intp]) -> FloatArray:
+        """All scans (M, 4, 4), each recording's by the poses (K, 4, 4) of its own keyframes; as refined without any."""
+        scans, keyframes = np.array(self.scan_poses), np.array(self._keyframe_scans)
+        for recording, (begin, end) in enumerate(pairwise([*self._first_scans, len(scans)])):
+            own = recordings == recording
+            if own.any():
+                scans[begin:end] = corrected(scans[begin:end], keyframes[own] - begin, poses[own])
+        return scans
+
+    def draw_map(self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None) -> GlobalMap:
+        """The submaps of some recordings, or of all, at their keyframes' corrected poses."""
         drawn = GlobalMap(voxel_size_m)
-        for index, pose in enumerate(result.graph.poses):
-            drawn.add_means(self._store[index], pose)
+        for index, (pose, recording) in enumerate(zip(result.graph.poses, result.keyframe_recordings, strict=True)):
+            if recordings is None or recording in recordings:
+                drawn.add_means(self._store[index], pose)
         return drawn
 
     def close(self) -> None:
@@ -146,8 +198,8 @@ class SlamGraph:
     def _begin_keyframe(self, scan: GraphScan) -> None:
         key = len(self._keyframe_scans)
         way, self._way = self._way, _Way()
-        if not key:
-            self._graph.add_pose(0, scan.T_world_lidar)
+        if not key or self._keyframe_scans[-1] < self._first_scans[-1]:
+            self._graph.add_pose(key, scan.T_world_lidar)
         else:
             T_first_second = inverse(self.scan_poses[self._keyframe_scans[-1]]) @ scan.T_world_lidar
             self._graph.add_pose(key, self._graph.pose(key - 1) @ T_first_second)
@@ -159,6 +211,7 @@ class SlamGraph:
         self._keyframe_way_m.append(self._way_m)
         self._registered.append(scan.covariance)
         self._sessions.append(self._session)
+        self._is_submap_open = True
 
     def _edges_between(self, key: int, T_first_second: FloatArray, way: _Way, scan: GraphScan) -> list[Edge]:
         """From the last keyframe to this one: what the trajectory says, and what the odometry says beside it."""
@@ -175,8 +228,9 @@ class SlamGraph:
 
     def _close_submap(self) -> None:
         """The last keyframe has been seen enough of: keep its submap, and look for it among those before."""
-        if not self._keyframe_scans:
+        if not self._is_submap_open:
             return
+        self._is_submap_open = False
         index = len(self._keyframe_scans) - 1
         submap, self._submap = self._submap or GlobalMap(1.0), None
         means = submap.means()
@@ -192,6 +246,20 @@ class SlamGraph:
             self._graph.add_edge(_loop_edge(closure))
         if accepted:
             self._graph.update()
+
+
+def _recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.searchsorted(first_scans, scans, side="right") - 1
+
+
+def _joined(recordings: NDArray[np.intp], count: int, loops: list[Edge]) -> NDArray[np.intp]:
+    """For each of so many recordings the first of those that loops join it with; (K,) says whose each keyframe is."""
+    sets = Sessions()
+    for recording in range(count):
+        sets.add(recording)
+    for loop in loops:
+        sets.join(int(recordings[loop.first]), int(recordings[loop.second]))
+    return np.array([sets.first(recording) for recording in range(count)])
 
 
 def _loop_edge(closure: LoopClosure) -> Edge:

@@ -1,6 +1,7 @@
 """The command line as a stranger meets it: help, exit statuses, one-line errors."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,8 @@ from lidarslam.config import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.merge import MergeOutcome
+from lidarslam.summary import MergedRecording, MergeSummary
 from odometry.checkpoint import checkpoint_of, save_checkpoint
 from odometry.image_config import ImageConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig
@@ -129,6 +132,10 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
             "only predicts",
         ),
         (["run", "{recording}", "--out", "{recording}/000000.npy"], 1, "a file is in the way"),
+        (["merge", "--out", "{out}"], 2, "Missing argument 'SOURCE...'"),
+        (["merge", "{recording}", "--out", "{out}"], 1, "expected two recordings or more"),
+        (["merge", "{recording}", "{recording}/../room", "--out", "{out}"], 1, "is named twice"),
+        (["merge", "{recording}", "{recording}/none", "--out", "{out}"], 1, "no such file or folder"),
         (["config", "--set", "reader.rate_hz=fast"], 1, "reader.rate_hz='fast'"),
     ],
 )
@@ -153,6 +160,46 @@ def test_an_earlier_run_is_replaced_only_when_asked(recording: Path, tmp_path: P
     assert "--overwrite" in refused.stderr
     assert lidarslam("run", recording, "--out", out, "--overwrite").exit_code == 0
     assert json.loads((out / "summary.json").read_text())["scans"] == 5
+
+
+def test_merge_says_who_is_left_out(recording: Path, tmp_path: Path) -> None:
+    shutil.copytree(recording, tmp_path / "again")
+    out = tmp_path / "merged"
+    fast = ("--odometry", "kiss-icp", "--set", "mapping.enabled=false")
+    result = lidarslam("merge", recording, tmp_path / "again", "--out", out, *fast)
+    assert result.exit_code == 1  # five scans are too few to be sure of
+    assert "01_room: 5 scans" in result.stdout
+    assert "1 of 2 recordings in one map" in result.stdout
+    assert f"written to {out}" in result.stdout
+    assert result.stderr == "lidarslam: 02_again: not joined to the others, left out of the common map\n"
+    assert json.loads((out / "summary.json").read_text())["recordings"][0]["joined"]
+    shown = lidarslam("view", out / "01_room", out / "02_again", "--save", tmp_path / "both.rrd")
+    assert shown.exit_code == 0
+    pictured = lidarslam("view", out, "--picture", tmp_path / "map.png")
+    assert pictured.exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("joined", "lost", "stopped", "status"),
+    [(True, 0, (), 0), (True, 2, (), 3), (False, 2, (), 1), (True, 2, ("room: not begun",), 1)],
+)
+def test_merge_exits_as_run_does(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    joined: bool,
+    lost: int,
+    stopped: tuple[str, ...],
+    status: int,
+) -> None:
+    entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
+    summary = MergeSummary(entries, 1.0, 100.0, None, 10, 0.1, ())
+    outcome = MergeOutcome(summary, (None, None), stopped)
+    monkeypatch.setattr("lidarslam.merge.merge", lambda *_: outcome)
+    assert (
+        lidarslam("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder").exit_code
+        == status
+    )
 
 
 def test_config_prints_yaml_that_loads_again(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """A walk round a block of corridors, with a drift that is known: loops are closed, and nothing else is."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from mapping.graph_config import SlamGraphConfig, TrajectoryEdgeConfig
 from mapping.graph_scan import GraphScan
+from mapping.pose_graph import Optimised
 from mapping.slam_graph import Corrected, SlamGraph, trajectory_covariance
 
 VOXEL_M = 0.1
@@ -85,15 +86,32 @@ def _heading(way: float) -> float:
 @pytest.fixture(scope="module")
 def walk() -> Walk:
     rng = np.random.default_rng(7)
-    world = _block(rng)
-    ways = np.arange(0.0, 76.0, 0.4)
+    return _walk(_block(rng), np.arange(0.0, 76.0, 0.4), rng)
+
+
+@pytest.fixture(scope="module")
+def second_walk() -> Walk:
+    """Through the same block from elsewhere, in a world of its own, turned by 120 degrees."""
+    world = _block(np.random.default_rng(7))
+    T_own_block = exp([0.0, 0.0, np.deg2rad(120.0), 5.0, -3.0, 0.5])
+    return _walk(world, np.arange(27.0, 57.0, 0.4), np.random.default_rng(8), T_own_block)
+
+
+@pytest.fixture(scope="module")
+def foreign_walk() -> Walk:
+    """Through another block."""
+    rng = np.random.default_rng(99)
+    return _walk(_block(rng), np.arange(0.0, 40.0, 0.4), rng)
+
+
+def _walk(world: FloatArray, ways: FloatArray, rng: np.random.Generator, T_own_block: FloatArray | None = None) -> Walk:
     truth = np.array([exp([0.0, 0.0, 0.0, *_along(w)[:2], 1.0]) @ exp([0, 0, _heading(w), 0, 0, 0]) for w in ways])
     points = []
     for T in truth:
         local = transform_points(inverse(T), world)
         near = local[np.linalg.norm(local, axis=1) < 7.0]
         points.append(near[rng.random(len(near)) < 0.5])
-    estimate = [truth[0]]
+    estimate = [truth[0] if T_own_block is None else T_own_block @ truth[0]]
     for before, after in pairwise(truth):
         estimate.append(estimate[-1] @ inverse(before) @ after @ DRIFT)
     return Walk(truth, np.array(estimate), points)
@@ -101,11 +119,27 @@ def walk() -> Walk:
 
 def follow(walk: Walk, scans: list[GraphScan] | None = None, config: SlamGraphConfig = CONFIG) -> SlamGraph:
     graph = SlamGraph(config)
-    for i, scan in enumerate(scans if scans is not None else walk.scans()):
+    go_on(graph, scans if scans is not None else walk.scans())
+    return graph
+
+
+def go_on(graph: SlamGraph, scans: Iterable[GraphScan]) -> None:
+    before = len(graph.scan_poses)
+    for i, scan in enumerate(scans):
         graph.add(scan)
         graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
-        assert len(graph.scan_poses) == i + 1
-    return graph
+        assert len(graph.scan_poses) == before + i + 1
+
+
+def follow_all(*walks: Walk) -> tuple[SlamGraph, Corrected]:
+    """One recording after the other."""
+    graph = follow(walks[0])
+    for walk in walks[1:]:
+        graph.begin_recording()
+        go_on(graph, walk.scans())
+    result = graph.finish()
+    assert result is not None
+    return graph, result
 
 
 @pytest.fixture(scope="module")
@@ -216,3 +250,95 @@ def test_drift_grows_with_the_way() -> None:
     np.testing.assert_allclose(sigmas, [np.deg2rad(0.3)] * 3 + [0.05] * 3)
     np.testing.assert_allclose(np.sqrt(np.diag(trajectory_covariance(4.0, False, False, config))), 3.0 * sigmas)
     assert trajectory_covariance(4.0, True, True, config)[3, 3] == pytest.approx(9.0)
+
+
+@pytest.fixture(scope="module")
+def two(walk: Walk, second_walk: Walk) -> tuple[SlamGraph, Corrected]:
+    return follow_all(walk, second_walk)
+
+
+def test_a_second_recording_finds_itself_in_the_first(
+    walk: Walk, second_walk: Walk, two: tuple[SlamGraph, Corrected]
+) -> None:
+    graph, result = two
+    count = len(walk.truth)
+    assert result.first_scans.tolist() == [0, count]
+    assert result.frames.tolist() == [0, 0]
+    # Both in the frame of the first, which begins at its true pose.
+    wrong = result.T_world_lidar[:, :3, 3] - np.concatenate([walk.truth, second_walk.truth])[:, :3, 3]
+    wrong_m = np.linalg.norm(wrong, axis=1)
+    assert wrong_m[count:].max() < 0.15
+    assert np.median(np.linalg.norm(second_walk.estimate[:, :3, 3] - second_walk.truth[:, :3, 3], axis=1)) > 5.0
+    # Where both were, they agree better than either with the truth.
+    here, there = result.T_world_lidar[count:, :3, 3], second_walk.truth[:, :3, 3]
+    nearest = cKDTree(walk.truth[:, :3, 3]).query(there)[1]
+    between = (here - result.T_world_lidar[nearest, :3, 3]) - (there - walk.truth[nearest, :3, 3])
+    assert np.median(np.linalg.norm(between, axis=1)) < 0.05
+    # No edge but loops leads from one to the other.
+    recordings = result.keyframe_recordings
+    across = [edge for edge in result.graph.edges if recordings[edge.first] != recordings[edge.second]]
+    assert len(across) >= 3
+    assert {edge.kind for edge in across} == {"loop"}
+    drawn = graph.draw_map(result, VOXEL_M, [1]).points()
+    true = cKDTree(np.concatenate([transform_points(T, p) for T, p in zip(walk.truth, walk.points, strict=True)]))
+    assert np.percentile(true.query(drawn)[0], 90.0) < 0.2
+    assert 0 < len(drawn) < len(graph.draw_map(result, VOXEL_M).points())
+
+
+def test_what_joined_two_recordings_and_is_not_believed_in_the_end_leaves_no_trace(
+    walk: Walk, second_walk: Walk, two: tuple[SlamGraph, Corrected], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph, joined = two
+    optimise = graph._graph.optimise
+
+    def believe_nothing() -> Optimised:
+        optimised = optimise()
+        return replace(optimised, loop_weights=np.zeros_like(optimised.loop_weights))
+
+    monkeypatch.setattr(graph._graph, "optimise", believe_nothing)
+    result = graph.finish()
+    assert result is not None
+    assert result.frames.tolist() == [0, 1]
+    count = len(walk.truth)
+    first = result.keyframe_scans[result.keyframe_recordings == 1][0]
+    np.testing.assert_allclose(result.T_world_lidar[first], second_walk.estimate[first - count], atol=1e-9)
+    # In one piece: nothing within the recording moves.
+    steps, as_joined = (
+        inverse(poses[count:-1]) @ poses[count + 1 :] for poses in (result.T_world_lidar, joined.T_world_lidar)
+    )
+    np.testing.assert_allclose(steps, as_joined, atol=1e-3)
+    np.testing.assert_allclose(result.T_world_lidar[:count], joined.T_world_lidar[:count], atol=1e-3)
+
+
+def test_recordings_of_different_places_stay_apart(walk: Walk, foreign_walk: Walk) -> None:
+    graph, result = follow_all(
+        replace(walk, truth=walk.truth[:80], estimate=walk.estimate[:80], points=walk.points[:80]), foreign_walk
+    )
+    assert result.frames.tolist() == [0, 1]
+    assert not any(result.believed)
+    np.testing.assert_allclose(result.T_world_lidar[80:], foreign_walk.estimate, atol=1e-6)
+    np.testing.assert_allclose(result.T_world_lidar[:80], walk.estimate[:80], atol=1e-6)
+    graph.close()
+
+
+def test_recordings_without_a_keyframe_are_in_frames_of_their_own(walk: Walk) -> None:
+    """One without a scan, one whose scans are all lost; those around them are corrected as ever."""
+    scans, far = list(walk.scans()), exp([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])
+    graph = follow(walk, scans[:30])
+    graph.begin_recording()
+    graph.begin_recording()
+    lost = [replace(s, T_world_lidar=far @ s.T_world_lidar, belongs_in_map=False, lost=True) for s in scans[:5]]
+    go_on(graph, lost)
+    graph.begin_recording()
+    go_on(graph, scans[29:39])
+    result = graph.finish()
+    assert result is not None
+    assert result.first_scans.tolist() == [0, 30, 30, 35]
+    assert result.frames[:3].tolist() == [0, 1, 2]
+    assert sorted(set(result.keyframe_recordings.tolist())) == [0, 3]
+    np.testing.assert_allclose(result.T_world_lidar[30:35], far @ walk.estimate[:5], atol=1e-9)
+    assert graph.draw_map(result, VOXEL_M).points()[:, 2].max() < 10.0  # what is lost is drawn into no submap
+    assert 35 in result.keyframe_scans  # a recording begins with one, wherever the last keyframe before it was
+    firsts = [edge.first for edge in result.graph.edges if edge.kind != "loop"]
+    assert int(np.flatnonzero(result.keyframe_recordings == 0)[-1]) not in firsts
+    graph.close()

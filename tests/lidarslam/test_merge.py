@@ -1,0 +1,266 @@
+"""Several recordings of one simulated office become one map; one of another office does not."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from lidarslam.config import load_config
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum, write_tum
+from lidarslam.finished_run import load_map, load_run
+from lidarslam.merge import MergeOutcome, MergeRequest, merge
+from lidarslam.merge_text import format_merge
+from lidarslam.pipeline import ScanResult
+from lidarslam.run import Progress
+from lidarslam.simulation.motions import Motion
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.worlds.registry import build_world
+from mapping.g2o import read_g2o
+
+SETTINGS = ["global_map.voxel_size_m=0.1"]
+
+
+@contextmanager
+def quiet(_name: str) -> Iterator[Progress]:
+    """No progress bar."""
+    yield lambda _number, _total, _result: None
+
+
+@dataclass(frozen=True, eq=False)
+class Later(Motion):
+    """A motion that one comes to later."""
+
+    since_s: float = 0.0
+
+    def pose_at(self, times: FloatArray) -> FloatArray:
+        return super().pose_at(times + self.since_s)
+
+
+def record(folder: Path, office: int, since_s: float, scans: int, noise: int) -> Path:
+    """Part of a walk through an office with a VLP-16, as .npy scans with times, stamps and ground truth."""
+    world = build_world("office", office)
+    route = motion_along_route("handheld", world, office)
+    motion = Later(**{f.name: getattr(route, f.name) for f in fields(Motion)}, since_s=since_s)
+    simulation = Simulation(
+        world, find_sensor("vlp-16"), motion, mount_pose("upright", motion.sensor_height_m), scans, noise
+    )
+    folder.mkdir()
+    types = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8")])
+    stamps = []
+    for index, scan in enumerate(simulation.scans()):
+        assert scan.time_offsets is not None
+        table = np.empty(len(scan), dtype=types)
+        table["x"], table["y"], table["z"] = scan.points.T
+        table["time"] = scan.time_offsets
+        np.save(folder / f"{index:06d}.npy", table)
+        stamps.append(scan.stamp)
+    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", simulation.ground_truth)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Two walks that share some metres, and one in another office."""
+    root = tmp_path_factory.mktemp("recordings")
+    return {
+        "first": record(root / "first", 0, 2.5, 90, 0),
+        "second": record(root / "second", 0, 5.0, 75, 1),
+        "foreign": record(root / "foreign", 5, 3.5, 12, 2),
+    }
+
+
+def request(out: Path, *sources: Path, overwrite: bool = False, settings: tuple[str, ...] = ()) -> MergeRequest:
+    return MergeRequest(sources, out, load_config(None, [*SETTINGS, *settings]), overwrite=overwrite)
+
+
+@pytest.fixture(scope="module")
+def merged(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MergeOutcome]:
+    out = tmp_path_factory.mktemp("merged") / "office"
+    return out, merge(request(out, places["first"], places["foreign"], places["second"]), quiet)
+
+
+def test_all_that_find_one_another_are_in_the_frame_of_the_first(
+    merged: tuple[Path, MergeOutcome], places: dict[str, Path]
+) -> None:
+    out, outcome = merged
+    assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
+    T_office_common = read_tum(places["first"] / "ground_truth.tum").T_world_lidar[0]
+    for name, place in (("01_first", "first"), ("03_second", "second")):
+        estimate, truth = read_tum(out / name / "trajectory.tum"), read_tum(places[place] / "ground_truth.tum")
+        wrong_m = np.linalg.norm(
+            transform_points(T_office_common, estimate.positions) - truth.at(estimate.stamps)[:, :3, 3], axis=1
+        )
+        assert wrong_m.max() < 0.1
+        assert np.sqrt(np.mean(wrong_m**2)) < 0.05
+    moved = read_tum(out / "03_second" / "trajectory.tum").positions[0]
+    assert np.linalg.norm(moved) > 1.0  # which is where it began for itself
+    apart = read_tum(out / "02_foreign" / "trajectory.tum").positions[0]
+    assert np.linalg.norm(apart) < 0.05
+
+
+def test_the_common_map_holds_what_is_joined_and_nothing_else(
+    merged: tuple[Path, MergeOutcome], places: dict[str, Path]
+) -> None:
+    out, outcome = merged
+    common = load_map(out).points
+    assert len(common) == outcome.summary.map_points > 0
+    first, foreign, second = (load_map(out / name).points for name in ("01_first", "02_foreign", "03_second"))
+    ours = cKDTree(np.concatenate([first, second]))
+    assert ours.query(common)[0].max() < 0.2
+    tree = cKDTree(common)
+    assert np.percentile(tree.query(first)[0], 99.0) < 0.1
+    assert np.percentile(tree.query(second)[0], 99.0) < 0.1
+    assert np.median(tree.query(foreign)[0]) > 0.1
+    # Walls that both saw are one wall.
+    both = cKDTree(first).query(second)[0]
+    assert np.median(both) < 0.06
+
+
+def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
+    out, outcome = merged
+    summary = json.loads((out / "summary.json").read_text())
+    names = [(entry["name"], entry["directory"]) for entry in summary["recordings"]]
+    assert names == [("first", "01_first"), ("foreign", "02_foreign"), ("second", "03_second")]
+    assert [entry["scans"] for entry in summary["recordings"]] == [90, 12, 75]
+    assert [entry["source"] for entry in summary["recordings"]] == [
+        str(places[name].resolve()) for name in ("first", "foreign", "second")
+    ]
+    accepted = [loop for loop in summary["pose_graph"]["loops"] if loop["accepted"]]
+    assert len(accepted) == summary["loop_closures"] >= 3
+    assert {(loop["first_recording"], loop["second_recording"]) for loop in accepted} == {(1, 3)}
+    truths = [read_tum(places[name] / "ground_truth.tum").T_world_lidar for name in ("first", "foreign", "second")]
+    for loop in accepted:  # scans are counted within their recordings
+        first = truths[loop["first_recording"] - 1][loop["first_scan"]]
+        second = truths[loop["second_recording"] - 1][loop["second_scan"]]
+        assert np.linalg.norm((inverse(first) @ second)[:3, 3]) == pytest.approx(loop["distance_m"], abs=0.1)
+    graph = read_g2o(out / "pose_graph.g2o")
+    assert len(graph.keys) == summary["pose_graph"]["keyframes"]
+    assert len(graph.edges) == summary["pose_graph"]["edges"]
+    (apart,) = (warning for warning in summary["warnings"] if "left out of the common map" in warning)
+    assert apart.startswith("02_foreign: ")
+    assert load_config(out / "config.yaml").pose_graph.enabled
+    text = format_merge(out, outcome)
+    assert "2 of 3 recordings in one map" in text
+    assert f"{len(accepted)} between recordings, 0 within" in text
+    assert "02_foreign: 12 scans" in text
+
+
+def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) -> None:
+    out, _ = merged
+    runs = [load_run(out / name) for name in ("01_first", "02_foreign", "03_second")]
+    assert [len(run.trajectory) for run in runs] == [90, 12, 75]
+    assert all(len(run.map_points) for run in runs)
+    keyframes = []
+    for name in ("01_first", "02_foreign", "03_second"):
+        summary = json.loads((out / name / "summary.json").read_text())
+        assert summary["pose_graph"]["loops"] == []  # none leads back within so short a way
+        assert summary["map_voxel_size_m"] == 0.1
+        assert any("frame of its own" in warning for warning in summary["warnings"]) == (name == "02_foreign")
+        graph = read_g2o(out / name / "pose_graph.g2o")
+        assert graph.keys.tolist() == list(range(summary["pose_graph"]["keyframes"]))
+        keyframes.append(len(graph.keys))
+        assert json.loads((out / name / "metrics.json").read_text())["trajectory"]["ate_rmse_m"] < 0.03
+        odometry = read_tum(out / name / "odometry.tum").positions[0]
+        assert np.linalg.norm(odometry) < 0.05  # as it was, in a frame of its own
+    assert keyframes[0] + keyframes[2] == len(read_g2o(out / "pose_graph.g2o").keys)
+
+
+# What follows is about files and errors; the rooms are too small to be joined.
+FAST = (
+    "odometry.method=kiss-icp",
+    "mapping.enabled=false",
+    "odometry.kiss_icp.voxel_size_m=0.2",
+    "odometry.kiss_icp.max_range_m=30",
+)
+
+
+@pytest.fixture
+def rooms(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> list[Path]:
+    """Three short recordings."""
+    folders = []
+    for number in range(3):
+        folder = tmp_path / f"in room {number}"
+        folder.mkdir()
+        for index, scan in enumerate(room_scans[:5]):
+            np.save(folder / f"{index:06d}.npy", scan.points)
+        np.savetxt(folder / "timestamps.txt", room_truth.stamps[:5], fmt="%.9f")
+        folders.append(folder)
+    return folders
+
+
+def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    merge(request(out, *rooms, settings=FAST), quiet)
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == [
+        "01_in_room_0", "02_in_room_1", "03_in_room_2"
+    ]  # fmt: skip
+    (out / "03_in_room_2" / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="--overwrite"):
+        merge(request(out, *rooms[:2], settings=FAST), quiet)
+    merge(request(out, *rooms[1:], overwrite=True, settings=FAST), quiet)
+    assert {path.name for path in out.iterdir() if path.is_dir()} == {"01_in_room_1", "02_in_room_2", "03_in_room_2"}
+    assert [path.name for path in (out / "03_in_room_2").iterdir()] == ["notes.txt"]
+    assert not list(out.rglob(".partial*"))
+
+
+def test_a_damaged_recording_ends_there_and_the_next_goes_on(rooms: list[Path], tmp_path: Path) -> None:
+    (rooms[0] / "000003.npy").write_bytes(b"not an array")
+    for scan in rooms[1].glob("*.npy"):
+        scan.write_bytes(b"not an array")
+    outcome = merge(request(tmp_path / "out", *rooms, settings=FAST), quiet)
+    assert [recording.scans for recording in outcome.summary.recordings] == [3, 0, 5]
+    assert [recording.directory for recording in outcome.summary.recordings] == ["01_in_room_0", None, "03_in_room_2"]
+    assert not (tmp_path / "out" / "02_in_room_1").exists()
+    assert len(outcome.stopped) == 2
+    assert "stopped after 3 scans" in outcome.stopped[0]
+    assert "no scan could be used" in outcome.stopped[1]
+    assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
+
+
+def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path: Path) -> None:
+    @contextmanager
+    def interrupt(name: str) -> Iterator[Progress]:
+        def tell(number: int, _total: int, _result: ScanResult) -> None:
+            if name.startswith("2/") and number == 2:
+                raise KeyboardInterrupt
+
+        yield tell
+
+    outcome = merge(request(tmp_path / "out", *rooms, settings=FAST), interrupt)
+    assert [recording.scans for recording in outcome.summary.recordings] == [5, 2, 0]
+    assert any("in room 1: stopped after 2 scans: interrupted" in line for line in outcome.stopped)
+    assert any("in room 2: not begun" in line for line in outcome.stopped)
+    assert len(read_tum(tmp_path / "out" / "02_in_room_1" / "trajectory.tum")) == 2
+
+
+def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match="two recordings or more"):
+        merge(request(out, rooms[0]), quiet)
+    with pytest.raises(InputError, match="named twice"):
+        merge(request(out, rooms[0], rooms[1], rooms[0].parent / "in room 1" / ".." / "in room 0"), quiet)
+    with pytest.raises(OutputError, match="is the recording itself"):
+        merge(request(rooms[1], *rooms, overwrite=True), quiet)
+    with pytest.raises(ConfigError, match="external"):
+        merge(request(out, *rooms, settings=("odometry.method=external",)), quiet)
+    with pytest.raises(InputError, match="no such"):
+        merge(request(out, rooms[0], tmp_path / "nothing"), quiet)
+    for scan in (path for room in rooms for path in room.glob("*.npy")):
+        scan.write_bytes(b"not an array")
+    with pytest.raises(InputError, match="no scan of any recording"):
+        merge(request(out, *rooms, settings=FAST), quiet)
+    assert not out.exists()
+    assert sorted(path.name for path in rooms[1].iterdir())[-1] == "timestamps.txt"
