@@ -78,8 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             outcomes[name].append(_try(config, excerpt, scans))
     for name, found in outcomes.items():
         _print_accuracy(name, found)
-    for name, found in outcomes.items():
-        _print_coverage(name, found)
+    _print_coverage("learned", outcomes["learned"])
 
 
 def _alone(weights: Path | None) -> LearnedConfig:
