@@ -1,27 +1,34 @@
-"""Loop closures on simulated laps: how many are found, how many are false, how exact they are, and what they cost.
+"""The pose graph on simulated laps: what it does to drift, which loops are closed, how exact they are, what they cost.
 
     python benchmarks/loop_closures.py
     python benchmarks/loop_closures.py --worlds office rooms --motions handheld --drift 2
 
-A sensor goes round every world a time and a third. Keyframes and their submaps are made with the true motion; the
-estimates that the detector is given drift away from the truth, as no graph corrects them here. `rooms` is a world of
-this benchmark: a corridor round a block, along it rooms that are all the same.
+A sensor goes round every world a time and a third. The whole graph of `lidarslam run --pose-graph` is given its scans,
+each compensated with the true motion and thinned, at poses that drift away from the truth; there is no odometry beside
+them. `rooms` is a world of this benchmark: a corridor round a block, along it rooms that are all the same.
 
-Prints a Markdown table, a row for each recording. A closure is false when its relative pose is off the truth by more
-than 0.5 m or 3 degrees. A keyframe is a revisit when the truth was within half the median range of it before, a loop's
-least way ago; it is found when a closure was accepted within 5 m of way of it.
+Prints a Markdown table, a row for each recording. ATE is of all scans, after SE(3) alignment. A closure is false when
+its relative pose is off the truth by more than 0.5 m or 3 degrees; the first number is of those that the detector
+accepted, the second of those that the optimiser believed in the end. A keyframe is a revisit when the truth was within
+half the median range of it before, a loop's least way ago; it is found when a closure was believed within 5 m of way of
+it. Milliseconds are of the processor. At the end, what false ones there are, and why true ones were refused.
 """
 
 import argparse
+import re
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mapping_accuracy import print_row
+from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
+from evaluation.trajectory_metrics import evaluate_trajectory
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
 from lidarslam.core.thinning import one_per_cell
-from lidarslam.core.trajectory import chain
+from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.localisation import SweepMotion
 from lidarslam.simulation.carriers import CARRIERS
 from lidarslam.simulation.mounts import MOUNTS, mount_pose
@@ -32,42 +39,56 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from mapping.deskew import body_velocity
-from mapping.loop_closure import LoopClosure, LoopDetector, Submap
+from mapping.global_map import voxel_size_for
+from mapping.graph_config import SlamGraphConfig
+from mapping.graph_scan import GraphScan
+from mapping.loop_closure import LoopClosure
 from mapping.loop_config import LoopConfig
+from mapping.slam_graph import Corrected, SlamGraph
 
 ROOMS = "rooms"
 FALSE_M, FALSE_DEG = 0.5, 3.0
 _FOUND_WITHIN_M = 5.0
-_TURN_DEG = 30.0
-_STEP_PER_RANGE, _STEP_BOUNDS_M = 0.4, (1.0, 5.0)
-_VOXELS_PER_RANGE, _VOXEL_BOUNDS_M = 50.0, (0.05, 0.25)
 # Errors of the estimate stay the same for so much of the way.
 _DRIFT_CHANGES_M = 50.0
 _MOTIONS = {"street": "car", "tunnel": "tracked", "hall": "tracked"}
+# What refinement says of a scan's pose.
+_REGISTERED = np.diag(np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Lap:
-    """Keyframes of a recording: submaps, true poses (K, 4, 4), and the median range."""
+    """A recording of which every so manieth scan is used.
+
+    Attributes:
+        name: of world and motion.
+        simulation: where scans come from.
+        scans: (M,) which are used.
+        truth: (M, 4, 4) T_world_lidar.
+        way_m: (M,) path length.
+    """
 
     name: str
-    submaps: Sequence[Submap]
+    simulation: Simulation
+    scans: NDArray[np.intp]
     truth: FloatArray
-    range_m: float
+    way_m: FloatArray
 
-    @property
-    def way_m(self) -> FloatArray:
-        """(K,) path length up to each keyframe."""
-        return np.array([submap.way_m for submap in self.submaps])
+    def points(self) -> Iterator[FloatArray]:
+        """(N, 3) of one scan after the other, compensated with the true motion."""
+        every = self.simulation.ground_truth.T_world_lidar
+        for index in self.scans:
+            velocity = body_velocity(inverse(every[index]) @ every[index + 1], self.simulation.sensor.period_s)
+            yield SweepMotion(velocity, velocity).compensate(self.simulation.scan(index).scan)
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What the detector made of a lap; milliseconds (K,) for each keyframe."""
+class Followed:
+    """What the graph made of a lap; milliseconds (K,) of the processor, one a keyframe."""
 
-    closures: Sequence[LoopClosure]
+    result: Corrected
     milliseconds: FloatArray
-    bytes_per_keyframe: float
+    range_m: float
 
 
 def build_rooms(seed: int) -> World:
@@ -97,45 +118,20 @@ def build_rooms(seed: int) -> World:
 
 
 def simulate(world: str, motion: str, sensor: str, mount: str, seed: int, laps: float, every: int) -> Lap:
-    """The keyframes of a recording straight from the simulator, of every so manieth scan."""
+    """A recording straight from the simulator."""
     place = build_rooms(seed) if world == ROOMS else build_world(world, seed)
     carried = motion_along_route(motion, place, seed)
     T_body_lidar = mount_pose(mount, carried.sensor_height_m)
     model = find_sensor(sensor)
     count = int(laps * carried.duration_s * model.rate_hz)
     simulation = Simulation(place, model, carried, T_body_lidar, count, seed)
-    return make_lap(f"{world}, {motion}", simulation, every)
-
-
-def make_lap(name: str, simulation: Simulation, every: int) -> Lap:
-    """Keyframes wherever the sensor has gone or turned far enough, each with the scans since the one before it."""
-    truth = simulation.ground_truth.T_world_lidar
-    way = simulation.ground_truth.distances
-    period_s = simulation.sensor.period_s
-    range_m = float(np.median(np.linalg.norm(simulation.scan(0).scan.points, axis=1)))
-    voxel_m = float(np.clip(range_m / _VOXELS_PER_RANGE, *_VOXEL_BOUNDS_M))
-    gathered: list[FloatArray] = []
-    submaps: list[Submap] = []
-    kept: list[FloatArray] = []
-    last = 0
-    for index in range(0, len(truth) - 1, every):
-        velocity = body_velocity(inverse(truth[index]) @ truth[index + 1], period_s)
-        points = SweepMotion(velocity, velocity).compensate(simulation.scan(index).scan)
-        gathered.append(transform_points(truth[index], points))
-        turned = np.rad2deg(rotation_angle(inverse(truth[last]) @ truth[index]))
-        step_m = np.clip(_STEP_PER_RANGE * range_m, *_STEP_BOUNDS_M)
-        if index and (way[index] - way[last] < step_m and turned < _TURN_DEG):
-            continue
-        there = transform_points(inverse(truth[index]), np.concatenate(gathered))
-        submaps.append(Submap(len(submaps), 0, float(way[index]), there[one_per_cell(there, voxel_m)]))
-        kept.append(truth[index])
-        last, gathered = index, []
-    ranges = [float(np.median(np.linalg.norm(submap.points, axis=1))) for submap in submaps]
-    return Lap(name, submaps, np.stack(kept), float(np.median(ranges)))
+    truth = simulation.ground_truth
+    used = np.arange(0, count - 1, every)
+    return Lap(f"{world}, {motion}", simulation, used, truth.T_world_lidar[used], truth.distances[used])
 
 
 def drifting(lap: Lap, factor: float, seed: int) -> FloatArray:
-    """Estimates (K, 4, 4) with 1 % of the way and, mostly in heading, 2 degrees in 100 m of error, times a factor."""
+    """Estimates (M, 4, 4) with 1 % of the way and, mostly in heading, 2 degrees in 100 m of error, times a factor."""
     rng = np.random.default_rng([seed, 77])
     motions = inverse(lap.truth[:-1]) @ lap.truth[1:]
     steps = np.diff(lap.way_m)
@@ -145,17 +141,25 @@ def drifting(lap: Lap, factor: float, seed: int) -> FloatArray:
     return chain(lap.truth[0], motions @ exp(rates[stretch] * steps[:, None]))
 
 
-def detect(lap: Lap, estimates: FloatArray, config: LoopConfig) -> Found:
-    """Give the detector keyframe after keyframe."""
-    detector = LoopDetector(config)
-    closures: list[LoopClosure] = []
-    milliseconds = []
-    for submap in lap.submaps:
-        started = time.perf_counter()
-        closures += detector.add(submap, estimates[: submap.index + 1])
-        milliseconds.append(1e3 * (time.perf_counter() - started))
-    closures += detector.finish()
-    return Found(closures, np.array(milliseconds), detector.nbytes / len(lap.submaps))
+def follow(lap: Lap, estimates: FloatArray, config: SlamGraphConfig) -> Followed:
+    """Give the graph scan after scan."""
+    graph = SlamGraph(config)
+    milliseconds: list[float] = []
+    ranges: list[float] = []
+    voxel_m: float | None = None
+    for pose, points in zip(estimates, lap.points(), strict=True):
+        voxel_m = voxel_size_for(points) if voxel_m is None else voxel_m
+        thinned = points[one_per_cell(points, voxel_m)]
+        ranges.append(float(np.median(np.linalg.norm(points, axis=1))))
+        before, started = len(graph.keyframe_ms), time.thread_time()
+        graph.add(GraphScan(pose, thinned, _REGISTERED, None, None, lost=False, belongs_in_map=True))
+        if len(graph.keyframe_ms) > before:
+            milliseconds.append(1e3 * (time.thread_time() - started))
+        graph.draw(thinned, pose, voxel_m)
+    result = graph.finish()
+    graph.close()
+    assert result is not None  # the first scan is a keyframe
+    return Followed(result, np.array(milliseconds), float(np.median(ranges)))
 
 
 def errors_of(closures: Sequence[LoopClosure], truth: FloatArray) -> FloatArray:
@@ -165,29 +169,42 @@ def errors_of(closures: Sequence[LoopClosure], truth: FloatArray) -> FloatArray:
     return np.array([[np.linalg.norm(T[:3, 3]), np.rad2deg(rotation_angle(T))] for T in off]).reshape(-1, 2)
 
 
-def revisits(lap: Lap, config: LoopConfig) -> list[int]:
-    """Keyframes that are close to where the sensor was before."""
-    position, way = lap.truth[:, :3, 3], lap.way_m
-    least = max(config.min_way_m, config.min_way_ranges * lap.range_m)
+def revisits(position: FloatArray, way_m: FloatArray, range_m: float, config: LoopConfig) -> list[int]:
+    """Keyframes (K,) that are close to where the sensor was before."""
+    least = max(config.min_way_m, config.min_way_ranges * range_m)
     found = []
-    for index in range(len(way)):
-        before = way < way[index] - least
-        near = np.linalg.norm(position[before] - position[index], axis=1) < 0.5 * lap.range_m
+    for index in range(len(way_m)):
+        near = np.linalg.norm(position[way_m < way_m[index] - least] - position[index], axis=1) < 0.5 * range_m
         if near.any():
             found.append(index)
     return found
 
 
-def row(lap: Lap, found: Found, config: LoopConfig) -> list[str]:
+def ate_m(lap: Lap, T_world_lidar: FloatArray) -> float:
+    """Of all scans, after SE(3) alignment."""
+    stamps = np.arange(len(lap.truth), dtype=np.float64)
+    return evaluate_trajectory(Trajectory(stamps, T_world_lidar), Trajectory(stamps, lap.truth)).errors.ate_rmse_m
+
+
+def is_false(errors: FloatArray) -> NDArray[np.bool_]:
+    """(N,) of `errors_of`."""
+    return np.asarray((errors[:, 0] > FALSE_M) | (errors[:, 1] > FALSE_DEG))
+
+
+def row(lap: Lap, estimates: FloatArray, followed: Followed, config: LoopConfig) -> list[str]:
     """The cells of one recording."""
-    accepted = [closure for closure in found.closures if closure.verdict == "accepted"]
-    errors = errors_of(accepted, lap.truth)
-    false = (errors[:, 0] > FALSE_M) | (errors[:, 1] > FALSE_DEG)
+    result = followed.result
+    truth, way_m = lap.truth[result.keyframe_scans], lap.way_m[result.keyframe_scans]
+    accepted = [closure for closure in result.closures if closure.verdict == "accepted"]
+    believed = [closure for closure, kept in zip(result.closures, result.believed, strict=True) if kept]
+    errors = errors_of(believed, truth)
+    false = is_false(errors)
     right = errors[~false]
-    again = revisits(lap, config)
-    ways = lap.way_m[[closure.second for closure in accepted]]
-    covered = [i for i in again if (np.abs(ways - lap.way_m[i]) < _FOUND_WITHIN_M).any()]
-    nees = [_squared(c, lap.truth) for c, wrong in zip(accepted, false, strict=True) if not wrong]
+    again = revisits(truth[:, :3, 3], way_m, followed.range_m, config)
+    ways = way_m[[closure.second for closure in believed]]
+    covered = [i for i in again if (np.abs(ways - way_m[i]) < _FOUND_WITHIN_M).any()]
+    nees = [_squared(c, truth) for c, wrong in zip(believed, false, strict=True) if not wrong]
+    before, after = ate_m(lap, estimates), ate_m(lap, result.T_world_lidar)
 
     def pair(column: int, unit: str) -> str:
         values = right[:, column]
@@ -195,31 +212,45 @@ def row(lap: Lap, found: Found, config: LoopConfig) -> list[str]:
 
     return [
         lap.name,
-        str(len(lap.submaps)),
-        f"{lap.way_m[-1]:.0f}",
+        f"{way_m[-1]:.0f}",
+        f"{before:.2f} / {after:.3f}",
+        f"{after / before:.2f}",
+        str(len(way_m)),
         str(len(again)),
-        str(len(accepted)),
-        str(sum(closure.found_by == "appearance" for closure in accepted)),
-        str(int(false.sum())),
+        str(len(believed)),
+        str(sum(closure.found_by == "appearance" for closure in believed)),
+        f"{is_false(errors_of(accepted, truth)).sum()} / {false.sum()}",
         pair(0, "m"),
         pair(1, "deg"),
         f"{np.median(nees):.1f}" if nees else "-",
         f"{100.0 * len(covered) / len(again):.0f}" if again else "-",
-        f"{np.median(found.milliseconds):.0f} / {np.percentile(found.milliseconds, 95):.0f}"
-        f" / {found.milliseconds.mean():.0f}",
-        f"{found.bytes_per_keyframe / 1e3:.0f}",
+        f"{np.median(followed.milliseconds):.0f} / {np.percentile(followed.milliseconds, 95):.0f}"
+        f" / {followed.milliseconds.mean():.0f}",
     ]
+
+
+def refusals(lap: Lap, followed: Followed) -> list[str]:
+    """Every false closure that was accepted, and for how many that were right what spoke against them."""
+    result = followed.result
+    truth = lap.truth[result.keyframe_scans]
+    lines: list[str] = []
+    reasons: Counter[str] = Counter()
+    errors = errors_of(result.closures, truth)
+    for closure, (off_m, off_deg), wrong in zip(result.closures, errors, is_false(errors), strict=True):
+        if wrong and closure.verdict == "accepted":
+            lines.append(
+                f"false: {closure.first} and {closure.second}, {closure.found_by}, off by {off_m:.2f} m"
+                f" {off_deg:.1f} deg, overlap {closure.overlap:.2f}, {closure.consistent} agree"
+            )
+        elif not wrong and closure.verdict == "rejected":
+            reasons[re.sub(r"[0-9.]+", "N", closure.reason)] += 1
+    return lines + [f"right but refused, {count}: {reason}" for reason, count in reasons.most_common()]
 
 
 def _squared(closure: LoopClosure, truth: FloatArray) -> float:
     """The error against its covariance; 5.3 in the median if that were right."""
     xi = log(inverse(closure.T_first_second) @ inverse(truth[closure.first]) @ truth[closure.second])
     return float(xi @ np.linalg.solve(closure.covariance, xi))
-
-
-def print_row(cells: Sequence[str]) -> None:
-    """One row of a Markdown table."""
-    print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def laps(arguments: argparse.Namespace) -> Iterator[Lap]:
@@ -243,14 +274,21 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=3, help="scans are taken one in so many")
     parser.add_argument("--drift", type=float, default=1.0, help="times 1 %% of the way and 2 degrees in 100 m")
     arguments = parser.parse_args()
-    config = expecting(arguments.drift)
-    header = ["recording", "keyframes", "path, m", "revisits", "closures", "by appearance", "false"]
+    loops = expecting(arguments.drift)
+    config = SlamGraphConfig(enabled=True, loops=loops)
+    header = ["recording", "path, m", "ATE before / after, m", "ratio", "keyframes", "revisits", "closures"]
+    header += ["by appearance", "false, accepted / believed"]
     header += ["off by, median / max", "degrees", "squared over covariance", "revisits found, %"]
-    header += ["ms a keyframe, median / 95 % / mean", "kB a keyframe"]
+    header += ["ms a keyframe, median / 95 % / mean"]
     print_row(header)
     print_row(["---"] * len(header))
+    notes: list[str] = []
     for lap in laps(arguments):
-        print_row(row(lap, detect(lap, drifting(lap, arguments.drift, arguments.seed), config), config))
+        estimates = drifting(lap, arguments.drift, arguments.seed)
+        followed = follow(lap, estimates, config)
+        print_row(row(lap, estimates, followed, loops))
+        notes += [f"{lap.name}: {line}" for line in refusals(lap, followed)]
+    print("", *notes, sep="\n")
 
 
 def expecting(factor: float) -> LoopConfig:

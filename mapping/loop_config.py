@@ -1,5 +1,7 @@
 """Settings of loop closures; light, so that reading a configuration imports no SciPy."""
 
+import math
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
@@ -45,6 +47,11 @@ class LoopConfig(BaseModel):
         1.0, ge=0.0, description="way that agreeing closures must be spread over, in median ranges"
     )
     pending_m: float = Field(100.0, gt=0.0, description="way after which a closure that nothing agrees with is dropped")
+
+    @property
+    def drift_rates(self) -> tuple[float, float]:
+        """Standard deviations of the estimate's attitude and position for each metre of the way, radians and metres."""
+        return math.radians(self.drift_deg_per_100m) / 100.0, 0.01 * self.drift_percent
 
     @model_validator(mode="after")
     def _ranges_leave_something(self) -> Self:

@@ -59,8 +59,8 @@ class Track:
         mean, square = (sums[high] - sums[low]) / count[:, None], (squares[high] - squares[low]) / count
         here = self.T_world_lidar[second, :3, 3]
         distance = np.sqrt(np.maximum(square - 2.0 * mean @ here + here @ here, 0.0))
-        rotation = _LEAST_ROTATION + np.deg2rad(config.drift_deg_per_100m) * way / 100.0
-        translation = _LEAST_TRANSLATION_M + 0.01 * config.drift_percent * way
+        turned, shifted = config.drift_rates
+        rotation, translation = _LEAST_ROTATION + turned * way, _LEAST_TRANSLATION_M + shifted * way
         return rotation, np.hypot(translation, 0.5 * rotation * distance)
 
     def drift_covariance(self, first: int, second: int, config: LoopConfig) -> FloatArray:
@@ -85,6 +85,17 @@ def correction_sigmas(link: Link, track: Track, config: LoopConfig) -> float:
     covariance = link.covariance + track.drift_covariance(link.first, link.second, config)
     parts = (slice(0, 3), slice(3, 6))
     return max(float(np.sqrt(xi[p] @ np.linalg.solve(covariance[p, p], xi[p]))) for p in parts)
+
+
+def beyond_drift(link: Link, track: Track, most_sigmas: float, config: LoopConfig) -> str:
+    """Why drift does not explain a link within a session; empty when it does, and between sessions."""
+    if track.session[link.first] != track.session[link.second]:
+        return ""
+    sigmas = correction_sigmas(link, track, config)
+    if sigmas <= most_sigmas:
+        return ""
+    way_m = track.way_m[link.second] - track.way_m[link.first]
+    return f"corrects {sigmas:.1f} standard deviations of the drift over {way_m:.0f} m"
 
 
 def agree(a: Link, b: Link, track: Track, config: LoopConfig) -> bool:

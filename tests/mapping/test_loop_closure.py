@@ -8,6 +8,7 @@ import pytest
 import mapping.loop_closure as module
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.core.trajectory import chain
+from mapping.loop_candidates import Keyframes
 from mapping.loop_closure import LoopClosure, LoopDetector, Submap
 from mapping.loop_config import LoopConfig
 
@@ -218,6 +219,22 @@ def test_keyframes_come_one_by_one():
         detector.add(Submap(1, 0, 0.0, np.zeros((0, 3))), np.tile(np.eye(4), (2, 1, 1)))
     with pytest.raises(ValueError, match="poses"):
         detector.add(Submap(0, 0, 0.0, np.zeros((0, 3))), np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_a_place_is_a_keyframe_with_its_neighbours(twice):
+    submaps, truth = twice
+    kept = Keyframes(CONFIG)
+    for i, submap in enumerate(submaps[:8]):
+        kept.add(submap.points, submap.way_m, int(i >= 6), truth[: i + 1])
+    way = kept.track.way_m
+    for index, around in ((0, [0, 1, 2]), (3, [1, 2, 3, 4, 5]), (5, [3, 4, 5]), (7, [6, 7])):
+        place = kept.place(index)
+        assert sorted(set(place.ahead_m)) == pytest.approx([way[i] - way[index] for i in around])
+        assert place.bend == pytest.approx((np.deg2rad(2.0) / 100.0, 0.01))
+        assert place.patch is kept.patches[index]
+    # The neighbours' points lie on the same walls: the hall's are 14 m from its middle.
+    world = transform_points(truth[3], kept.place(3).points)
+    assert (np.abs(world[:, 1]) < 14.1).all()
 
 
 def test_memory_of_a_keyframe_is_bounded(twice):

@@ -1,12 +1,15 @@
 """Rooms of boxes, sampled as points, laid on themselves from wrong guesses; corridors and other rooms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle, transform_points
 from mapping.loop_config import LoopConfig
-from mapping.loop_verification import Place, judge, verify
-from mapping.place_recognition import Patch, make_patch
+from mapping.loop_patch import Patch, make_patch
+from mapping.loop_registration import Place, Pulls
+from mapping.loop_verification import judge, verify
 
 CONFIG = LoopConfig()
 # Centre and half sizes; the sensor stands inside.
@@ -139,6 +142,57 @@ def test_neighbours_help(room):
     found = verify(joined, room[1], TRUE)
     assert found is not None
     assert np.linalg.norm((inverse(TRUE) @ found.T_target_source)[:3, 3]) < 0.01
+
+
+def test_neighbours_that_drift_may_have_moved_count_less(room):
+    stand = pose(1.5, 0.8, 40.0)
+    wrong = exp([0, 0, 0, 0.15, 0.1, 0.0]) @ inverse(FIRST) @ stand
+    around = [(wrong, patch_from(ROOM, stand, 5)), (wrong, patch_from(ROOM, stand, 6))]
+    trusted = Place.join(room[0].patch, around)
+    doubted, source = (
+        replace(place, bend=(0.02, 0.05)) for place in (Place.join(room[0].patch, around, [3, 3]), room[1])
+    )
+    off = []
+    for target, other in ((trusted, room[1]), (doubted, source)):
+        found = verify(target, other, TRUE)
+        assert found is not None
+        off.append(np.linalg.norm((inverse(TRUE) @ found.T_target_source)[:3, 3]))
+    assert off[0] > 0.03
+    assert off[1] < 0.5 * off[0]
+
+
+def test_trust_falls_with_what_drift_does_on_the_way():
+    points, ahead_m = np.array([[5.0, 0, 0], [5.0, 0, 0], [0, 0, 0]]), np.array([[0, 0], [3.0, 4.0], [0, 2.0]])
+    noise_m = np.full(3, 0.02)
+    pulls = Pulls(points, np.tile([1.0, 0, 0], (3, 1)), np.zeros(3), np.zeros(3), noise_m, ahead_m, (0.002, 0.01))
+    # Shifted by 0.01 a metre, and turned by 0.002 a metre at 5 m.
+    assert pulls.trust == pytest.approx([1.0, 0.0004 / (0.0004 + 25 * 0.0002), 0.0004 / (0.0004 + 4 * 0.0001)])
+
+
+def test_covariance_holds_what_drift_does_within_a_place(room):
+    def covariance(target_middle: float, source_middle: float, ahead: float) -> FloatArray:
+        bend = (0.01, 0.02)
+        target = replace(room[0], middle_m=target_middle, bend=bend)
+        source = replace(room[1], middle_m=source_middle, bend=bend, ahead_m=np.full(len(room[1].points), ahead))
+        return judge(target, source, TRUE).covariance
+
+    more = covariance(1.0, 2.0, 0.0) - covariance(0.0, 0.0, 0.0)
+    assert more == pytest.approx(np.diag([1e-4 * 5 / 3] * 3 + [4e-4 * 5 / 3] * 3), abs=1e-12)
+    # What lies behind makes up for a submap that is drawn ahead; points are trusted as much either way.
+    more = covariance(0.0, 1.0, 1.0) - covariance(0.0, 1.0, -1.0)
+    assert more == pytest.approx(np.diag([1e-4 * 4 / 3] * 3 + [4e-4 * 4 / 3] * 3), abs=1e-12)
+
+
+def test_points_know_which_way_their_keyframe_lies(room):
+    other = patch_from(ROOM, pose(1.5, 0.8, 40.0), 5)
+    another = patch_from(ROOM, pose(1.5, 0.8, 40.0), 6)
+    place = Place.join(room[0].patch, [(np.eye(4), other), (np.eye(4), another)], [-3.0, 2.0], (0.1, 0.2))
+    assert set(place.ahead_m) == {-3.0, 0.0, 2.0}
+    assert place.middle_m == 1.0  # half the way to the next
+    assert place.bend == (0.1, 0.2)
+    assert len(place.ahead_m) == len(place.points)
+    same = Place.join(room[0].patch, [(np.eye(4), room[0].patch)], [-3.0], (0.1, 0.2))
+    assert (same.ahead_m == 0.0).all()  # its own points are the better ones
 
 
 @pytest.mark.parametrize("count", [0, 1, 9, 30])
