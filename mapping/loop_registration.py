@@ -58,7 +58,7 @@ class Place:
         bend: tuple[float, float] = (0.0, 0.0),
     ) -> "Place":
         """Unite a keyframe with others, each with `T_keyframe_neighbour` (4, 4) and the way there; back is negative."""
-        parts = [*neighbours, (np.eye(4), patch)]  # of points in one cell the last stays: the best
+        parts = [(np.eye(4), patch), *neighbours]
         used = [part.kinds > 0 for _, part in parts]
         points = [transform_points(T, part.points[u].astype(float)) for u, (T, part) in zip(used, parts, strict=True)]
         axes = [part.axes[u].astype(float) @ T[:3, :3].T for u, (T, part) in zip(used, parts, strict=True)]
@@ -66,7 +66,7 @@ class Place:
         kept = one_per_cell(together, 1.5 * patch.cell_m)
         tilt = np.concatenate([part.tilt[u] for u, (_, part) in zip(used, parts, strict=True)]).astype(float)
         is_line = np.concatenate([part.kinds[u] == LINE for u, (_, part) in zip(used, parts, strict=True)])
-        ahead_m = np.repeat([*(ways_m or [0.0] * len(neighbours)), 0.0], [int(u.sum()) for u in used])
+        ahead_m = np.repeat([0.0, *(ways_m or [0.0] * len(neighbours))], [int(u.sum()) for u in used])
         middle_m = 0.5 * min((abs(way_m) for way_m in ways_m), default=0.0)
         together = together[kept]
         unit = np.concatenate(axes)[kept]

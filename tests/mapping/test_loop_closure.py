@@ -221,6 +221,20 @@ def test_keyframes_come_one_by_one():
         detector.add(Submap(0, 0, 0.0, np.zeros((0, 3))), np.tile(np.eye(4), (3, 1, 1)))
 
 
+def test_closures_wait_for_others_to_agree_until_the_session_ends(twice):
+    submaps, truth = twice
+    config = CONFIG.model_copy(update={"alone_ranges": 0.0, "agreeing": 99, "appearance_candidates": 0})
+    _, detector = detect(submaps[:0], truth, config)
+    last = next(i for i, s in enumerate(submaps) if s.way_m > 60.0)
+    estimates = drifted(truth)
+    waiting = [c for s in submaps[:last] for c in detector.add(s, estimates[: s.index + 1])]
+    assert accepted(waiting) == []
+    decided = detector.add(Submap(last, 1, 0.0, np.zeros((0, 3))), estimates[: last + 1])
+    assert len(decided) > 2
+    assert {c.reason for c in decided} == {"no other closure agrees"}
+    assert detector.finish() == []
+
+
 def test_a_place_is_a_keyframe_with_its_neighbours(twice):
     submaps, truth = twice
     kept = Keyframes(CONFIG)
