@@ -29,7 +29,7 @@ from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
 _COVERED_95 = float(chi2.ppf(0.95, 6))
-_BEYOND_TRUTH_S = 0.2
+BEYOND_TRUTH_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _print(simulate(world, motion, options.sensor, options.scans, options.seed), methods)
 
 
-def _methods(weights: Path | None) -> dict[str, OdometryConfig]:
+def network_alone(weights: Path | None) -> LearnedConfig:
+    """The learned odometry without alignment, and without a judgement."""
     unrefined = AlignmentConfig(iterations=0, doubtful=0.0)
-    alone = LearnedConfig(weights=weights, alignment=unrefined, least_explained=0.0, least_points=6)
+    return LearnedConfig(weights=weights, alignment=unrefined, least_explained=0.0, least_points=6)
+
+
+def _methods(weights: Path | None) -> dict[str, OdometryConfig]:
     return {
-        "network alone": OdometryConfig(learned=alone),
+        "network alone": OdometryConfig(learned=network_alone(weights)),
         "learned": OdometryConfig(learned=LearnedConfig(weights=weights)),
         "KISS-ICP": OdometryConfig(method="kiss-icp"),
     }
@@ -74,9 +78,9 @@ def _methods(weights: Path | None) -> dict[str, OdometryConfig]:
 
 def _print(recorded: Recorded, methods: dict[str, OdometryConfig]) -> None:
     stamps = np.array([scan.stamp for scan in recorded.scans])
-    truth = Trajectory(stamps, recorded.truth.at(stamps, _BEYOND_TRUTH_S))
+    truth = Trajectory(stamps, recorded.truth.at(stamps, BEYOND_TRUTH_S))
     motions = truth.relative_motions()
-    step, turn = _rms(np.linalg.norm(motions[:, :3, 3], axis=1)), np.rad2deg(_rms(rotation_angle(motions)))
+    step, turn = rms(np.linalg.norm(motions[:, :3, 3], axis=1)), np.rad2deg(rms(rotation_angle(motions)))
     for name, config in methods.items():
         errors = _try(config, recorded, truth)
         covered = "" if errors.covered_percent is None else f"{errors.covered_percent:.0f}"
@@ -103,8 +107,8 @@ def _try(config: OdometryConfig, recorded: Recorded, truth: Trajectory) -> Error
     wrong = inverse(estimated) @ truth.relative_motions()
     trajectory = Trajectory(truth.stamps, chain(truth.T_world_lidar[0], estimated))
     return Errors(
-        rotation_deg=float(np.rad2deg(_rms(rotation_angle(wrong)))),
-        translation_m=_rms(np.linalg.norm(wrong[:, :3, 3], axis=1)),
+        rotation_deg=float(np.rad2deg(rms(rotation_angle(wrong)))),
+        translation_m=rms(np.linalg.norm(wrong[:, :3, 3], axis=1)),
         ate_m=errors_of(trajectory, recorded).ate_rmse_m,
         failures=sum(motion.failure is not None for motion in motions),
         covered_percent=_covered_percent(motions[1:], log(wrong)),
@@ -114,15 +118,23 @@ def _try(config: OdometryConfig, recorded: Recorded, truth: Trajectory) -> Error
 
 def _covered_percent(motions: Sequence[Motion], errors: FloatArray) -> float | None:
     """Of the errors (N, 6), those within the 95 % ellipsoid of their covariance."""
-    squared = [
-        float(error @ np.linalg.solve(motion.covariance, error))
-        for motion, error in zip(motions, errors, strict=True)
-        if motion.covariance is not None
-    ]
-    return 100.0 * float(np.mean(np.array(squared) <= _COVERED_95)) if squared else None
+    squared = squared_errors(motions, errors)
+    squared = squared[np.isfinite(squared)]
+    return 100.0 * float(np.mean(squared <= _COVERED_95)) if len(squared) else None
 
 
-def _rms(values: FloatArray) -> float:
+def squared_errors(motions: Sequence[Motion], errors: FloatArray) -> FloatArray:
+    """(N,) of errors (N, 6), in standard deviations, summed over the six directions; NaN without a covariance."""
+    return np.array(
+        [
+            np.nan if motion.covariance is None else error @ np.linalg.solve(motion.covariance, error)
+            for motion, error in zip(motions, errors, strict=True)
+        ]
+    )
+
+
+def rms(values: FloatArray) -> float:
+    """The root of the mean of their squares."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

@@ -19,20 +19,18 @@ from pathlib import Path
 import numpy as np
 from mapping_accuracy import print_row
 from numpy.typing import NDArray
+from odometry_accuracy import BEYOND_TRUTH_S, network_alone, rms, squared_errors
 from scipy.stats import chi2
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.simulation.mixture import Excerpt, mixture
 from lidarslam.simulation.recorder import Simulation
-from odometry.alignment_config import AlignmentConfig
 from odometry.config import OdometryConfig
-from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
 _SIGMAS = (1, 2, 3)
-_BEYOND_TRUTH_S = 0.2
 # What a motion should be better than: degrees, metres, and part of the step.
 _GOOD_DEG, _GOOD_M, _GOOD_SHARE = 0.3, 0.02, 0.03
 _FASTEST_DEG = 15.0
@@ -70,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--weights", type=Path, help="instead of the program's own")
     options = parser.parse_args(arguments)
-    methods = {"network alone": _alone(options.weights), "learned": LearnedConfig(weights=options.weights)}
+    methods = {"network alone": network_alone(options.weights), "learned": LearnedConfig(weights=options.weights)}
     outcomes: dict[str, list[Outcome]] = {name: [] for name in methods}
     for excerpt in mixture(options.recordings, options.scans, options.seed):
         scans = list(excerpt.scans())
@@ -79,11 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, found in outcomes.items():
         _print_accuracy(name, found)
     _print_coverage("learned", outcomes["learned"])
-
-
-def _alone(weights: Path | None) -> LearnedConfig:
-    unrefined = AlignmentConfig(iterations=0, doubtful=0.0)
-    return LearnedConfig(weights=weights, alignment=unrefined, least_explained=0.0, least_points=6)
 
 
 def _try(config: LearnedConfig, excerpt: Excerpt, scans: Sequence[Scan]) -> Outcome:
@@ -96,21 +89,17 @@ def _try(config: LearnedConfig, excerpt: Excerpt, scans: Sequence[Scan]) -> Outc
     finally:
         odometry.close()
     cpu_ms = 1e3 * (time.process_time() - started) / len(motions)
-    truth = simulation.ground_truth.at(np.array([scan.stamp for scan in scans]), _BEYOND_TRUTH_S)
+    truth = simulation.ground_truth.at(np.array([scan.stamp for scan in scans]), BEYOND_TRUTH_S)
     true = inverse(truth[:-1]) @ truth[1:]
     estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
     measured = np.array([motion.failure is None for motion in motions[1:]])
     error = log(inverse(estimated) @ true)
-    squared = np.array([_squared(motion, one) for motion, one in zip(motions[1:], error, strict=True)])
+    squared = squared_errors(motions[1:], error)
     return Outcome(
         simulation.world.name, simulation.sensor.name, simulation.motion.name,
         np.linalg.norm(true[measured, :3, 3], axis=1), np.rad2deg(rotation_angle(true[measured])), error[measured],
         squared[measured], int((~measured).sum()), cpu_ms,
     )  # fmt: skip
-
-
-def _squared(motion: Motion, error: FloatArray) -> float:
-    return np.nan if motion.covariance is None else float(error @ np.linalg.solve(motion.covariance, error))
 
 
 def _print_accuracy(name: str, outcomes: Sequence[Outcome]) -> None:
@@ -135,13 +124,13 @@ def _print_group(name: str, outcomes: Sequence[Outcome]) -> None:
     """Errors of all motions together, and how many of the recordings are as good as they should be."""
     parts = [(one, one.turn_deg <= _FASTEST_DEG) for one in outcomes]
     error = np.concatenate([one.error[slow] for one, slow in parts])
-    step_m = _rms(np.concatenate([one.step_m[slow] for one, slow in parts]))
-    turn_deg = _rms(np.concatenate([one.turn_deg[slow] for one, slow in parts]))
-    translation_m = _rms(np.linalg.norm(error[:, 3:], axis=1))
+    step_m = rms(np.concatenate([one.step_m[slow] for one, slow in parts]))
+    turn_deg = rms(np.concatenate([one.turn_deg[slow] for one, slow in parts]))
+    translation_m = rms(np.linalg.norm(error[:, 3:], axis=1))
     good = np.array([_is_good(one, slow) for one, slow in parts])
     print_row([
         name, str(len(outcomes)), f"{step_m:.2f}", f"{turn_deg:.1f}",
-        f"{np.rad2deg(_rms(np.linalg.norm(error[:, :3], axis=1))):.2f}", f"{100.0 * translation_m:.1f}",
+        f"{np.rad2deg(rms(np.linalg.norm(error[:, :3], axis=1))):.2f}", f"{100.0 * translation_m:.1f}",
         f"{100.0 * translation_m / step_m:.0f}", *(f"{good[:, i].sum()} of {len(good)}" for i in range(2)),
         str(sum(one.failed for one in outcomes)), f"{np.median([one.cpu_ms for one in outcomes]):.0f}",
     ])  # fmt: skip
@@ -152,10 +141,10 @@ def _is_good(outcome: Outcome, chosen: NDArray[np.bool_]) -> tuple[bool, bool]:
     error = outcome.error[chosen]
     if not len(error):
         return True, True
-    rotation_deg = np.rad2deg(_rms(np.linalg.norm(error[:, :3], axis=1)))
-    translation_m = _rms(np.linalg.norm(error[:, 3:], axis=1))
+    rotation_deg = np.rad2deg(rms(np.linalg.norm(error[:, :3], axis=1)))
+    translation_m = rms(np.linalg.norm(error[:, 3:], axis=1))
     return bool(rotation_deg <= _GOOD_DEG), bool(
-        translation_m <= max(_GOOD_M, _GOOD_SHARE * _rms(outcome.step_m[chosen]))
+        translation_m <= max(_GOOD_M, _GOOD_SHARE * rms(outcome.step_m[chosen]))
     )
 
 
@@ -168,10 +157,6 @@ def _print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
     expected = [erf(sigma / sqrt(2.0)) for sigma in _SIGMAS]
     print_row(["should be, %", *(f"{100.0 * share:.1f}" for share in expected)])
     print_row(["are, %", *(f"{100.0 * np.mean(squared <= chi2.ppf(share, 6)):.1f}" for share in expected)])
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 if __name__ == "__main__":

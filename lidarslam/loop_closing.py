@@ -158,7 +158,10 @@ class FinishedGraph:
         if not len(keys) or not self._scans[recording]:
             return 0.0
         begin, first = self._result.first_scans[recording], self._result.keyframe_scans[keys[0]]
-        before, after = np.array(self._graph.scan_poses[begin:])[: self._scans[recording]], self._scan_poses(recording)
+        before, after = (
+            np.array(self._graph.scan_poses[begin : begin + self._scans[recording]]),
+            self._scan_poses(recording),
+        )
         T_common_own = self._result.T_world_lidar[first] @ inverse(self._graph.scan_poses[first])
         return float(np.linalg.norm(after[:, :3, 3] - (T_common_own @ before)[:, :3, 3], axis=1).max())
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from lidarslam.merge import MergeOutcome
 from lidarslam.run import RunOutcome
 from lidarslam.summary import MergedRecording, MergeSummary
+from lidarslam.summary_text import format_map
 
 
 def format_merge(out: Path, outcome: MergeOutcome) -> str:
@@ -18,11 +19,7 @@ def _lines(out: Path, outcome: MergeOutcome) -> Iterator[str]:
     for recording, run in zip(summary.recordings, outcome.runs, strict=True):
         yield _recording(recording, run)
     yield _joined(summary)
-    if summary.map_voxel_size_m is None:
-        yield "no map: no scan could be believed"
-    else:
-        voxel_cm = 100.0 * summary.map_voxel_size_m
-        yield f"map of {summary.map_points:,} points, one in every voxel of {voxel_cm:.0f} cm"
+    yield format_map(summary.map_points, summary.map_voxel_size_m)
     for warning in summary.warnings:
         yield f"warning: {warning}"
     if summary.lost_scans:

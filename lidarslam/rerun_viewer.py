@@ -23,6 +23,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.finished_run import FinishedRun
 from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
+from mapping.global_map import GlobalMap
 
 _log = logging.getLogger(__name__)
 
@@ -107,13 +108,13 @@ class RerunViewer:
         cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
         self._recording.log("world/map", cloud)
 
-    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], map_points: FloatArray) -> None:
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], global_map: GlobalMap) -> None:
         """The corrected path beside the one that was seen to grow, the loops, and the map drawn anew."""
         path = rr.LineStrips3D([positions], colors=[_CLOSED_COLOUR], radii=_PATH_RADIUS, labels=["loops closed"])
         self._recording.log("world/closed/trajectory", path)
         self._recording.log("world/closed/loops", _loop_lines(positions, np.array(loops, dtype=np.intp).reshape(-1, 2)))
         self._last_position = positions[-1]
-        self.show_map(map_points)
+        self.show_map(global_map.points())
 
     def close(self) -> None:
         """Wait until everything is written; a window that went away does not fail the run."""

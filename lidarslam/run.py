@@ -263,13 +263,13 @@ def _close_loops(
     graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog, viewer: Viewer
 ) -> GraphOutcome | None:
     """Correct what was logged, once all scans are there."""
-    if graph is None or global_map is None or not len(log):
+    if graph is None or global_map is None:
         return None
     closed = finish_graph(graph, len(log), global_map.voxel_size_m)
     if closed is not None:
         log.correct(closed.T_world_lidar)
         pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
-        viewer.show_closed(log.trajectory.positions, pairs, closed.global_map.points())
+        viewer.show_closed(log.trajectory.positions, pairs, closed.global_map)
     return closed
 
 

@@ -129,11 +129,7 @@ class RunSummary:
             "lost_scans": self.lost_scans,
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
-            "loop_closures": self.loop_closures,
-            "pose_graph": None if self.graph is None else self.graph.to_json(),
-            "map_points": self.map_points,
-            "map_voxel_size_m": self.map_voxel_size_m,
-            "warnings": list(self.warnings),
+            **_of_graph_and_map(self),
         }
 
 
@@ -187,12 +183,19 @@ class MergeSummary:
             "elapsed_s": self.elapsed_s,
             "peak_rss_mb": self.peak_rss_mb,
             "lost_scans": self.lost_scans,
-            "loop_closures": self.loop_closures,
-            "pose_graph": None if self.graph is None else self.graph.to_json(),
-            "map_points": self.map_points,
-            "map_voxel_size_m": self.map_voxel_size_m,
-            "warnings": list(self.warnings),
+            **_of_graph_and_map(self),
         }
+
+
+def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
+    """What the summary.json of a run and of several say alike."""
+    return {
+        "loop_closures": summary.loop_closures,
+        "pose_graph": None if summary.graph is None else summary.graph.to_json(),
+        "map_points": summary.map_points,
+        "map_voxel_size_m": summary.map_voxel_size_m,
+        "warnings": list(summary.warnings),
+    }
 
 
 def summarise(

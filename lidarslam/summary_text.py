@@ -22,11 +22,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
     total = summary.ms_per_scan["total"]
     yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
-    if summary.map_voxel_size_m is None:
-        yield "no map: no scan could be believed"
-    else:
-        points, voxel_cm = _count(summary.map_points, "point"), 100.0 * summary.map_voxel_size_m
-        yield f"map of {points}, one in every voxel of {voxel_cm:.0f} cm"
+    yield format_map(summary.map_points, summary.map_voxel_size_m)
     if summary.graph is not None:
         yield _loops(summary.graph)
     if outcome.metrics is not None:
@@ -37,12 +33,18 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     yield f"written to {out}"
 
 
+def format_map(points: int, voxel_size_m: float | None) -> str:
+    """A line about a map; the voxels have no size where there is none."""
+    if voxel_size_m is None:
+        return "no map: no scan could be believed"
+    return f"map of {_count(points, 'point')}, one in every voxel of {100.0 * voxel_size_m:.0f} cm"
+
+
 def _loops(graph: GraphSummary) -> str:
-    closed = sum(loop.accepted for loop in graph.loops)
-    moved = f", which moved poses by up to {graph.largest_correction_m:.2f} m" if closed else ""
-    refused = len(graph.loops) - closed
+    moved = f", which moved poses by up to {graph.largest_correction_m:.2f} m" if graph.closed else ""
+    refused = len(graph.loops) - graph.closed
     unsure = f" ({refused} more did not convince; {SUMMARY} says why)" if refused else ""
-    return f"{_count(graph.keyframes, 'keyframe')}, {_count(closed, 'loop')} closed{moved}{unsure}"
+    return f"{_count(graph.keyframes, 'keyframe')}, {_count(graph.closed, 'loop')} closed{moved}{unsure}"
 
 
 def _count(number: int, noun: str) -> str:

@@ -6,6 +6,7 @@ from typing import Protocol
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline import ScanResult
+from mapping.global_map import GlobalMap
 
 
 class Viewer(Protocol):
@@ -23,8 +24,8 @@ class Viewer(Protocol):
     def show_map(self, points: FloatArray) -> None:
         """The points (N, 3) of the map so far, in the world."""
 
-    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], map_points: FloatArray) -> None:
-        """Where all scans (N, 3) are once loops are closed, between which scans these are, and the map (M, 3) then."""
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], global_map: GlobalMap) -> None:
+        """Where all scans (N, 3) are once loops are closed, between which scans these are, and the map then."""
 
     def close(self) -> None:
         """The run is over; everything shown is kept."""
@@ -46,7 +47,7 @@ class NullViewer:
     def show_map(self, points: FloatArray) -> None:
         """Nothing."""
 
-    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], map_points: FloatArray) -> None:
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], global_map: GlobalMap) -> None:
         """Nothing."""
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from mapping.graph_config import KeyframeConfig
+from mapping.voxel_table import key_steps, point_keys
 
 # The spacing follows the scene: the median range over this, within these limits.
 _RANGES_APART, _LEAST_M, _MOST_M = 4.0, 0.5, 4.0
@@ -12,8 +13,6 @@ _RANGES_APART, _LEAST_M, _MOST_M = 4.0, 0.5, 4.0
 _CELL_RANGES = 0.1
 # More points than this do not tell more about how much two scans see of one another.
 _COMPARED_POINTS = 1500
-# Cells to either side of the origin: three coordinates share one integer.
-_REACH = 1 << 20
 
 
 class KeyframeSelector:
@@ -50,17 +49,11 @@ class KeyframeSelector:
         points = points[:: max(1, len(points) // _COMPARED_POINTS)]
         if not len(points) or not len(self._cells):
             return 1.0
-        keys = _keys(np.floor(transform_points(T_keyframe_lidar, points) / self._cell_m))
+        keys = point_keys(transform_points(T_keyframe_lidar, points), self._cell_m)
         row = np.searchsorted(self._cells, keys).clip(max=len(self._cells) - 1)
         return float(np.mean(self._cells[row] == keys))
 
     def _grown(self, points: FloatArray) -> NDArray[np.int64]:
         """The cells of points and those that share a face with them, so that noise does not count."""
-        cells = np.floor(points / self._cell_m)
-        steps = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-        return np.concatenate([_keys(cells + step) for step in steps])
-
-
-def _keys(cells: FloatArray) -> NDArray[np.int64]:
-    index = np.clip(cells, -_REACH, _REACH - 1).astype(np.int64) + _REACH
-    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+        steps = key_steps(np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]).astype(np.int64))
+        return np.add.outer(point_keys(points, self._cell_m), steps).ravel()

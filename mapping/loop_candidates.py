@@ -124,12 +124,8 @@ class Keyframes:
         rotation, translation = track.drift(others, index, config)
         distance = np.linalg.norm(track.T_world_lidar[others, :3, 3] - track.T_world_lidar[index, :3, 3], axis=1)
         within = distance < patch.range_m + 2.0 * translation
-        others, rotation, translation, distance = (
-            others[within],
-            rotation[within],
-            translation[within],
-            distance[within],
-        )
+        others = others[within]
+        rotation, translation, distance = (values[within] for values in (rotation, translation, distance))
         if not len(others) or not config.nearby_candidates:
             return
         source = Drawing.of(patch)

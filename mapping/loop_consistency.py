@@ -98,12 +98,6 @@ def beyond_drift(link: Link, track: Track, most_sigmas: float, config: LoopConfi
     return f"corrects {sigmas:.1f} standard deviations of the drift over {way_m:.0f} m"
 
 
-def agree(a: Link, b: Link, track: Track, config: LoopConfig) -> bool:
-    """Whether the circle of two links and the ways between them closes; links of other pairs of sessions never do."""
-    circle = close_circle(a, b, track, config)
-    return circle is not None and circle.closes
-
-
 @dataclass(frozen=True)
 class Circle:
     """Two links and the ways between them: whether they lead back, and how far off they may be, in metres."""

@@ -215,11 +215,12 @@ class SlamGraph:
 
     def _edges_between(self, key: int, T_first_second: FloatArray, way: _Way, scan: GraphScan) -> list[Edge]:
         """From the last keyframe to this one: what the trajectory says, and what the odometry says beside it."""
-        config, mapped = self._config.edges, scan.covariance is not None
+        config, before, now = self._config.edges, self._registered[-1], scan.covariance
+        mapped = now is not None
         covariance = trajectory_covariance(way.length_m, mapped, way.lost, config)
-        if mapped and scan.covariance is not None and self._registered[-1] is not None and not way.lost:
+        if now is not None and before is not None and not way.lost:
             A = adjoint(inverse(T_first_second))
-            covariance = covariance + scan.covariance + A @ self._registered[-1] @ A.T
+            covariance = covariance + now + A @ before @ A.T
         edges = [Edge(key - 1, key, T_first_second, covariance, "refinement" if mapped else "odometry")]
         if mapped and way.T_keyframe_lidar is not None:
             doubted = config.odometry_caution**2 * way.covariance
@@ -236,10 +237,8 @@ class SlamGraph:
         means = submap.means()
         self._store.append(means)
         self._graph.update()
-        points = means.points
-        found = self._detector.add(
-            Submap(index, self._sessions[index], self._keyframe_way_m[index], points), self._graph.poses()
-        )
+        seen = Submap(index, self._sessions[index], self._keyframe_way_m[index], means.points)
+        found = self._detector.add(seen, self._graph.poses())
         self._closures += found
         accepted = [closure for closure in found if closure.verdict == "accepted"]
         for closure in accepted:

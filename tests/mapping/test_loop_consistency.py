@@ -5,10 +5,16 @@ import pytest
 
 from lidarslam.core.geometry import exp, inverse, make_transform
 from mapping.loop_config import LoopConfig
-from mapping.loop_consistency import Link, Track, agree, correction_sigmas
+from mapping.loop_consistency import Link, Track, close_circle, correction_sigmas
 
 CONFIG = LoopConfig()
 SIGMAS = np.array([0.003] * 3 + [0.03] * 3)
+
+
+def agree(a: Link, b: Link, track: Track, config: LoopConfig) -> bool:
+    """Whether the circle of two links closes; links of other pairs of sessions make none."""
+    circle = close_circle(a, b, track, config)
+    return circle is not None and circle.closes
 
 
 @pytest.fixture
