@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from odometry.evidence import EVIDENCE_CHANNELS, PACKED_CHANNELS, evidence, pack
 from odometry.network_config import CorrelationConfig
 from odometry.normals import has_normal
 from odometry.torch_geometry import exp, full_precision, turn_about_z
@@ -122,10 +123,11 @@ class CorrelationNetwork(nn.Module):
         self.encoder = Encoder(config.widths)
         self.sharpness = nn.Parameter(torch.tensor(3.0))
         mixed = config.pair_width
-        self.mix = CircularConv(2 * c + 2 * reach + 1, mixed, (1, 1), (1, 1))
+        self.mix = CircularConv(2 * c + 2 * reach + 1 + EVIDENCE_CHANNELS, mixed, (1, 1), (1, 1))
         self.pair = nn.Sequential(Block(mixed), Block(mixed))
         self.columns = nn.Conv1d(mixed * rows, 2 * mixed, 1)
-        self.head = nn.Sequential(nn.Linear(2 * mixed * 5 + 1, 256), nn.SiLU(), nn.Linear(256, 256), nn.SiLU())
+        described = 5 * (2 * mixed + rows * EVIDENCE_CHANNELS) + 2
+        self.head = nn.Sequential(nn.Linear(described, 256), nn.SiLU(), nn.Linear(256, 256), nn.SiLU())
         self.motion = nn.Linear(256, 6)
         self.confidence = nn.Linear(256, 6)
         for layer in (self.motion, self.confidence):
@@ -133,26 +135,33 @@ class CorrelationNetwork(nn.Module):
             nn.init.normal_(layer.weight, std=1e-3)
 
     def encode(self, points: Tensor, normals: Tensor) -> Tensor:
-        """Features (B, C, H/4, W/4) of scans, points and normals (B, 3, H, W); to be kept between pairs."""
-        features: Tensor = self.encoder(points, normals)
-        return features
+        """What is kept of scans, points and normals (B, 3, H, W), for all pairs they are part of.
+
+        Returns:
+            (B, C + PACKED_CHANNELS, H/4, W/4): features, and the points and normals themselves.
+        """
+        return torch.cat([self.encoder(points, normals), pack(points, normals)], dim=1)
 
     def forward(self, previous: Tensor, current: Tensor) -> Estimate:
-        """The motion between scans with features (B, C, H', W') each."""
+        """The motion between scans of which `encode` gave these."""
+        previous, seen = previous[:, :-PACKED_CHANNELS], previous[:, -PACKED_CHANNELS:]
+        current, seen_now = current[:, :-PACKED_CHANNELS], current[:, -PACKED_CHANNELS:]
         unit_previous, unit_current = (functional.normalize(f, dim=1) for f in (previous, current))
         with full_precision(previous.device):
             turns = self._turn_scores(unit_previous.float(), unit_current.float())  # (B, W')
         shift = turns.argmax(dim=1)
         turned, unit_turned = (_shift_columns(f, shift) for f in (current, unit_current))
-        volume = torch.cat([previous, turned, self._local(unit_previous, unit_turned)], dim=1)
+        with full_precision(previous.device):
+            shown = evidence(seen.float(), _shift_columns(seen_now, shift).float())  # (B, E, H', W')
+        volume = torch.cat([previous, turned, self._local(unit_previous, unit_turned), shown], dim=1)
         x = self.pair(functional.silu(self.mix(volume)))  # (B, M, H', W')
         x = functional.silu(self.columns(x.flatten(1, 2)))  # (B, M, H', W') -> (B, M * H', W') -> (B, 2 M, W')
-        moments = _moments(x)  # (B, 10 M)
-        certainty = (turns.logsumexp(1) - turns.amax(1))[:, None]
-        hidden = self.head(torch.cat([moments, certainty], dim=1))
+        moments = _moments(torch.cat([x, shown.flatten(1, 2)], dim=1))  # (B, 5 (2 M + E H'))
+        certainty, fraction = turns.logsumexp(1) - turns.amax(1), _fraction(turns, shift)
+        hidden = self.head(torch.cat([moments, certainty[:, None], fraction[:, None]], dim=1))
         with full_precision(previous.device):
             hidden = hidden.float()
-            T_turned_curr = _turn(shift + _fraction(turns, shift), turns.shape[1])
+            T_turned_curr = _turn(shift + fraction, turns.shape[1])
             log_sigma = self.confidence(hidden) - 3.0
             return Estimate(exp(self.motion(hidden)) @ T_turned_curr, log_sigma.clamp(*_LOG_SIGMA), turns)
 

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from odometry.correlation import INPUT_CHANNELS, CorrelationNetwork, column_channels
+from odometry.evidence import PACKED_CHANNELS
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
 from odometry.objective import objective
@@ -49,7 +50,7 @@ def yaw_deg(T: Tensor) -> Tensor:
 
 
 def test_the_size_is_the_documented_one(network):
-    assert sum(p.numel() for p in network.parameters()) == 661_317
+    assert sum(p.numel() for p in network.parameters()) == 765_253
 
 
 @pytest.mark.parametrize("columns", [1, 7, -3])
@@ -70,7 +71,7 @@ def test_input_channels_are_about_one_and_empty_pixels_are_zero(scans):
 @torch.no_grad()
 def test_turning_a_scan_shifts_its_features(network, scans, columns):
     features = network.encode(*scans)
-    assert features.shape == (3, 64, 4, FEATURE_COLUMNS)
+    assert features.shape == (3, 64 + PACKED_CHANNELS, 4, FEATURE_COLUMNS)
     shifted = network.encode(*turned(scans, columns))
     torch.testing.assert_close(shifted, features.roll(columns, -1), rtol=0, atol=1e-4)
     assert not torch.allclose(shifted, features, rtol=0, atol=0.1)
@@ -199,7 +200,7 @@ def test_other_sizes(scans):
     network = make(rows=8, widths=(8, 16, 24), pair_width=16, reach=2)
     half = tuple(images[:, :, ::2] for images in scans)
     features = network.encode(*half)
-    assert features.shape == (3, 24, 2, FEATURE_COLUMNS)
+    assert features.shape == (3, 24 + PACKED_CHANNELS, 2, FEATURE_COLUMNS)
     assert network(features[:2], features[1:]).T_prev_curr.shape == (2, 4, 4)
     with pytest.raises(ValidationError, match="multiple of 4"):
         CorrelationConfig(rows=10)
