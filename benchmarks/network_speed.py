@@ -48,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("| network | parameters | wall, ms | CPU, ms | times faster |\n| --- | --- | --- | --- | --- |")
     slowest = None
     for label, name, change in _VARIANTS:
-        count, wall, cpu = _time_network(name, change, options)
+        network = make_network(NetworkConfig(name=name, correlation=CorrelationConfig(rows=options.rows)))
+        count = sum(p.numel() for p in network.parameters())
+        wall, cpu = time_pair(network, options.rows, options.columns, options.repeats, change)
         slowest = slowest or wall
         print(f"| {label} | {count:,} | {wall:.1f} | {cpu:.1f} | {slowest / wall:.1f} |", flush=True)
     print(f"\nStages of the learned odometry, {options.sensor} in an office\n")
@@ -58,19 +60,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
 
 
-def _time_network(name: NetworkName, change: Change, options: argparse.Namespace) -> tuple[int, float, float]:
-    """Parameters, wall and processor milliseconds of one scan and one pair."""
-    sizes = CorrelationConfig(rows=options.rows)
-    network = make_network(NetworkConfig(name=name, correlation=sizes)).eval()
-    points = torch.randn(1, 3, options.rows, options.columns) * 10.0
+def time_pair(
+    network: torch.nn.Module, rows: int, columns: int, repeats: int, change: Change = ""
+) -> tuple[float, float]:
+    """Median wall and processor milliseconds of one scan encoded and one pair compared."""
+    network = network.eval()
+    points = torch.randn(1, 3, rows, columns) * 10.0
     normals = torch.nn.functional.normalize(torch.randn_like(points), dim=1)
     if change == "channels last":
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         points, normals = (x.contiguous(memory_format=torch.channels_last) for x in (points, normals))
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=change == "bfloat16"):
         earlier = network.encode(points, normals)  # type: ignore[operator]
-        wall, cpu = _timed(lambda: network(earlier, network.encode(points, normals)), options.repeats)  # type: ignore[operator]
-    return sum(p.numel() for p in network.parameters()), wall, cpu
+        return _timed(lambda: network(earlier, network.encode(points, normals)), repeats)  # type: ignore[operator]
 
 
 def _stages(options: argparse.Namespace) -> dict[str, Callable[[], object]]:

@@ -33,6 +33,8 @@ class SimulatedConfig(BaseModel):
     recordings: int = Field(0, ge=0)
     scans: int = Field(60, ge=2, description="of each")
     seed: int = Field(0, ge=0)
+    worlds: tuple[str, ...] | None = Field(None, description="of those recordings, only the ones in these; null: all")
+    sensors: tuple[str, ...] | None = Field(None, description="and only the ones of these; null: all")
 
 
 class TrainConfig(BaseModel):

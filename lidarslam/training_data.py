@@ -3,7 +3,7 @@
 import hashlib
 import json
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,12 +11,14 @@ from typing import Any
 
 import torch
 
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.run import in_order
-from lidarslam.simulation.mixture import mixture
+from lidarslam.simulation.mixture import Ingredients, ingredients_of, mixture
+from lidarslam.simulation.sensor_table import SENSORS
+from lidarslam.simulation.worlds.registry import WORLDS
 from lidarslam.train_config import SimulatedConfig
 from odometry.image_config import ImageConfig
 from odometry.preparation import PreparedRecording, prepare
@@ -80,8 +82,30 @@ def recorded(source: Path, reader: ReaderConfig) -> Stretch:
 
 
 def simulated(config: SimulatedConfig) -> list[Stretch]:
-    """The simulated recordings; their worlds are built when they are needed."""
-    return [_simulation(number, config) for number in range(config.recordings)]
+    """The simulated recordings; their worlds are built when they are needed.
+
+    Raises:
+        ConfigError: a world or sensor that they are to be of does not exist, or there is none of that kind.
+    """
+    _require_known("simulated.worlds", config.worlds, WORLDS)
+    _require_known("simulated.sensors", config.sensors, SENSORS)
+    chosen = [number for number in range(config.recordings) if _is_wanted(ingredients_of(number, config.seed), config)]
+    if config.recordings and not chosen:
+        raise ConfigError(
+            f"simulated.recordings={config.recordings}: none is of the worlds and sensors asked for; ask for more"
+        )
+    return [_simulation(number, config) for number in chosen]
+
+
+def _require_known(key: str, names: Iterable[str] | None, known: Iterable[str]) -> None:
+    for name in names or ():
+        if name not in known:
+            raise ConfigError(f"{key}: there is no {name!r}; choose from {', '.join(known)}")
+
+
+def _is_wanted(of: Ingredients, config: SimulatedConfig) -> bool:
+    in_world = config.worlds is None or of.world in config.worlds
+    return in_world and (config.sensors is None or of.sensor in config.sensors)
 
 
 def _simulation(number: int, config: SimulatedConfig) -> Stretch:

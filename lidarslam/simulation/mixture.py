@@ -54,23 +54,46 @@ class Excerpt:
         return self.whole.scans(chosen.start, chosen.stop, chosen.step)
 
 
+@dataclass(frozen=True)
+class Ingredients:
+    """What a recording of a mixture is of, by name."""
+
+    world: str
+    sensor: str
+    carrier: str
+    mount: str
+
+
 def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Excerpt]:
     """Recordings of so many scans each; number i of a seed is the same whatever comes before it."""
     for number in range(first, first + recordings):
         yield _draw(number, scans, seed)
 
 
+def ingredients_of(number: int, seed: int) -> Ingredients:
+    """What a recording of a mixture is of; its world is not built."""
+    return _ingredients(np.random.default_rng([seed, number]), number)
+
+
+def _ingredients(rng: np.random.Generator, number: int) -> Ingredients:
+    return Ingredients(
+        world=list(WORLDS)[number % len(WORLDS)],
+        sensor=_pick(rng, list(SENSORS), _SENSOR_WEIGHTS),
+        carrier=_pick(rng, list(CARRIERS), _CARRIER_WEIGHTS),
+        mount=_pick(rng, list(_MOUNT_WEIGHTS), _MOUNT_WEIGHTS),
+    )
+
+
 def _draw(number: int, scans: int, seed: int) -> Excerpt:
     rng = np.random.default_rng([seed, number])
-    sensor = SENSORS[_pick(rng, list(SENSORS), _SENSOR_WEIGHTS)]
-    carrier = _pick(rng, list(CARRIERS), _CARRIER_WEIGHTS)
-    mount = _pick(rng, list(_MOUNT_WEIGHTS), _MOUNT_WEIGHTS)
+    chosen = _ingredients(rng, number)
+    sensor = SENSORS[chosen.sensor]
     world_seed = _FIRST_SEED * (seed + 1) + number
-    world = build_world(list(WORLDS)[number % len(WORLDS)], world_seed)
-    motion = motion_along_route(carrier, world, world_seed)
+    world = build_world(chosen.world, world_seed)
+    motion = motion_along_route(chosen.carrier, world, world_seed)
     lap = int(motion.duration_s * sensor.rate_hz)
     first = int(rng.integers(max(1, lap - scans)))
-    T_body_lidar = mount_pose(mount, motion.sensor_height_m)
+    T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
     return Excerpt(Simulation(world, sensor, motion, T_body_lidar, first + scans, world_seed), first, scans)
 
 

@@ -15,11 +15,12 @@ from lidarslam import training_data
 from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
+from lidarslam.simulation.mixture import ingredients_of
 from lidarslam.train import execute
 from lidarslam.train_config import SimulatedConfig, TrainConfig, dump_train_yaml, load_train_config, loss_settings
 from lidarslam.train_request import StepReport, TrainNarrator, TrainRequest
 from lidarslam.train_text import format_outcome, format_validation
-from lidarslam.training_data import Stretch, hold_out, prepared, recorded
+from lidarslam.training_data import Stretch, hold_out, prepared, recorded, simulated
 from odometry.checkpoint import load_checkpoint, network_of
 from odometry.loss_config import LossConfig
 from odometry.networks import make_network
@@ -181,6 +182,23 @@ def test_whole_recordings_are_held_out_and_the_end_of_a_single_one() -> None:
     assert hold_out(many, 0.0, seed=0) == (many, [])
     with pytest.raises(InputError, match=r"hold_out=0"):
         hold_out([Stretch("short", {}, lambda: pytest.fail("opened"), 0, 3)], 0.1, seed=0)
+
+
+def test_of_the_simulated_recordings_some_kinds_can_be_chosen() -> None:
+    """Those chosen are the same recordings as among all, so that what was prepared serves again."""
+    everything = simulated(SimulatedConfig(recordings=60))
+    chosen = simulated(SimulatedConfig(recordings=60, worlds=("street", "park"), sensors=("vlp-16", "os1-64")))
+    assert len(everything) == 60
+    numbers = [int(stretch.identity["simulated"]) for stretch in chosen]
+    assert 0 < len(numbers) < 20
+    for number in range(60):
+        of = ingredients_of(number, 0)
+        assert (number in numbers) == (of.world in ("street", "park") and of.sensor in ("vlp-16", "os1-64"))
+    assert all(stretch.identity == everything[number].identity for stretch, number in zip(chosen, numbers, strict=True))
+    with pytest.raises(ConfigError, match=r"simulated\.worlds: there is no 'strete'; choose from street, office"):
+        simulated(SimulatedConfig(recordings=1, worlds=("strete",)))
+    with pytest.raises(ConfigError, match=r"simulated\.recordings=1: none is of the worlds"):
+        simulated(SimulatedConfig(recordings=1, worlds=("park",)))
 
 
 def test_named_losses() -> None:

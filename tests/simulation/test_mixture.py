@@ -9,7 +9,7 @@ import pytest
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.mixture import Excerpt, mixture
+from lidarslam.simulation.mixture import Excerpt, ingredients_of, mixture
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.worlds.registry import WORLDS
 
@@ -109,3 +109,14 @@ def test_another_seed_draws_others(drawn):
 def simulation(excerpt: Excerpt) -> Simulation:
     assert isinstance(excerpt.whole, Simulation)
     return excerpt.whole
+
+
+def test_what_a_recording_is_of_is_known_without_building_it(drawn):
+    for number, excerpt in enumerate(drawn):
+        of = ingredients_of(number, SEED)
+        simulation = excerpt.whole
+        assert isinstance(simulation, Simulation)
+        assert (of.world, of.sensor, of.carrier) == (
+            simulation.world.name, simulation.sensor.name, simulation.motion.name
+        )  # fmt: skip
+        assert of.mount in ("upright", "upside-down", "tilted")
