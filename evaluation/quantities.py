@@ -18,6 +18,7 @@ class Quantity:
         unit: empty for counts.
         digits: after the decimal point.
         lower_is_better: None where neither end is the good one.
+        percent_of: where that stands of which the number is given in percent; None: it is given as it is.
     """
 
     keys: tuple[str, ...]
@@ -25,13 +26,22 @@ class Quantity:
     unit: str
     digits: int
     lower_is_better: bool | None = True
+    percent_of: tuple[str, ...] | None = None
 
     def of(self, result: MethodResult) -> float | None:
         """The number; None where there is none."""
-        value: object = result.to_json()
-        for key in self.keys:
-            value = value.get(key) if isinstance(value, Mapping) else None
-        return float(value) if isinstance(value, int | float) else None
+        entry = result.to_json()
+        value = _look_up(entry, self.keys)
+        if self.percent_of is None or value is None:
+            return value
+        whole = _look_up(entry, self.percent_of)
+        return 100.0 * value / whole if whole else None
+
+
+def _look_up(entry: object, keys: tuple[str, ...]) -> float | None:
+    for key in keys:
+        entry = entry.get(key) if isinstance(entry, Mapping) else None
+    return float(entry) if isinstance(entry, int | float) else None
 
 
 def find_quantity(name: str) -> Quantity:
@@ -68,6 +78,16 @@ def _map(name: str, label: str, unit: str, tolerance_m: str = "", lower_is_bette
 QUANTITIES: dict[str, Quantity] = dict(
     [
         _trajectory("ate_rmse_m", "ATE", "m", 3),
+        (
+            "ate_percent_of_path",
+            Quantity(
+                ("metrics", "trajectory", "ate_rmse_m"),
+                "ATE",
+                "% of path",
+                2,
+                percent_of=("metrics", "trajectory", "length_m"),
+            ),
+        ),
         _trajectory("ate_rotation_rmse_deg", "rotation", "deg", 2),
         _trajectory("rpe_translation_rmse_m", "RPE", "m", 3),
         _trajectory("rpe_rotation_rmse_deg", "RPE rotation", "deg", 3),

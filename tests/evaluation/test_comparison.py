@@ -81,6 +81,8 @@ def test_quantities_are_read_off_the_entry(result: MethodResult) -> None:
     assert find_quantity("kitti_translation_percent").of(result) == pytest.approx(1.0, abs=0.02)
     assert find_quantity("segment_10_translation_percent").of(result) == pytest.approx(1.0, abs=1e-6)
     assert find_quantity("odometry_ms_median").of(result) == 15.0
+    # Errors along a line of 150 m, which is also 150 m long for the truth, are evenly spread from -0.75 to 0.75 m.
+    assert find_quantity("ate_percent_of_path").of(result) == pytest.approx(100.0 * 1.5 / 12**0.5 / 150.0, rel=0.02)
     assert find_quantity("lost_scans").of(result) == 2.0
     assert find_quantity("map_chamfer_m").of(result) is None
     mapped = replace(result, map_metrics={"f_score_percent": {"0.2": 80.0}, "coverage_percent": {"1.0": 90.0}})
