@@ -19,7 +19,8 @@ def align_best(
     """The alignment of one scan on another (B = 1) that explains most, and whether it began from the first guess.
 
     Guesses that differ are tried roughly, of which the best is refined; a later one must do clearly better. Where the
-    scans still agree on too little, steps along the direction in doubt are tried.
+    scans still agree on too little, steps along the direction in doubt are tried; the less likely the first guess makes
+    what is found there, the more must be agreed on for it.
 
     Args:
         guesses: (K, 4, 4) of T_prev_curr, the most likely first.
@@ -33,14 +34,28 @@ def align_best(
     if float(best.explained) >= config.doubtful or not config.search_m:
         return best, is_first
     other = try_instead(best, _along(best, config.search_m), sweeps, config)
-    return (best, is_first) if other is None else (other, False)
+    if other is None or _gain(best, other) <= config.clearly_better * _away(other, guesses[:1], information):
+        return best, is_first
+    return other, False
 
 
 def try_instead(best: Aligned, guesses: Tensor, sweeps: SweepPairs, config: AlignmentConfig) -> Aligned | None:
     """The alignment from the most promising of many guesses (K, 4, 4), if it does clearly better than the best."""
     found = try_guesses(guesses, sweeps, config)
     other = align(found, sweeps, config)
-    return other if float(other.explained) > float(best.explained) + config.clearly_better else None
+    return other if _gain(best, other) > config.clearly_better else None
+
+
+def _gain(best: Aligned, other: Aligned) -> float:
+    return float(other.explained) - float(best.explained)
+
+
+def _away(aligned: Aligned, guess: Tensor, information: Tensor | None) -> float:
+    """How many standard deviations of the guess (1, 4, 4) the motion lies from it; 0 where those are not known."""
+    if information is None:
+        return 0.0
+    away = log(aligned.T_prev_curr @ inverse(guess))[0].to(information)
+    return float((away @ information[0] @ away).sqrt())
 
 
 def _choose(guesses: Tensor, sweeps: SweepPairs, config: AlignmentConfig) -> slice:

@@ -90,8 +90,14 @@ def test_information_is_about_the_first_guess_alone(street, corridor):
     torch.testing.assert_close(held.T_prev_curr, moved(1.0), rtol=0, atol=1e-4)
     other = one_on_the_other(street, torch.cat([REST, moved(1.3)]), firm, search_m=())
     assert wrong_by_m(other) < 0.02
-    searched = one_on_the_other(street, REST, firm)
-    assert wrong_by_m(searched) < 0.02
+
+
+@pytest.mark.parametrize(("sigma_m", "found"), [(0.7, True), (0.03, False)])
+def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m, found):
+    """The motion is 1.4 m from the guess: two standard deviations, or fifty."""
+    information = torch.eye(6)[None] / sigma_m**2
+    searched = one_on_the_other(street, REST, information)
+    assert (wrong_by_m(searched) < 0.02) == found
 
 
 def test_the_best_of_many_guesses_is_found_roughly(street):
