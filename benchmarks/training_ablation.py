@@ -7,7 +7,7 @@ Trains the default network again and again, with equal steps, on parts of one mi
 and one sensor, more worlds, more sensors, and both. Tests every network, alone and without alignment, on other
 recordings of that mixture: of worlds and sensors that are among the training's, of worlds never trained on, of sensors
 never trained on, and of neither. Then networks of several sizes, trained on all, with the time that each takes for a
-scan. Prints Markdown tables; what was prepared and trained already is not done again.
+scan; `--plot` draws error over time. Prints Markdown tables; what was prepared and trained already is not done again.
 """
 
 import argparse
@@ -15,10 +15,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
 from mapping_accuracy import print_row
 from network_speed import time_pair
 
+from evaluation.figures.panel import Panel, draw_panel, scale_ticks, text
+from evaluation.figures.scale import Scale, tick_texts, ticks
+from evaluation.markup import element
 from lidarslam.simulation.mixture import Ingredients, ingredients_of
 from lidarslam.train import execute
 from lidarslam.train_config import SimulatedConfig, TrainConfig
@@ -29,7 +33,7 @@ from odometry.image_config import ImageConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import PairNetwork
 from odometry.preparation import PreparedRecording
-from odometry.training import validate
+from odometry.training import Validation, validate
 from odometry.training_config import TrainingConfig
 
 _WORLDS = ("street", "office", "tunnel", "park")
@@ -56,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="trainings are kept here")
     parser.add_argument("--prepared", type=Path, help="recordings made ready are kept here  [default: in --out]")
     parser.add_argument("--of", choices=("variety", "sizes", "both"), default="both")
+    parser.add_argument("--plot", type=Path, help="an .svg file: sizes, error over time")
     parser.add_argument("--recordings", type=int, default=150, help="of the mixture, to learn from")
     parser.add_argument("--test", type=int, default=42, help="the ones after them, to test on")
     parser.add_argument("--scans", type=int, default=48)
@@ -107,6 +112,7 @@ def _print_sizes(options: argparse.Namespace, tests: dict[str, list[PreparedReco
     print_row(["network", "widths", "parameters", "CPU, ms", "RMS, median: deg; cm"])
     print_row(["---"] * 5)
     data = SimulatedConfig(recordings=options.recordings, scans=options.scans)
+    drawn = []
     for name, size in _SIZES.items():
         label = "all six worlds, all eight sensors" if name == "default" else f"{name} network"
         network = _trained(label, data, NetworkConfig(correlation=size), options)
@@ -114,6 +120,27 @@ def _print_sizes(options: argparse.Namespace, tests: dict[str, list[PreparedReco
         widths = f"{', '.join(map(str, size.widths))}; {size.pair_width}"
         _, cpu_ms = time_pair(network, rows=16, columns=720, repeats=30)
         print_row([name, widths, f"{parameters:,}", f"{cpu_ms:.1f}", _errors(network, everything)])
+        drawn.append((name, cpu_ms, 100.0 * _validated(network, everything).translation_rms_m))
+    if options.plot is not None:
+        options.plot.write_text(_plot(drawn), encoding="utf-8")
+
+
+def _plot(sizes: Sequence[tuple[str, float, float]]) -> str:
+    """Error (cm) over time (ms) as SVG, a dot with its name for each network."""
+    times, errors = (np.array(values) for values in list(zip(*sizes, strict=True))[1:])
+    width, height = 420.0, 220.0
+    x = Scale(0.0, 1.25 * float(times.max()), 0.0, width)
+    y = Scale(0.0, 1.25 * float(errors.max()), height, 0.0)
+    x_values, y_values = ticks(x.low, x.high), ticks(y.low, y.high)
+    panel = Panel(
+        "RMS error of the translation, cm", "Error of networks of several sizes over the time they take", width, height,
+        "processor time for a scan, ms",
+        scale_ticks(x, x_values.tolist(), tick_texts(x_values)),
+        scale_ticks(y, y_values.tolist(), tick_texts(y_values)),
+    )  # fmt: skip
+    dots = [element("circle", cx=x.at(ms), cy=y.at(cm), r=5.0, fill="#0072b2") for _, ms, cm in sizes]
+    names = [text(name, x.at(ms) + 9.0, y.at(cm) + 4.0) for name, ms, cm in sizes]
+    return draw_panel(panel, dots, names)
 
 
 def _trained(name: str, data: SimulatedConfig, network: NetworkConfig, options: argparse.Namespace) -> torch.nn.Module:
@@ -129,11 +156,15 @@ def _trained(name: str, data: SimulatedConfig, network: NetworkConfig, options: 
 
 
 def _errors(network: torch.nn.Module, recordings: Sequence[PreparedRecording]) -> str:
-    found = validate(cast(PairNetwork, network), recordings)
+    found = _validated(network, recordings)
     return (
         f"{found.rotation_rms_deg:.2f}, {found.rotation_median_deg:.2f};"
         f" {100.0 * found.translation_rms_m:.1f}, {100.0 * found.translation_median_m:.1f}"
     )
+
+
+def _validated(network: torch.nn.Module, recordings: Sequence[PreparedRecording]) -> Validation:
+    return validate(cast(PairNetwork, network), recordings)
 
 
 if __name__ == "__main__":
