@@ -5,8 +5,9 @@ import json
 import os
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,10 @@ from lidarslam.core.state import Saved, State
 
 # An .npz file holds a checksum of each of its members, and without its end it is none.
 _TREE, _ARRAY = "tree", "array"
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_DAMAGE = (
+    OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error,
+    MemoryError, OverflowError,  # of an array whose shape is not its own
+)  # fmt: skip
 
 
 def write_state(path: Path, state: State) -> None:
@@ -29,18 +33,30 @@ def write_state(path: Path, state: State) -> None:
     text = json.dumps(_encoded(state, arrays), ensure_ascii=False)
     members = {f"{_ARRAY}{number}": array for number, array in enumerate(arrays)}
     members[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
+    with replacing_for_good(path) as out:
+        np.savez(out, allow_pickle=False, **members)
+
+
+@contextlib.contextmanager
+def replacing_for_good(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to, which takes its name when it is on the disk; the earlier one stays until then.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     partial = path.with_name(f"{path.name}.partial")
     try:
         with partial.open("wb") as out:
-            np.savez(out, allow_pickle=False, **members)  # type: ignore[arg-type] # the stub takes the names for flags
+            yield out
             out.flush()
             os.fsync(out.fileno())
         partial.replace(path)
-        sync_directory(path.parent)
+        _sync_directory(path.parent)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def read_state(path: Path) -> Saved:
@@ -61,7 +77,7 @@ def read_state(path: Path) -> Saved:
     return Saved(values, str(path))
 
 
-def sync_directory(path: Path) -> None:
+def _sync_directory(path: Path) -> None:
     """See that the names in a directory are on the disk, where the system can do that."""
     with contextlib.suppress(OSError):
         handle = os.open(path, os.O_RDONLY)
