@@ -235,7 +235,7 @@ def info(
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.progress import show_progress
-    from lidarslam.run import RunRequest, execute, is_finished
+    from lidarslam.run import RunRequest, execute, lost_when_finished
     from lidarslam.summary_text import format_outcome
 
     if options["resume"] and options["overwrite"]:
@@ -252,9 +252,9 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     config = _resolve(options.pop("config_file"), settings, **reader)
     _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
     request = RunRequest(source, out, config, **options)
-    if request.resume and is_finished(request):
+    if request.resume and (lost := lost_when_finished(request)) is not None:
         click.echo(f"{out}: is finished, nothing is left to do")
-        return
+        ctx.exit(EXIT_LOST if lost else 0)
     with show_progress(source.name) as progress:
         outcome = execute(request, progress)
     click.echo(format_outcome(out, outcome))

@@ -3,12 +3,11 @@
 import hashlib
 import json
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from lidarslam import run_directory as files
 from lidarslam.config import Config, read_yaml
@@ -16,6 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.datasets.recording import Recording
+from lidarslam.scan_order import in_order
 from lidarslam.unfinished import About
 from odometry.interface import Odometry
 
@@ -46,25 +46,26 @@ def describe_computed(config: Config, recording: Recording, run: dict[str, Any],
     return json.loads(json.dumps({**given, "recording": _fingerprint(recording), **tree}))  # type: ignore[no-any-return]
 
 
-def finished_before(out: Path, config: Config, run: dict[str, Any]) -> bool:
-    """Whether a directory holds this very run, with nothing left to do.
+def lost_before(out: Path, config: Config, run: dict[str, Any]) -> int | None:
+    """How many scans this very run lost, if a directory holds it with nothing left to do; None if it does not.
 
     Raises:
         InputError: it holds another one.
     """
     if About.read(out) is not None or not (out / files.CONFIG).is_file() or not (out / files.SUMMARY).is_file():
-        return False
+        return None
     try:
         tree = read_yaml(out / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         was = Config.model_validate(tree).model_dump(exclude=_WITHOUT_EFFECT)
-    except (ConfigError, KeyError, ValueError, yaml.YAMLError):
-        return False
+        lost = int(json.loads((out / files.SUMMARY).read_text(encoding="utf-8"))["lost_scans"])
+    except (ConfigError, OSError, KeyError, TypeError, ValueError):
+        return None
     if was_run != run or was != config.model_dump(exclude=_WITHOUT_EFFECT):
         raise InputError(
             f"{out}: holds a finished run of something else; name another directory, or replace it with --overwrite"
         )
-    return True
+    return lost
 
 
 def scans_left(
@@ -90,17 +91,8 @@ def scans_left(
         scans = iter(recording.scans(chosen.start, chosen.stop, chosen.step))
         return _after(scans, held)
     logger.warning("the odometry is run again over the %d scans before", done + 1)
-    return _after(
-        _estimated_again(in_order(recording.scans(chosen.start, chosen.stop, chosen.step)), held, odometry), held
-    )
-
-
-def in_order(scans: Iterable[Scan], latest: float = -np.inf) -> Iterator[Scan]:
-    """The scans whose stamps increase; no trajectory could hold the others."""
-    for scan in scans:
-        if scan.stamp > latest:
-            latest = scan.stamp
-            yield scan
+    everything = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
+    return _after(_estimated_again(everything, held, odometry), held)
 
 
 def _estimated_again(scans: Iterator[Scan], held: Scan, odometry: Odometry) -> Iterator[Scan]:

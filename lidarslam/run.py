@@ -27,9 +27,10 @@ from lidarslam.localisation import Localiser, OdometryAlone, ScanToMap
 from lidarslam.loop_closing import GraphOutcome, begin_graph, finish_graph, restore_graph
 from lidarslam.pipeline import Pipeline, ScanResult
 from lidarslam.prefetch import prefetch
-from lidarslam.resuming import describe_computed, finished_before, in_order, scans_left
+from lidarslam.resuming import describe_computed, lost_before, scans_left
 from lidarslam.run_directory import RunDirectory
 from lidarslam.scan_log import ScanLog
+from lidarslam.scan_order import in_order
 from lidarslam.summary import RunSummary, summarise
 from lidarslam.unfinished import Unfinished
 from lidarslam.viewer import NullViewer, Viewer
@@ -135,13 +136,13 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     return outcome
 
 
-def is_finished(request: RunRequest) -> bool:
-    """Whether `out` holds this very run already, with nothing left to resume.
+def lost_when_finished(request: RunRequest) -> int | None:
+    """How many scans were lost, if `out` holds this very run with nothing left to resume; None if it does not.
 
     Raises:
         InputError: it holds another one.
     """
-    return finished_before(request.out, request.config, _describe(request))
+    return lost_before(request.out, request.config, _describe(request))
 
 
 def _claim(request: RunRequest, recording: Recording, stack: ExitStack) -> Unfinished | None:

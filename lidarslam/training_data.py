@@ -15,7 +15,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.run import in_order
+from lidarslam.scan_order import in_order
 from lidarslam.simulation.mixture import mixture
 from lidarslam.train_config import SimulatedConfig
 from odometry.image_config import ImageConfig
