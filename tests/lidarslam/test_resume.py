@@ -3,23 +3,30 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from lidarslam.core.scan import Scan
+from lidarslam.cli import main
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.finished_run import load_run
 
 ROOT = Path(__file__).parents[2]
-KILLED = -signal.SIGKILL
+KILL = signal.SIGKILL
+KILLED = -KILL
 
 # Loads the program once, and for every line forks a run of it; told to, that kills itself without further notice as it
 # is about to do something to its directory, or at some time. It counts what it does there.
@@ -43,8 +50,9 @@ def run(order):
             return
         count += 1
         if count == order["kill_at"]:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), order["signal"])
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.addaudithook(see)
     fsync = os.fsync
     os.fsync = lambda handle: (see("fsync", ()), fsync(handle))[1]
@@ -76,6 +84,7 @@ class Ended:
     status: int
     said: str
     events: int
+    seconds: float
 
 
 Run = Callable[..., Ended]
@@ -99,7 +108,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     assert server.stdout.readline() == "ready\n"
 
     def run(
-        source: Path, out: Path, *arguments: str, kill_at: int | None = None, kill_after_s: float | None = None
+        source: Path,
+        out: Path,
+        *arguments: str,
+        kill_at: int | None = None,
+        kill_after_s: float | None = None,
+        signal: int = KILL,
     ) -> Ended:
         order = {
             "arguments": ["run", str(source), "--out", str(out), *arguments],
@@ -107,50 +121,63 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             "log": str(log),
             "kill_at": kill_at,
             "kill_after_s": kill_after_s,
+            "signal": int(signal),
         }
         count = Path(f"{log}.count")
         count.unlink(missing_ok=True)
         server.stdin.write(json.dumps(order) + "\n")
         server.stdin.flush()
+        started = time.monotonic()
         status = int(server.stdout.readline())
-        return Ended(status, log.read_text(), int(count.read_text()) if count.is_file() else -1)
+        events = int(count.read_text()) if count.is_file() else -1
+        return Ended(status, log.read_text(), events, time.monotonic() - started)
 
     yield run
     server.stdin.close()
     server.wait()
 
 
-SCANS = 20
+SCANS = 34
+COVERED = 4
 METHODS = {
-    "constant velocity": ["--odometry", "constant-velocity"],
-    "learned": ["--odometry", "learned"],
-    "odometry alone": ["--odometry", "learned", "--no-mapping"],
+    "constant velocity": ["--odometry", "constant-velocity", "--stop", "12"],
+    "learned": ["--odometry", "learned", "--stop", "10"],
+    "odometry alone": ["--odometry", "learned", "--no-mapping", "--stop", "10"],
     "pose graph": [
         "--odometry", "constant-velocity", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",
         "--set", "pose_graph.loops.min_way_m=0.5", "--set", "pose_graph.loops.min_way_ranges=0",
-        "--set", "pose_graph.loops.alone_ranges=100",
     ],
-    "kiss-icp": ["--odometry", "kiss-icp", "--no-mapping", "--set", "odometry.kiss_icp.threads=1"],
+    "kiss-icp": ["--odometry", "kiss-icp", "--no-mapping", "--set", "odometry.kiss_icp.threads=1", "--stop", "12"],
 }  # fmt: skip
 FAST = ["--set", "checkpoints.every_scans=3", "--set", "global_map.voxel_size_m=0.1", "--set", "mapping.keypoints=800"]
 
 
+def there_and_back(time: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) at times (N,): a loop through the room in three seconds."""
+    phase = 2.0 * np.pi / 3.0 * time
+    ways = np.zeros((*phase.shape, 6))
+    ways[..., 2], ways[..., 3], ways[..., 4] = 0.3 * np.sin(phase), 1.2 * np.sin(phase), 0.6 * (1.0 - np.cos(phase))
+    return exp(np.array([0.0, 0.0, 0.3, -4.0, 0.0, -0.4])) @ exp(ways)
+
+
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
-    """The drive through the room, thinned to a third; one scan is of a covered sensor, and one goes back in time."""
+def source(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
+    """Sweeps of few points along the loop; in one the sensor is covered."""
     folder = tmp_path_factory.mktemp("data") / "room"
     folder.mkdir()
     fields = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
-    for index, scan in enumerate(room_scans[:SCANS]):
-        thin = scan.select(np.arange(0, len(scan), 3))
-        table = np.empty(len(thin), dtype=fields)
-        table["x"], table["y"], table["z"] = thin.points.T
-        table["time"] = thin.time_offsets
-        if index == 9:
+    stamps = 0.1 * np.arange(1, SCANS + 1)
+    few = replace(room, points=3000)
+    for index, stamp in enumerate(stamps):
+        scan = few.sweep(there_and_back, float(stamp))
+        table = np.empty(len(scan), dtype=fields)
+        table["x"], table["y"], table["z"] = scan.points.T
+        table["time"] = scan.time_offsets
+        if index == COVERED:
             table["x"] = np.nan
         np.save(folder / f"{index:06d}.npy", table)
-    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:SCANS], fmt="%.9f")
-    write_tum(folder / "ground_truth.tum", room_truth)
+    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", Trajectory(stamps, there_and_back(stamps)))
     return folder
 
 
@@ -207,7 +234,10 @@ def assert_same(out: Path, expected: Path) -> None:
     assert numbers(out / "summary.json") == numbers(expected / "summary.json")
 
 
-@pytest.mark.parametrize("method", METHODS)
+SLOW = ("learned", "odometry alone", "kiss-icp")  # for their odometry; those with --pose-graph show loops
+
+
+@pytest.mark.parametrize("method", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in METHODS])
 def test_a_killed_run_comes_to_the_same_results(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str
 ) -> None:
@@ -223,3 +253,231 @@ def test_a_killed_run_comes_to_the_same_results(
     first, second = map(int, resumed.removeprefix("the run was resumed 2 times, after ").split(" scans")[0].split(", "))
     assert 0 < first < second < SCANS
     assert resumed in ended.said
+
+
+def test_the_graph_that_is_resumed_has_loops(whole: Callable[[str], Whole]) -> None:
+    """Else the test above would tell nothing about them."""
+    assert json.loads((whole("pose graph").out / "summary.json").read_text())["loop_closures"] > 0
+
+
+def kill_and_resume(run: Run, expected: Whole, source: Path, out: Path, **kill: Any) -> None:
+    """Kill a run, resume it until it is done, and see that it is as it should be."""
+    ended = run(source, out, *expected.arguments, **kill)
+    if ended.status != KILLED:  # it was done before
+        assert ended.status == expected.ended.status, ended.said
+    elif out.exists() and (out / "unfinished" / "run.json").exists():
+        with pytest.raises(InputError, match="did not finish"):
+            load_run(out)
+        ended = run(source, out, *expected.arguments, "--resume")
+    else:  # hardly begun, or just done
+        again = () if (out / "summary.json").exists() else ("--overwrite",)
+        ended = run(source, out, *expected.arguments, *(again or ("--resume",)))
+    assert ended.status == expected.ended.status, ended.said
+    leftover = out / "unfinished"
+    if leftover.exists():  # killed while it was removed: nothing that anybody would take for a run
+        assert not (leftover / "run.json").exists()
+        shutil.rmtree(leftover)
+    assert_same(out, expected.out)
+
+
+EVERYWHERE = 24
+
+
+@pytest.mark.slow  # a fork and two runs for every kill: some two minutes
+@pytest.mark.parametrize("method", ["constant velocity", "pose graph"])
+def test_a_run_may_be_killed_before_anything_it_does_on_disk(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str
+) -> None:
+    expected = whole(method)
+    for event in range(1, expected.ended.events + 1):
+        kill_and_resume(run, expected, source, tmp_path / str(event), kill_at=event)
+
+
+@pytest.mark.slow  # likewise
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_may_be_killed_at_any_time(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, rng: np.random.Generator, method: str
+) -> None:
+    expected = whole(method)
+    for number, delay_s in enumerate(rng.uniform(0.0, 1.2 * expected.ended.seconds, EVERYWHERE)):
+        kill_and_resume(run, expected, source, tmp_path / str(number), kill_after_s=float(delay_s))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.55, 0.8, 0.95])
+def test_a_run_may_be_killed_while_it_writes(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, share: float
+) -> None:
+    """A sample of the slow test above; the last one is killed among its final results."""
+    expected = whole("constant velocity")
+    kill_and_resume(run, expected, source, tmp_path / "run", kill_at=round(share * expected.ended.events))
+
+
+def test_a_run_that_is_stopped_can_be_resumed_as_well(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path
+) -> None:
+    """Ctrl-C comes just as a state is written; what there is can be looked at meanwhile."""
+    expected, out = whole("constant velocity"), tmp_path / "run"
+    ended = run(source, out, *expected.arguments, kill_at=expected.ended.events // 2, signal=signal.SIGINT)
+    assert ended.status == 1
+    assert "interrupted; --resume goes on with it" in ended.said
+    scans = len(load_run(out).trajectory)
+    assert 0 < scans < 12
+    ended = run(source, out, *expected.arguments, "--resume")
+    assert ended.status == expected.ended.status, ended.said
+    assert "stopped after" not in ended.said
+    assert_same(out, expected.out)
+
+
+@pytest.fixture(scope="module")
+def killed_once(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The directory of a run that was killed half way."""
+    expected, out = whole("constant velocity"), tmp_path_factory.mktemp("killed") / "run"
+    assert run(source, out, *expected.arguments, kill_at=expected.ended.events // 2).status == KILLED
+    assert (out / "unfinished" / "state.npz").exists()
+    return out
+
+
+@pytest.fixture
+def killed(killed_once: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(killed_once, tmp_path / "run"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--stop", "13"], "stop 12 (now 13)"),
+        (["--start", "1"], "start 0 (now 1)"),
+        (["--pose-graph"], "pose_graph.enabled False (now True)"),
+        (["--set", "mapping.keypoints=900"], "mapping.keypoints 800 (now 900)"),
+        (["--odometry", "learned"], "odometry.method constant-velocity (now learned)"),
+    ],
+)
+def test_another_run_is_not_resumed(
+    run: Run, whole: Callable[[str], Whole], source: Path, killed: Path, arguments: list[str], told: str
+) -> None:
+    before = contents(killed)
+    ended = run(source, killed, *whole("constant velocity").arguments, *arguments, "--resume")
+    assert ended.status == 1
+    assert told in ended.said
+    assert ended.said.count("\n") == 1
+    assert contents(killed) == before
+
+
+def test_another_recording_is_not_taken_for_it(
+    run: Run, whole: Callable[[str], Whole], source: Path, killed: Path, tmp_path: Path
+) -> None:
+    arguments = whole("constant velocity").arguments
+    other = shutil.copytree(source, tmp_path / "other")
+    ended = run(other, killed, *arguments, "--resume")
+    assert ended.status == 1
+    assert "was begun with source" in ended.said
+    about = killed / "unfinished" / "run.json"
+    about.write_text(about.read_text().replace(str(source), str(other)))
+    (other / "000000.npy").write_bytes((other / "000001.npy").read_bytes())  # it has been dealt with already
+    (other / "ground_truth.tum").unlink()
+    for path in sorted(other.glob("*.npy"))[1:]:
+        table = np.load(path)
+        table["x"] += 0.01
+        np.save(path, table)
+    ended = run(other, killed, *arguments, "--resume")
+    assert ended.status == 1
+    assert "the recording is not what it was" in ended.said
+    assert ended.said.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["state.npz", "scans.csv", "run.json"])
+def test_damage_is_told_in_one_line(
+    run: Run, whole: Callable[[str], Whole], source: Path, killed: Path, name: str
+) -> None:
+    path = killed / "unfinished" / name
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    arguments = whole("constant velocity").arguments
+    ended = run(source, killed, *arguments, "--resume")
+    assert ended.status == 1
+    assert f"{name}: is damaged" in ended.said
+    assert "--overwrite" in ended.said
+    assert ended.said.count("\n") == 1
+    ended = run(source, killed, *arguments, "--overwrite")
+    assert ended.status == whole("constant velocity").ended.status
+    assert_same(killed, whole("constant velocity").out)
+
+
+def test_damaged_submaps_are_told(run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path) -> None:
+    expected, out = whole("pose graph"), tmp_path / "run"
+    assert run(source, out, *expected.arguments, kill_at=expected.ended.events // 2).status == KILLED
+    path = out / "unfinished" / "submaps.bin"
+    path.write_bytes(b"\0" * 1000 + path.read_bytes()[1000:])
+    ended = run(source, out, *expected.arguments, "--resume")
+    assert ended.status == 1
+    assert "submaps.bin: is damaged (submap 0)" in ended.said
+
+
+def test_a_run_killed_before_its_first_state_begins_again(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path
+) -> None:
+    expected, out = whole("constant velocity"), tmp_path / "run"
+    event = 1
+    while not (out / "unfinished" / "run.json").exists():
+        shutil.rmtree(out, ignore_errors=True)
+        event += 1
+        assert run(source, out, *expected.arguments, kill_at=event).status == KILLED
+    assert not (out / "unfinished" / "state.npz").exists()
+    ended = run(source, out, *expected.arguments, "--resume")
+    assert "nothing was saved yet; the run begins from the start" in ended.said
+    assert_same(out, expected.out)
+
+
+def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(
+    run: Run, whole: Callable[[str], Whole], source: Path, killed: Path
+) -> None:
+    arguments = whole("constant velocity").arguments
+    ended = run(source, killed, *arguments)
+    assert ended.status == 1
+    assert "did not finish; go on with it by --resume, or replace it with --overwrite" in ended.said
+    for command in (["evaluate", str(killed)], ["view", str(killed)], ["view", str(killed), "--picture", "x.png"]):
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 1
+        assert f"did not finish; resume it with lidarslam run {source} --out {killed} --resume" in result.stderr
+    whole_run = whole("constant velocity").out
+    result = CliRunner().invoke(main, ["evaluate", str(whole_run), "--reference", str(killed)])
+    assert (result.exit_code, "did not finish" in result.stderr) == (1, True)
+
+
+def test_a_finished_run_is_left_as_it_is(run: Run, whole: Callable[[str], Whole], source: Path) -> None:
+    expected = whole("constant velocity")
+    before = contents(expected.out)
+    ended = run(source, expected.out, *expected.arguments, "--resume")
+    assert ended.status == expected.ended.status
+    assert "is finished, nothing is left to do" in ended.said
+    other = run(source, expected.out, *expected.arguments, "--stop", "5", "--resume")
+    assert other.status == 1
+    assert "holds a finished run of something else" in other.said
+    assert contents(expected.out) == before
+
+
+def test_there_must_be_something_to_resume(run: Run, source: Path, tmp_path: Path) -> None:
+    ended = run(source, tmp_path / "run", "--resume")
+    assert ended.status == 1
+    assert "holds no run to go on with; leave --resume out to begin one" in ended.said
+    assert not (tmp_path / "run").exists()
+    ended = run(source, tmp_path / "run", "--resume", "--overwrite")
+    assert ended.status == 2
+
+
+def test_a_rerun_recording_goes_on_in_a_new_file(
+    run: Run, whole: Callable[[str], Whole], source: Path, killed: Path
+) -> None:
+    ended = run(source, killed, *whole("constant velocity").arguments, "--resume", "--rerun", "save")
+    assert ended.status == whole("constant velocity").ended.status
+    assert "warning: recording.rrd holds the scans from" in ended.said
+    assert (killed / "recording.rrd").stat().st_size > 0
+    assert (killed / "trajectory.tum").read_text() == (whole("constant velocity").out / "trajectory.tum").read_text()
