@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.state import Saved
-from lidarslam.run_directory import ABOUT, FILES, UNFINISHED
+from lidarslam.run_directory import ABOUT, UNFINISHED
 from lidarslam.state_file import read_state, replacing_for_good
 
 _STATE, _ROWS, _SUBMAPS, _LOCK = "state.npz", "scans.csv", "submaps.bin", "lock"
@@ -114,8 +114,8 @@ class Unfinished:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise OutputError(f"{run}: somebody else is at work on this run; wait, or end that first") from None
-            for partial in (path for name in FILES for path in run.glob(f".partial-*-{name}")):
-                partial.unlink()  # of whoever was killed
+            for partial in run.glob(".partial-*"):
+                partial.unlink(missing_ok=True)  # of whoever was killed
             saved = read_state(folder / _STATE) if about is not None and (folder / _STATE).is_file() else None
             unfinished = cls(run, about or About(description), saved)
             was_there = (run / ABOUT).exists()  # and says so of results that are not whole, until others are there

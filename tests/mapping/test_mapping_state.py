@@ -63,7 +63,7 @@ def test_a_map_that_has_forgotten_goes_on(rng: np.random.Generator, through_disk
     from mapping.local_map import LocalMap
 
     def add(local_map: LocalMap, step: int, seed: int) -> None:
-        points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + [2.0 * step, 0.0, 0.0]
+        points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])
         local_map.add(points, np.zeros(3000), points[:200], np.array([2.0 * step, 0.0, 0.0]))
 
     whole = LocalMap(0.3, 6.0)
