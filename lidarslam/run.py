@@ -271,10 +271,11 @@ def _restore(
 def _begin(request: RunRequest, unfinished: Unfinished, log: ScanLog) -> None:
     """From here on the run is at work; of one that was resumed the summary says so."""
     unfinished.begin(len(log) if request.resume else None)
+    was_saved, unfinished.saved = unfinished.saved is not None, None  # what is in use by now need not be held twice
     resumed = unfinished.about.resumed_after
     if not resumed:
         return
-    if unfinished.saved is None:
+    if not was_saved:
         logger.warning("%s: nothing was saved yet; the run begins from the start", request.out)
     elif request.rerun != "off":
         log.warn(f"{files.RERUN} holds the scans from {len(log)} on; lidarslam view shows the whole run")

@@ -133,7 +133,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
                 f"{path}: holds a run that did not finish; go on with it by --resume, or replace it with --overwrite"
             )
         if resume or not present:
-            return present
+            return [*present, *([] if resume else [ABOUT])]
     if not present or resume:
         return present
     listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
@@ -143,7 +143,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
         raise OutputError(
             f"{path}: holds a run already ({listed}); name another directory, or replace it with --overwrite"
         )
-    return present
+    return [*present, *([ABOUT] if (path / ABOUT).exists() else [])]
 
 
 def _is_run(path: Path) -> bool:
