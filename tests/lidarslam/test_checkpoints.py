@@ -255,3 +255,16 @@ def test_what_differs_is_named_and_not_too_much_of_it(tmp_path: Path) -> None:
         Unfinished.claim(tmp_path, other, resume=True),
     ):
         pass
+
+
+def test_results_of_another_command_in_the_place_of_a_killed_run_are_whole(tmp_path: Path) -> None:
+    """A merge saves nothing, and is not taken for the run that was killed there."""
+    with Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
+        unfinished.begin(None)
+    with pytest.raises(RuntimeError), RunDirectory.create(tmp_path, overwrite=True):
+        raise RuntimeError
+    with pytest.raises(InputError, match="did not finish"):
+        require_whole(tmp_path)
+    with RunDirectory.create(tmp_path, overwrite=True):
+        pass
+    require_whole(tmp_path)
