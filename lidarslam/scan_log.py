@@ -5,6 +5,7 @@ import csv
 import os
 import shutil
 import zlib
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State, stack
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline import STAGES, ScanResult
@@ -33,6 +34,18 @@ COLUMNS = (
     *(f"ms_{stage}" for stage in STAGES),
     "message",
 )
+
+
+def _doubles(values: FloatArray | None = None) -> "array[float]":
+    """Numbers (whatever their shape) after one another, and more to come."""
+    numbers = array("d")
+    if values is not None:
+        numbers.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return numbers
+
+
+def _poses(numbers: "array[float]") -> FloatArray:
+    return np.array(numbers).reshape(-1, 4, 4)
 
 
 class _Rows:
@@ -74,17 +87,18 @@ class _Rows:
 
 @dataclass
 class ScanLog:
-    """The scans of a run so far; two poses and a few numbers each, no points."""
+    """The scans of a run so far; two poses and a few numbers each, some 350 bytes, and no points."""
 
     _rows: _Rows
-    stamps: list[float] = field(default_factory=list)
+    stamps: "array[float]" = field(default_factory=_doubles)
     statuses: list[Status] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
-    stage_ms: list[list[float]] = field(default_factory=list)
     points_dropped: int = 0
     warnings: list[str] = field(default_factory=list)
-    _T_world_lidar: list[FloatArray] = field(default_factory=list)
-    _T_odom_lidar: list[FloatArray] = field(default_factory=list)
+    # Numbers after one another: an array of its own for each pose would take twice the memory.
+    _stage_ms: "array[float]" = field(default_factory=_doubles)
+    _T_world_lidar: "array[float]" = field(default_factory=_doubles)
+    _T_odom_lidar: "array[float]" = field(default_factory=_doubles)
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -121,32 +135,32 @@ class ScanLog:
         """
         return {
             "rows": self._rows.state(),
-            "stamps": np.array(self.stamps, dtype=np.float64),
+            "stamps": np.array(self.stamps),
             "statuses": [status.value for status in self.statuses],
             "messages": list(self.messages),
-            "stage_ms": stack([np.array(ms) for ms in self.stage_ms], (len(STAGES),)),
+            "stage_ms": self.stage_ms,
             "points_dropped": self.points_dropped,
             "warnings": list(self.warnings),
-            "T_world_lidar": stack(self._T_world_lidar, (4, 4)),
-            "T_odom_lidar": stack(self._T_odom_lidar, (4, 4)),
+            "T_world_lidar": _poses(self._T_world_lidar),
+            "T_odom_lidar": _poses(self._T_odom_lidar),
         }
 
     @classmethod
     def _restored(cls, out: BinaryIO, saved: Saved) -> "ScanLog":
-        stamps = saved.array("stamps", (None,)).tolist()
+        stamps = saved.array("stamps", (None,))
         statuses, messages = saved.texts("statuses"), saved.texts("messages")
         if not len(stamps) == len(statuses) == len(messages) or not set(statuses) <= {s.value for s in Status}:
             raise saved.refuse(f"{len(stamps)} scans have {len(statuses)} statuses and {len(messages)} messages")
         return cls(
             _Rows.restored(out, saved.part("rows")),
-            stamps,
+            _doubles(stamps),
             [Status(status) for status in statuses],
             messages,
-            saved.array("stage_ms", (len(stamps), len(STAGES))).tolist(),
             saved.integer("points_dropped"),
             saved.texts("warnings"),
-            list(saved.array("T_world_lidar", (len(stamps), 4, 4))),
-            list(saved.array("T_odom_lidar", (len(stamps), 4, 4))),
+            _doubles(saved.array("stage_ms", (len(stamps), len(STAGES)))),
+            _doubles(saved.array("T_world_lidar", (len(stamps), 4, 4))),
+            _doubles(saved.array("T_odom_lidar", (len(stamps), 4, 4))),
         )
 
     def add(self, result: ScanResult) -> None:
@@ -169,10 +183,10 @@ class ScanLog:
         self.stamps.append(result.stamp)
         self.statuses.append(result.status)
         self.messages.append(result.message)
-        self.stage_ms.append(ms)
         self.points_dropped += result.points_dropped
-        self._T_world_lidar.append(result.T_world_lidar)
-        self._T_odom_lidar.append(result.T_odom_lidar)
+        self._stage_ms.extend(ms)
+        self._T_world_lidar.extend(result.T_world_lidar.ravel())
+        self._T_odom_lidar.extend(result.T_odom_lidar.ravel())
 
     def warn(self, message: str) -> None:
         """Keep a sentence for the summary, once."""
@@ -183,17 +197,22 @@ class ScanLog:
         """Take other poses (N, 4, 4), one for each scan, as the final ones."""
         if T_world_lidar.shape != (len(self), 4, 4):
             raise ValueError(f"expected a pose for each of {len(self)} scans, got {T_world_lidar.shape}")
-        self._T_world_lidar = list(T_world_lidar)
+        self._T_world_lidar = _doubles(T_world_lidar)
+
+    @property
+    def stage_ms(self) -> FloatArray:
+        """(N, 6) wall time of each of the `STAGES`."""
+        return np.array(self._stage_ms).reshape(-1, len(STAGES))
 
     @property
     def trajectory(self) -> Trajectory:
         """The final poses."""
-        return Trajectory(np.array(self.stamps), np.array(self._T_world_lidar))
+        return Trajectory(np.array(self.stamps), _poses(self._T_world_lidar))
 
     @property
     def odometry(self) -> Trajectory:
         """The odometry's own poses."""
-        return Trajectory(np.array(self.stamps), np.array(self._T_odom_lidar))
+        return Trajectory(np.array(self.stamps), _poses(self._T_odom_lidar))
 
 
 def _number(value: float | None) -> str:
