@@ -2,33 +2,41 @@
 
     python benchmarks/mapping_memory.py
     python benchmarks/mapping_memory.py --world hall --motion tracked --scans 20000
+    python benchmarks/mapping_memory.py --scans 20000 --columns 200
 
-The scans go straight from the simulator into the pipeline of `lidarslam run`, results are thrown away. Prints a
-Markdown table, a row every `--every` scans: resident memory of the process, cells of the local map, points of the
-global map, scans lost and degraded since the row before, how far the pose is from the truth (the first poses put
-together), and the wall time of a scan, simulator included. Below it, what grew over the second half, by when every
-place has been seen. Linux only: memory is read from /proc.
+The scans go straight from the simulator into the pipeline of `lidarslam run`, which logs them and saves its state now
+and then, in a temporary folder. Prints a Markdown table, a row every `--every` scans: resident memory of the process,
+size of the saved state, cells of the local map, points of the global map, scans lost and degraded since the row before,
+how far the pose is from the truth (the first poses put together), and the wall time of a scan, simulator included.
+Below it, what grew over the second half, by when every place has been seen. Linux only: memory is read from /proc.
 """
 
 import argparse
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from mapping_accuracy import make_simulation, print_row, without_odometry
 
+from lidarslam.checkpoints import Checkpoints
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.localisation import ScanToMap
 from lidarslam.pipeline import Pipeline, ScanResult
 from lidarslam.prefetch import prefetch
+from lidarslam.run_directory import RunDirectory
+from lidarslam.scan_log import ScanLog
 from lidarslam.simulation.carriers import CARRIERS
 from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.scan_patterns import Spinning
 from lidarslam.simulation.sensor_table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.unfinished import Unfinished
 from mapping.config import MappingConfig
 from mapping.mapper import Mapper
 from odometry.registry import make_odometry
@@ -40,6 +48,7 @@ class Sample:
 
     scans: int
     rss_mb: float
+    state_mb: float
     cells: int
     map_points: int
 
@@ -48,23 +57,44 @@ def watch(simulation: Simulation, every: int) -> list[Sample]:
     """Run, and print a row now and then."""
     config = without_odometry(MappingConfig())
     mapper = Mapper(config.mapping)  # as `lidarslam run` makes it, but in reach
-    pipeline = Pipeline(make_odometry(config.odometry), ScanToMap(mapper), config.global_map)
     samples: list[Sample] = []
+    with ExitStack() as stack:
+        directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
+        unfinished = stack.enter_context(Unfinished.claim(directory.path, {}, resume=False))
+        log = stack.enter_context(ScanLog.open(directory, unfinished.rows))
+        keeper = Checkpoints(unfinished, config.checkpoints, lambda: {"log": log.state()}, log.warn)
+        pipeline = Pipeline(make_odometry(config.odometry), ScanToMap(mapper), config.global_map, keeper=keeper)
+        _follow(simulation, every, pipeline, mapper, log, unfinished, samples)
+    return samples
+
+
+def _follow(
+    simulation: Simulation,
+    every: int,
+    pipeline: Pipeline,
+    mapper: Mapper,
+    log: ScanLog,
+    unfinished: Unfinished,
+    samples: list[Sample],
+) -> None:
     statuses: Counter[Status] = Counter()
     started = time.perf_counter()
     for number, result in enumerate(pipeline.run(prefetch(simulation.scans())), 1):
+        log.add(result)
         statuses[result.status] += 1
         if number % every:
             continue
         rss_mb = resident_mb()
         cells = 0 if mapper.local_map is None else len(mapper.local_map)
         points = 0 if pipeline.global_map is None else len(pipeline.global_map.points())
-        sample = Sample(number, rss_mb, cells, points)
+        state_mb = unfinished.state.stat().st_size / 2**20 if unfinished.state.exists() else 0.0
+        sample = Sample(number, rss_mb, state_mb, cells, points)
         samples.append(sample)
         print_row([
             f"{number:,}",
             f"{number / simulation.sensor.rate_hz / simulation.motion.duration_s:.1f}",
             f"{sample.rss_mb:.0f}",
+            f"{sample.state_mb:.1f}",
             f"{cells:,}",
             f"{points:,}",
             str(statuses[Status.LOST]),
@@ -74,7 +104,6 @@ def watch(simulation: Simulation, every: int) -> list[Sample]:
         ])  # fmt: skip
         statuses.clear()
         started = time.perf_counter()
-    return samples
 
 
 def resident_mb() -> float:
@@ -101,7 +130,9 @@ def growth(samples: list[Sample]) -> str:
     return (
         f"From scan {half[0].scans:,} to {half[-1].scans:,}: {half[-1].rss_mb - half[0].rss_mb:+.1f} MB,"
         f" {half[-1].cells - half[0].cells:+,} cells, {half[-1].map_points - half[0].map_points:+,} points;"
-        f" a straight line through the rows rises by {slope([sample.rss_mb for sample in half]):.2f} MB,"
+        f" a straight line through the rows rises by {slope([sample.rss_mb for sample in half]):.2f} MB"
+        f" ({1048.576 * slope([sample.rss_mb for sample in half]):.0f} bytes a scan),"
+        f" {slope([sample.state_mb for sample in half]):.2f} MB of saved state,"
         f" {slope([sample.cells for sample in half]):.0f} cells"
         f" and {slope([sample.map_points for sample in half]):.0f} points every 1,000 scans."
     )
@@ -114,11 +145,29 @@ def main() -> None:
     parser.add_argument("--motion", choices=list(CARRIERS), default="handheld")
     parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
     parser.add_argument("--scans", type=int, default=10_000)
+    parser.add_argument("--columns", type=int, help="of a turn, to make less of a spinning sensor")
     parser.add_argument("--every", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     simulation = make_simulation(arguments.world, arguments.motion, arguments.sensor, arguments.scans, arguments.seed)
-    header = ["scans", "laps", "memory, MB", "cells", "map points", "lost", "degraded", "error, m", "ms a scan"]
+    if arguments.columns is not None:
+        sensor = simulation.sensor
+        if not isinstance(sensor.pattern, Spinning):
+            parser.error(f"--columns: {sensor.name} does not spin")
+        thinner = replace(sensor, pattern=replace(sensor.pattern, columns=arguments.columns))
+        simulation = replace(simulation, sensor=thinner)
+    header = [
+        "scans",
+        "laps",
+        "memory, MB",
+        "state, MB",
+        "cells",
+        "map points",
+        "lost",
+        "degraded",
+        "error, m",
+        "ms a scan",
+    ]
     print_row(header)
     print_row(["---"] * len(header))
     samples = watch(simulation, arguments.every)

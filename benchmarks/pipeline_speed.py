@@ -28,7 +28,8 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.loop_closing import begin_graph, finish_graph
 from lidarslam.methods import parse_method
 from lidarslam.pipeline import Pipeline
-from lidarslam.run import in_order, make_localiser
+from lidarslam.run import make_localiser
+from lidarslam.scan_order import in_order
 from odometry.registry import make_odometry
 
 _KISS = "KISS-ICP's own loop"

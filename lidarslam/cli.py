@@ -198,7 +198,8 @@ def info(
 @main.command(
     epilog="""lidarslam run KITTI --sequence 04 --out runs/04
     lidarslam run office.mcap --out runs/office --rerun save
-    lidarslam run office.mcap --out runs/wheels --prior wheel_odometry.tum"""
+    lidarslam run office.mcap --out runs/wheels --prior wheel_odometry.tum
+    lidarslam run office.mcap --out runs/office --rerun save --resume"""
 )
 @_SOURCE
 @click.option("--out", type=_PATH, required=True, metavar="RUN", help="Directory that the results are written to.")
@@ -221,6 +222,12 @@ def info(
     help="Write a Rerun recording beside the results; spawn opens a window too.",
 )
 @click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on with the run in the directory, which was killed or stopped, to the results that it would have had;"
+    " give all other options as they were.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @_reader_options
 @_config_options
@@ -228,9 +235,11 @@ def info(
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.progress import show_progress
-    from lidarslam.run import RunRequest, execute
+    from lidarslam.run import RunRequest, execute, lost_when_finished
     from lidarslam.summary_text import format_outcome
 
+    if options["resume"] and options["overwrite"]:
+        raise click.UsageError("--resume goes on with a run, --overwrite replaces it; choose one")
     settings = _method_settings(
         options.pop("odometry"),
         options.pop("weights"),
@@ -242,11 +251,15 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
     config = _resolve(options.pop("config_file"), settings, **reader)
     _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    request = RunRequest(source, out, config, **options)
+    if request.resume and (lost := lost_when_finished(request)) is not None:
+        click.echo(f"{out}: is finished, nothing is left to do")
+        ctx.exit(EXIT_LOST if lost else 0)
     with show_progress(source.name) as progress:
-        outcome = execute(RunRequest(source, out, config, **options), progress)
+        outcome = execute(request, progress)
     click.echo(format_outcome(out, outcome))
     if outcome.stopped is not None:
-        click.echo(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", err=True)
+        _tell(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; --resume goes on with it")
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.lost_scans:
         ctx.exit(EXIT_LOST)

@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from lidarslam.checkpoint_config import CheckpointConfig
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run_directory import RUN_SECTION
@@ -50,6 +51,7 @@ class Config(BaseModel):
     pose_graph: SlamGraphConfig = SlamGraphConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
+    checkpoints: CheckpointConfig = CheckpointConfig()
 
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:

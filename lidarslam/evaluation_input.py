@@ -15,6 +15,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
+from lidarslam.unfinished import require_whole
 
 # KITTI's LiDAR turned ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1
@@ -78,6 +79,7 @@ def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
         raise InputError(f"{path}: no such run directory or trajectory file")
     if not path.is_dir():
         return Estimate(read_poses(path), None, map_file, None, Config())
+    require_whole(path)
     if not (path / files.TRAJECTORY_TUM).is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
     own_map = path / files.MAP_PLY
@@ -96,6 +98,7 @@ def read_reference(path: Path, config: ReaderConfig) -> Poses:
     """
     if not path.exists():
         raise InputError(f"{path}: no such trajectory, run directory or recording")
+    require_whole(path)
     if (path / files.TRAJECTORY_TUM).is_file():
         return Poses.of(f"the run {path}", read_tum(path / files.TRAJECTORY_TUM))
     if path.is_dir() or any(reader.recognises(path) for reader in READERS.values()):

@@ -14,6 +14,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
+from lidarslam.unfinished import require_whole
 from mapping.global_map import PointCloud
 
 
@@ -42,6 +43,7 @@ def load_run(path: Path) -> FinishedRun:
     Raises:
         InputError: there is no run, or a file of it is damaged.
     """
+    require_whole(path)
     if not (path / files.TRAJECTORY_TUM).is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
     trajectory = read_tum(path / files.TRAJECTORY_TUM)
@@ -65,6 +67,7 @@ def load_map(path: Path) -> PointCloud:
     file = path / files.MAP_PLY if path.is_dir() else path
     if not path.exists():
         raise InputError(f"{path}: no such file")
+    require_whole(path)
     if not file.is_file() or not file.stat().st_size:
         return PointCloud(np.empty((0, 3)), np.empty((0, 3)))
     _require_cloud(file)

@@ -8,6 +8,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from mapping.deskew import body_velocity, deskew
 from mapping.mapper import Mapper
@@ -30,6 +31,16 @@ class Estimated:
     motion: Motion
     interval_s: float | None
 
+    def state(self) -> State:
+        """All of it."""
+        return {"scan": self.scan.state(), "motion": self.motion.state(), "interval_s": self.interval_s}
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "Estimated":
+        """What was saved."""
+        scan, motion = Scan.restored(saved.part("scan")), Motion.restored(saved.part("motion"))
+        return cls(scan, motion, saved.optional_number("interval_s"))
+
     @property
     def velocity(self) -> FloatArray | None:
         """(6,) between the previous stamp and this one; None when it was not measured."""
@@ -42,6 +53,11 @@ class SweepMotion:
 
     before: FloatArray | None
     after: FloatArray | None
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "SweepMotion":
+        """What was saved, which is all of it."""
+        return cls(saved.optional_array("before", (6,)), saved.optional_array("after", (6,)))
 
     def compensate(self, scan: Scan) -> FloatArray:
         """The scan's points (N, 3) as seen from the pose at its stamp.
@@ -100,6 +116,12 @@ class Localiser(Protocol):
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """The pose of a scan; the one that follows is known already, None after the last."""
 
+    def state(self) -> State:
+        """What it remembers of the scans so far."""
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+
 
 class OdometryAlone:
     """Believes the odometry, unless the scan does not fit the one before."""
@@ -107,6 +129,15 @@ class OdometryAlone:
     def __init__(self, check: ConsistencyCheck) -> None:
         self._check = check
         self._T_odom_lidar = np.eye(4)
+
+    def state(self) -> State:
+        """The pose, and the scan that the next is held against."""
+        return {"T_odom_lidar": self._T_odom_lidar, "check": self._check.state()}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        self._T_odom_lidar = saved.array("T_odom_lidar", (4, 4))
+        self._check.restore(saved.part("check"))
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Chain the motion, and hold the scan against the one before it."""
@@ -139,6 +170,20 @@ class ScanToMap:
         self._mapper = mapper
         self._T_odom_lidar = np.eye(4)
         self._T_world_last = np.eye(4)
+
+    def state(self) -> State:
+        """The poses, and the map."""
+        return {
+            "T_odom_lidar": self._T_odom_lidar,
+            "T_world_last": self._T_world_last,
+            "mapper": self._mapper.state(),
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        self._T_odom_lidar = saved.array("T_odom_lidar", (4, 4))
+        self._T_world_last = saved.array("T_world_last", (4, 4))
+        self._mapper.restore(saved.part("mapper"))
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Refine the odometry's pose; where it measured nothing, the mapper goes on with the motion it saw last."""

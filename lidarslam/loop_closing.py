@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.config import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.state import Saved
 from mapping.g2o import GraphFile
 from mapping.global_map import GlobalMap
 
@@ -75,13 +76,24 @@ class GraphOutcome:
         return tuple(loop for loop in self.loops if loop.accepted)
 
 
-def begin_graph(config: Config, directory: Path | None = None) -> "SlamGraph | None":
-    """A pose graph, when the configuration asks for one; what it puts aside lies in the directory."""
+def begin_graph(config: Config, directory: Path | None = None, file: Path | None = None) -> "SlamGraph | None":
+    """A pose graph, when the configuration asks for one; what it puts aside lies in the directory, or in the file."""
     if not config.pose_graph.enabled:
         return None
     from mapping.slam_graph import SlamGraph
 
-    return SlamGraph(config.pose_graph, directory)
+    return SlamGraph(config.pose_graph, directory, file)
+
+
+def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph":
+    """A pose graph with a state; what it put aside lies in the file.
+
+    Raises:
+        InputError: one of them is damaged.
+    """
+    from mapping.slam_graph import SlamGraph
+
+    return SlamGraph.restored(config.pose_graph, saved, file)
 
 
 def finish_graph(graph: "SlamGraph", scans: int, voxel_size_m: float) -> GraphOutcome | None:

@@ -44,6 +44,7 @@ def decode(text: str) -> RunRequest:
         config=Config.model_validate(values.pop("config")),
         prior=None if prior is None else Path(prior),
         overwrite=True,
+        resumable=False,  # a comparison runs it again, and saving would count as its time
         **values,
     )
 

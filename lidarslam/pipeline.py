@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from lidarslam.localisation import Estimated, Localised, Localiser, SweepMotion
@@ -75,6 +76,14 @@ class _Timed:
     estimated: Estimated
     stage_ms: dict[str, float]
 
+    def state(self) -> State:
+        return {"estimated": self.estimated.state(), "stage_ms": dict(self.stage_ms)}
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "_Timed":
+        ms = saved.part("stage_ms")
+        return cls(Estimated.restored(saved.part("estimated")), {s: ms.number(s) for s in ("read", "odometry")})
+
 
 @dataclass(frozen=True, eq=False)
 class _Compensated:
@@ -84,6 +93,15 @@ class _Compensated:
     motion: SweepMotion
     points: FloatArray
     T_world_lidar: FloatArray
+
+    def state(self) -> State:
+        motion = dict(vars(self.motion))
+        return {**vars(self), "thinned": self.thinned.state(), "motion": motion}
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "_Compensated":
+        thinned, motion = Scan.restored(saved.part("thinned")), SweepMotion.restored(saved.part("motion"))
+        return cls(thinned, motion, saved.array("points", (len(thinned), 3)), saved.array("T_world_lidar", (4, 4)))
 
 
 class Follower(Protocol):
@@ -96,6 +114,16 @@ class Follower(Protocol):
         """The next scan."""
 
 
+class Keeper(Protocol):
+    """Keeps now and then what is needed to go on after the program was killed."""
+
+    def is_due(self) -> bool:
+        """Whether it is time; asked after every scan."""
+
+    def keep(self, pipeline: "Pipeline") -> None:
+        """Keep the pipeline's state; nothing is at work meanwhile, and all results up to here are out."""
+
+
 class Pipeline:
     """Turns a stream of scans into a stream of results and a global map.
 
@@ -103,10 +131,16 @@ class Pipeline:
         odometry, localiser: where scans are.
         config: of the global map.
         graph: follows what comes of it on a thread of its own, and is up to date when the last result has come.
+        keeper: keeps its state now and then.
     """
 
     def __init__(
-        self, odometry: Odometry, localiser: Localiser, config: GlobalMapConfig, graph: Follower | None = None
+        self,
+        odometry: Odometry,
+        localiser: Localiser,
+        config: GlobalMapConfig,
+        graph: Follower | None = None,
+        keeper: Keeper | None = None,
     ) -> None:
         self._odometry = odometry
         self._localiser = localiser
@@ -114,7 +148,39 @@ class Pipeline:
         self._graph = None if graph is None else _Behind(graph)
         self._voxel_size_m = config.voxel_size_m
         self._waiting: _Compensated | None = None
+        self._keeper = keeper
+        self._held: _Timed | None = None  # whose successor is not known yet
+        self._measured_stamp: float | None = None  # of the last scan, unless its motion was only predicted
         self.global_map: GlobalMap | None = None
+
+    @property
+    def held(self) -> Scan | None:
+        """The last scan that was read, while its result waits for the next one."""
+        return None if self._held is None else self._held.estimated.scan
+
+    def state(self) -> State:
+        """What is remembered of the scans so far; to be had by a `Keeper` only, but for the graph's part.
+
+        The odometry's part is None where it has to be given the scans again.
+        """
+        return {
+            "odometry": self._odometry.state(),
+            "localiser": self._localiser.state(),
+            "voxel_size_m": self._voxel_size_m,
+            "waiting": None if self._waiting is None else self._waiting.state(),
+            "held": None if self._held is None else self._held.state(),
+            "measured_stamp": self._measured_stamp,
+            "global_map": None if self.global_map is None else self.global_map.state(),
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, with the scans after the one that was held; not with the odometry's part."""
+        self._localiser.restore(saved.part("localiser"))
+        self._voxel_size_m = saved.optional_number("voxel_size_m")
+        self._waiting = saved.optional("waiting", _Compensated.restored)
+        self._held = saved.optional("held", _Timed.restored)
+        self._measured_stamp = saved.optional_number("measured_stamp")
+        self.global_map = saved.optional("global_map", GlobalMap.restored)
 
     def run(self, scans: Iterable[Scan]) -> Generator[ScanResult, None, None]:
         """Process the scans in order; each result comes while later scans' odometry is at work.
@@ -132,7 +198,7 @@ class Pipeline:
         error: Exception | None = None
         # Matrices here are small: a BLAS of several threads spends its time on waiting, and takes it from the others.
         with threadpool_limits(1, "blas"), ThreadPoolExecutor(max_workers=1, thread_name_prefix="map") as pool:
-            estimates = _with_next(self._estimate(scans))
+            estimates = self._with_next(self._estimate(scans))
             while error is None:
                 try:
                     estimated, following = next(estimates)
@@ -144,6 +210,12 @@ class Pipeline:
                 jobs.append(pool.submit(self._follow, estimated, following))
                 if len(jobs) > _MAX_BEHIND:
                     yield jobs.popleft().result()
+                if self._keeper is not None and following is not None and self._keeper.is_due():
+                    while jobs:
+                        yield jobs.popleft().result()
+                    if self._graph is not None:
+                        self._graph.catch_up()
+                    self._keeper.keep(self)
             while jobs:
                 yield jobs.popleft().result()
         self._add_waiting(Status.OK)
@@ -152,17 +224,33 @@ class Pipeline:
 
     def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Timed]:
         """Read and estimate scan after scan."""
-        measured_stamp: float | None = None  # of the scan before, unless its motion was only predicted
         started = time.perf_counter()
         for scan in scans:
             read = time.perf_counter()
             motion = self._odometry.estimate(scan)
             stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
             measured = motion.failure is None
-            interval_s = scan.stamp - measured_stamp if measured and measured_stamp is not None else None
-            measured_stamp = scan.stamp if measured else None
+            before = self._measured_stamp
+            interval_s = scan.stamp - before if measured and before is not None else None
+            self._measured_stamp = scan.stamp if measured else None
             yield _Timed(Estimated(scan, motion, interval_s), stage_ms)
             started = time.perf_counter()
+
+    def _with_next(self, items: Iterable[_Timed]) -> Iterator[tuple[_Timed, _Timed | None]]:
+        """Each item with the one after it, None after the last."""
+        error: LidarSlamError | None = None
+        try:
+            for item in items:
+                held, self._held = self._held, item
+                if held is not None:
+                    yield held, item
+        except LidarSlamError as reason:  # the last item before it still has its turn
+            error = reason
+        held, self._held = self._held, None
+        if held is not None:
+            yield held, None
+        if error is not None:
+            raise error
 
     def _follow(self, timed: _Timed, following: _Timed | None) -> ScanResult:
         """Everything that follows from a motion: find the pose, compensate the sweep, add to the map."""
@@ -221,28 +309,15 @@ class _Behind:
         while len(self._jobs) > _MAX_BEHIND_GRAPH:
             self._jobs.popleft().result()
 
-    def finish(self) -> None:
+    def catch_up(self) -> None:
         """Wait until all is done; an error of the follower's is raised."""
         while self._jobs:
             self._jobs.popleft().result()
+
+    def finish(self) -> None:
+        """Wait until all is done, for the last time."""
+        self.catch_up()
         self._pool.shutdown()
-
-
-def _with_next(items: Iterable[_Timed]) -> Iterator[tuple[_Timed, _Timed | None]]:
-    """Each item with the one after it, None after the last."""
-    held: _Timed | None = None
-    error: LidarSlamError | None = None
-    try:
-        for item in items:
-            if held is not None:
-                yield held, item
-            held = item
-    except LidarSlamError as reason:  # the last item before it still has its turn
-        error = reason
-    if held is not None:
-        yield held, None
-    if error is not None:
-        raise error
 
 
 def _result(scan: Scan, localised: Localised, points: FloatArray, stage_ms: dict[str, float]) -> ScanResult:

@@ -1,5 +1,6 @@
 """One run on disk: from a source to a run directory."""
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -12,21 +13,26 @@ import numpy as np
 
 from evaluation.trajectory_metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam import run_directory as files
+from lidarslam.checkpoints import Checkpoints
 from lidarslam.config import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, format_tum, read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.localisation import Localiser, OdometryAlone, ScanToMap
-from lidarslam.loop_closing import GraphOutcome, begin_graph, finish_graph
+from lidarslam.loop_closing import GraphOutcome, begin_graph, finish_graph, restore_graph
 from lidarslam.pipeline import Pipeline, ScanResult
 from lidarslam.prefetch import prefetch
+from lidarslam.resuming import describe_computed, lost_before, scans_left
 from lidarslam.run_directory import RunDirectory
 from lidarslam.scan_log import ScanLog
+from lidarslam.scan_order import in_order
 from lidarslam.summary import RunSummary, summarise
+from lidarslam.unfinished import Unfinished
 from lidarslam.viewer import NullViewer, Viewer
 from mapping.config import GlobalMapConfig
 from mapping.g2o import format_g2o
@@ -40,7 +46,11 @@ from odometry.registry import make_odometry
 if TYPE_CHECKING:
     from mapping.slam_graph import SlamGraph
 
+logger = logging.getLogger(__name__)
+
 RerunMode = Literal["off", "save", "spawn"]
+# How the sentence in the summary begins.
+_RESUMED = "the run was resumed "
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,8 @@ class RunRequest:
         rerun: no Rerun recording, one in the run directory, or one there and a window.
         pcd: whether the map is written as .pcd too.
         overwrite: whether an earlier run in `out` is replaced.
+        resume: whether the run in `out`, which was killed or stopped, is gone on with.
+        resumable: whether the state is saved now and then, so that it can be.
     """
 
     source: Path
@@ -68,6 +80,8 @@ class RunRequest:
     rerun: RerunMode = "off"
     pcd: bool = False
     overwrite: bool = False
+    resume: bool = False
+    resumable: bool = True
 
 
 @dataclass(frozen=True)
@@ -92,10 +106,12 @@ Progress = Callable[[int, int, ScanResult], None]
 def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     """Run, and write the run directory.
 
-    A recording that turns out damaged on the way, or an interruption, ends the run with what there is.
+    A recording that turns out damaged on the way, or an interruption, ends the run with what there is. A run that is
+    killed leaves a folder from which it can be resumed to the results it would have had.
 
     Raises:
-        LidarSlamError: the source, the configuration or the output directory is not usable.
+        LidarSlamError: the source, the configuration or the output directory is not usable, or there is nothing to
+            resume.
     """
     require_apart(request.out, request.source)
     config = request.config
@@ -108,15 +124,51 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     with ExitStack() as stack:
         odometry = open_odometry(config, request.prior)
         stack.callback(odometry.close)
-        directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
-        log = stack.enter_context(ScanLog.open(directory))
-        graph = begin_graph(config, directory.path)
-        if graph is not None:
-            stack.callback(graph.close)
+        directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
+        unfinished = _claim(request, recording, stack)
+        log, graph = _log_and_graph(config, directory, unfinished, stack)
         with _viewing(request, recording, directory) as viewer:
-            tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress)
+            tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
             closed = _close_loops(graph, tracked.global_map, log, viewer)
-        return write_results(directory, request, tracked, closed)
+        outcome = write_results(directory, request, tracked, closed)
+    if unfinished is not None:
+        unfinished.end(outcome.stopped is not None)
+    return outcome
+
+
+def lost_when_finished(request: RunRequest) -> int | None:
+    """How many scans were lost, if `out` holds this very run with nothing left to resume; None if it does not.
+
+    Raises:
+        InputError: it holds another one.
+    """
+    return lost_before(request.out, request.config, _describe(request))
+
+
+def _claim(request: RunRequest, recording: Recording, stack: ExitStack) -> Unfinished | None:
+    """What makes a run resumable."""
+    if not request.resumable:
+        return None
+    description = describe_computed(request.config, recording, _describe(request), request.prior)
+    return stack.enter_context(Unfinished.claim(request.out, description, request.resume))
+
+
+def _log_and_graph(
+    config: Config, directory: RunDirectory, unfinished: Unfinished | None, stack: ExitStack
+) -> tuple[ScanLog, "SlamGraph | None"]:
+    """New, or as they were saved."""
+    if unfinished is None:
+        log, graph = stack.enter_context(ScanLog.open(directory)), begin_graph(config, directory.path)
+    elif unfinished.saved is None:
+        log = stack.enter_context(ScanLog.open(directory, unfinished.rows))
+        graph = begin_graph(config, file=unfinished.submaps)
+    else:
+        saved = unfinished.saved
+        log = stack.enter_context(ScanLog.open(directory, unfinished.rows, saved.part("log")))
+        graph = saved.optional("graph", lambda part: restore_graph(config, part, unfinished.submaps))
+    if graph is not None:
+        stack.callback(graph.close)
+    return log, graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,21 +214,74 @@ def track(
     graph: "SlamGraph | None",
     viewer: Viewer,
     progress: Progress,
+    unfinished: Unfinished | None = None,
 ) -> Tracked:
     """Take the chosen scans of a recording through the pipeline, and log them; a graph follows.
 
+    Args:
+        request: what is run.
+        recording, chosen: its source, and which scans of that.
+        odometry, log, graph: for the pipeline; log and graph as they were saved, where the run is resumed.
+        viewer, progress: told of every scan.
+        unfinished: where the state is saved, and was; None: nowhere.
+
     Raises:
         NoScanError: none could be used.
+        InputError: the recording is not the one that the run was begun with.
     """
     config, truth = request.config, _ground_truth(recording, log)
-    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
-    scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
     watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
+    keeper = None if unfinished is None else _keeper(config, unfinished, watch, graph)
+    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, keeper)
+    if unfinished is None or unfinished.saved is None:
+        scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
+    else:
+        scans = _restore(unfinished.saved, pipeline, watch, recording, chosen, odometry)
+    if unfinished is not None:
+        _begin(request, unfinished, log)
     error = _process(pipeline, scans, watch)
     if not len(log):
         why = "" if error is None else f": {_reason(error)}"
         raise NoScanError(f"{request.source}: no scan could be used{why}", isinstance(error, KeyboardInterrupt))
     return Tracked(recording, truth, log, len(chosen), watch.total_ms, pipeline.global_map, error)
+
+
+def _keeper(config: Config, unfinished: Unfinished, watch: "_Watch", graph: "SlamGraph | None") -> Checkpoints:
+    """Saves everything that a run is made of."""
+
+    def rest() -> State:
+        saved = None if graph is None else graph.state()
+        return {"graph": saved, "log": watch.log.state(), "total_ms": np.array(watch.total_ms)}
+
+    return Checkpoints(unfinished, config.checkpoints, rest, watch.log.warn)
+
+
+def _restore(
+    saved: Saved, pipeline: Pipeline, watch: "_Watch", recording: Recording, chosen: range, odometry: Odometry
+) -> Iterator[Scan]:
+    """Go on from a state; the scans that are left."""
+    part, log = saved.part("pipeline"), watch.log
+    pipeline.restore(part)
+    if pipeline.held is None:
+        raise saved.refuse("no scan is held")
+    watch.total_ms = saved.array("total_ms", (len(log),)).tolist()
+    return scans_left(recording, chosen, len(log), pipeline.held, odometry, part)
+
+
+def _begin(request: RunRequest, unfinished: Unfinished, log: ScanLog) -> None:
+    """From here on the run is at work; of one that was resumed the summary says so."""
+    unfinished.begin(len(log) if request.resume else None)
+    was_saved, unfinished.saved = unfinished.saved is not None, None  # what is in use by now need not be held twice
+    resumed = unfinished.about.resumed_after
+    if not resumed:
+        return
+    if not was_saved:
+        logger.warning("%s: nothing was saved yet; the run begins from the start", request.out)
+    elif request.rerun != "off":
+        log.warn(f"{files.RERUN} holds the scans from {len(log)} on; lidarslam view shows the whole run")
+    times = "once" if len(resumed) == 1 else f"{len(resumed)} times"
+    log.warnings = [warning for warning in log.warnings if not warning.startswith(_RESUMED)]
+    log.warn(f"{_RESUMED}{times}, after {', '.join(map(str, resumed))} scans; the peak memory is that of the last part")
 
 
 def write_results(
@@ -207,15 +312,6 @@ def require_apart(out: Path, source: Path) -> None:
         raise OutputError(f"{out}: is the recording itself; name another directory for the run")
 
 
-def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
-    """The scans whose stamps increase; no trajectory could hold the others."""
-    latest = -np.inf
-    for scan in scans:
-        if scan.stamp > latest:
-            latest = scan.stamp
-            yield scan
-
-
 @dataclass
 class _Watch:
     """Everyone who is told of each scan, and the wall time each took, milliseconds."""
@@ -225,13 +321,15 @@ class _Watch:
     truth: Trajectory | None
     progress: Callable[[int, ScanResult], None]
     total_ms: list[float] = field(default_factory=list)
+    _is_truth_shown: bool = False
 
     def see(self, result: ScanResult, global_map: GlobalMap | None) -> None:
         """One more scan is done."""
         index = len(self.log)
-        if index == 0:
-            _show_reference(self.viewer, self.truth, result.stamp)
         self.log.add(result)
+        if not self._is_truth_shown:
+            _show_reference(self.viewer, self.truth, self.log.stamps[0])
+            self._is_truth_shown = True
         self.viewer.show_scan(index, result)
         if global_map is not None and self.viewer.wants_map(index):
             self.viewer.show_map(global_map.points())

@@ -25,6 +25,10 @@ SUMMARY = "summary.json"
 METRICS = "metrics.json"
 RERUN = "recording.rrd"
 
+# A folder that is there while a run is at work, and after it was stopped; `lidarslam.unfinished` knows what it holds.
+UNFINISHED = "unfinished"
+ABOUT = f"{UNFINISHED}/run.json"
+
 FILES = (
     CONFIG,
     TRAJECTORY_TUM,
@@ -49,18 +53,18 @@ class RunDirectory:
 
     @classmethod
     @contextlib.contextmanager
-    def create(cls, path: Path, overwrite: bool = False) -> Iterator["RunDirectory"]:
+    def create(cls, path: Path, overwrite: bool = False, resume: bool = False) -> Iterator["RunDirectory"]:
         """Make the directory, or take over an existing one, for the time of a run.
 
         An earlier run stays as it is until the new one's files take their places; what they leave over is removed when
         the block ends well. A directory made here is removed again when nothing was written to it.
 
         Raises:
-            OutputError: the directory holds a run and `overwrite` is not given, holds files with a run's names that
-                are no run's, or cannot be written.
+            OutputError: the directory holds a run, be it unfinished, and neither `overwrite` nor `resume` is given;
+                holds files with a run's names that are no run's; or cannot be written.
         """
         is_new = not path.exists()
-        directory = cls(path, _earlier_run(path, overwrite))
+        directory = cls(path, _earlier_run(path, overwrite, resume))
         try:
             path.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path, prefix=".partial-"):
@@ -120,11 +124,18 @@ def remove_run(path: Path) -> None:
             path.rmdir()
 
 
-def _earlier_run(path: Path, overwrite: bool) -> list[str]:
+def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
     present = [name for name in FILES if (path / name).exists()]
-    if not present:
-        return []
+    if (path / ABOUT).exists():
+        if not overwrite and not resume:
+            raise OutputError(
+                f"{path}: holds a run that did not finish; go on with it by --resume, or replace it with --overwrite"
+            )
+        if resume or not present:
+            return [*present, *([] if resume else [ABOUT])]
+    if not present or resume:
+        return present
     listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
     if not _is_run(path):
         raise OutputError(f"{path}: holds files that are not those of a run ({listed}); name another directory")
@@ -132,7 +143,7 @@ def _earlier_run(path: Path, overwrite: bool) -> list[str]:
         raise OutputError(
             f"{path}: holds a run already ({listed}); name another directory, or replace it with --overwrite"
         )
-    return present
+    return [*present, *([ABOUT] if (path / ABOUT).exists() else [])]
 
 
 def _is_run(path: Path) -> bool:

@@ -216,7 +216,7 @@ def summarise(
         closed: what its pose graph did to it, if it had one.
     """
     trajectory = log.trajectory
-    stages = {"total": total_ms} | dict(zip(STAGES, np.array(log.stage_ms).T, strict=True))
+    stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
     elapsed_s = sum(total_ms) / 1e3
     return RunSummary(
         scans=len(log),

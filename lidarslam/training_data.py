@@ -15,7 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.run import in_order
+from lidarslam.scan_order import in_order
 from lidarslam.simulation.mixture import Ingredients, ingredients_of, mixture
 from lidarslam.simulation.sensor_table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.state import Saved, State, stack
 
 EdgeKind = Literal["odometry", "refinement", "loop"]
 
@@ -46,6 +47,30 @@ class Edge:
     T_first_second: FloatArray
     covariance: FloatArray
     kind: EdgeKind
+
+
+def edges_state(edges: Sequence[Edge]) -> State:
+    """All of several edges."""
+    return {
+        "ends": np.array([(edge.first, edge.second) for edge in edges], dtype=np.int64).reshape(-1, 2),
+        "T_first_second": stack([edge.T_first_second for edge in edges], (4, 4)),
+        "covariance": stack([edge.covariance for edge in edges], (6, 6)),
+        "kind": [edge.kind for edge in edges],
+    }
+
+
+def restored_edges(saved: Saved) -> list[Edge]:
+    """The edges with a state."""
+    kinds = saved.texts("kind")
+    if not set(kinds) <= set(get_args(EdgeKind)):
+        raise saved.refuse(f"edges are of {set(kinds)}")
+    ends = saved.array("ends", (len(kinds), 2), np.int64).tolist()
+    T_first_second = saved.array("T_first_second", (len(kinds), 4, 4))
+    covariance = saved.array("covariance", (len(kinds), 6, 6))
+    return [
+        Edge(first, second, T, C, cast(EdgeKind, kind))
+        for (first, second), T, C, kind in zip(ends, T_first_second, covariance, kinds, strict=True)
+    ]
 
 
 @dataclass(frozen=True, eq=False)

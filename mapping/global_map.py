@@ -1,12 +1,14 @@
 """The merged map: one averaged point a voxel, so that memory follows the mapped area, not the number of scans."""
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.state import Saved, State
 
 # Three signed voxel coordinates share one 64-bit key; 21 bits reach 52 km at voxels of 5 cm.
 _BITS = 21
@@ -64,6 +66,16 @@ class _Voxels:
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 7), dtype=np.float32))
 
     @classmethod
+    def restored(cls, saved: Saved) -> "_Voxels":
+        keys = saved.array("keys", (None,), np.int64)
+        return cls(keys, saved.array("sums", (len(keys), _COUNT + 1), np.float32))
+
+    @classmethod
+    def join(cls, parts: "Sequence[_Voxels]") -> "_Voxels":
+        """All of them after one another, equal keys not added up."""
+        return cls(np.concatenate([part.keys for part in parts]), np.concatenate([part.sums for part in parts]))
+
+    @classmethod
     def reduce(cls, keys: NDArray[np.int64], sums: NDArray[np.float32]) -> "_Voxels":
         """Add up the rows of equal keys."""
         if not len(keys):
@@ -88,6 +100,22 @@ class GlobalMap:
         self._pending: list[_Voxels] = []
         self._pending_size = 0
         self._lock = threading.Lock()  # a viewer may look while a scan is added
+
+    def state(self) -> State:
+        """The table and what waits to be merged; merging it now would round other sums."""
+        with self._lock:
+            self._pending = [_Voxels.join([_Voxels.empty(), *self._pending])]
+            merged, pending = dict(vars(self._merged)), dict(vars(self._pending[0]))
+        return {"voxel_size_m": self.voxel_size_m, "merged": merged, "pending": pending}
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "GlobalMap":
+        """The map with a state."""
+        restored = cls(saved.number("voxel_size_m"))
+        restored._merged = _Voxels.restored(saved.part("merged"))
+        restored._pending = [_Voxels.restored(saved.part("pending"))]
+        restored._pending_size = len(restored._pending[0].keys)
+        return restored
 
     def add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp."""
@@ -156,11 +184,9 @@ class GlobalMap:
     def _merge(self) -> None:
         if not self._pending:
             return
-        parts = [self._merged, *self._pending]
+        joined = _Voxels.join([self._merged, *self._pending])
         self._pending, self._pending_size = [], 0
-        self._merged = _Voxels.reduce(
-            np.concatenate([part.keys for part in parts]), np.concatenate([part.sums for part in parts])
-        )
+        self._merged = _Voxels.reduce(joined.keys, joined.sums)
 
 
 def _pack(cells: FloatArray) -> NDArray[np.int64]:

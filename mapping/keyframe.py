@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
+from lidarslam.core.state import Saved, State
 from mapping.graph_config import KeyframeConfig
 from mapping.voxel_table import key_steps, point_keys
 
@@ -23,6 +24,21 @@ class KeyframeSelector:
         self._T_world_keyframe: FloatArray | None = None
         self._cells = np.empty(0, dtype=np.int64)
         self._cell_m, self._distance_m = 1.0, _LEAST_M
+
+    def state(self) -> State:
+        """The last keyframe."""
+        return {
+            "T_world_keyframe": self._T_world_keyframe,
+            "cells": self._cells,
+            "cell_m": self._cell_m,
+            "distance_m": self._distance_m,
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self._T_world_keyframe = saved.optional_array("T_world_keyframe", (4, 4))
+        self._cells = saved.array("cells", (None,), np.int64)
+        self._cell_m, self._distance_m = saved.number("cell_m"), saved.number("distance_m")
 
     def is_due(self, T_world_lidar: FloatArray, points: FloatArray) -> bool:
         """Whether a scan with a pose (4, 4) and points (N, 3) in its LiDAR frame should be one; the first is."""

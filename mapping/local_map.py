@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state import Saved, State
 from mapping.patches import FEWEST_POINTS, PatchTable
 from mapping.surfel_grid import SurfelGrid
 from mapping.voxel_table import ABSENT
@@ -81,6 +82,27 @@ class LocalMap:
     def __len__(self) -> int:
         """How many cells are held, all grids together."""
         return sum(len(grid) for grid in (*self._planes, self._lines))
+
+    def state(self) -> State:
+        """All of it."""
+        return {
+            "cell_m": self.cell_m,
+            "radius_m": self._radius_m,
+            "planes": [grid.state() for grid in self._planes],
+            "lines": self._lines.state(),
+            "centre": self._centre,
+        }
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "LocalMap":
+        """The map with a state."""
+        restored = cls(saved.number("cell_m"), saved.number("radius_m"))
+        restored._planes = [SurfelGrid.restored(grid) for grid in saved.parts("planes")]
+        if len(restored._planes) != len(LEVELS):
+            raise saved.refuse(f"{len(restored._planes)} grids of planes instead of {len(LEVELS)}")
+        restored._lines = SurfelGrid.restored(saved.part("lines"))
+        restored._centre = saved.optional_array("centre", (3,))
+        return restored
 
     def add(self, planes: FloatArray, elevations: FloatArray, edges: FloatArray, sensor: FloatArray) -> None:
         """Add a scan.

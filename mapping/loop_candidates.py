@@ -1,6 +1,6 @@
 """Where a new keyframe may lie: beside earlier ones near its estimate, or where earlier ones look like it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.state import Saved, State
 from mapping.loop_config import LoopConfig
 from mapping.loop_consistency import Link, Track, beyond_drift
 from mapping.loop_patch import Patch, make_patch
@@ -79,15 +80,35 @@ class Keyframes:
 
     def add(self, points: FloatArray, way_m: float, session: int, poses: FloatArray) -> None:
         """Take the next keyframe: its submap (N, 3), way and session, and the present estimates (K, 4, 4) of all."""
-        config, track = self._config, self.track
+        track = self.track
+        self._keep(points)
+        self.track = Track(
+            np.asarray(poses, dtype=np.float64), np.append(track.way_m, way_m), np.append(track.session, session)
+        )
+
+    def state(self) -> State:
+        """The present estimates; what is kept of submaps follows from them."""
+        track = self.track
+        return {"T_world_lidar": track.T_world_lidar, "way_m": track.way_m, "session": track.session}
+
+    def restore(self, saved: Saved, submaps: Iterable[FloatArray]) -> None:
+        """Go on from a state, and the points (N, 3) of all submaps there were."""
+        for points in submaps:
+            self._keep(points)
+        count = len(self)
+        self.track = Track(
+            saved.array("T_world_lidar", (count, 4, 4)),
+            saved.array("way_m", (count,)),
+            saved.array("session", (count,), np.int64),
+        )
+
+    def _keep(self, points: FloatArray) -> None:
+        config = self._config
         patch = make_patch(points, config.min_range_m, config.max_range_m, config.cells_per_range, config.max_points)
         if self._radius_m is None and len(patch):
             self._radius_m = _RADIUS_PER_RANGE * patch.range_m
         self._places.add(Drawing.of(patch).signature(self.radius_m))
         self.patches.append(patch)
-        self.track = Track(
-            np.asarray(poses, dtype=np.float64), np.append(track.way_m, way_m), np.append(track.session, session)
-        )
 
     def place(self, index: int) -> Place:
         """A keyframe with those before and after it."""

@@ -4,16 +4,20 @@ Precision comes before recall: a false closure tears a map apart, a missed one l
 cannot explain is not believed within a session; where tracking was lost, go on with a new session number.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state import Saved, State, stack
 from mapping.loop_candidates import Candidate, FoundBy, Keyframes, most_sigmas
 from mapping.loop_config import LoopConfig
 from mapping.loop_consistency import Link, beyond_drift, close_circle
 from mapping.loop_verification import Verification, verify
+
+Verdict = Literal["accepted", "rejected"]
 
 # Circles that may be off by more than this, of the median range, tell nothing.
 _TELLING_RANGES = 0.25
@@ -22,6 +26,10 @@ _OUTVOTED = 3
 _RIVALS = 5
 # A closure is held against at most so many of those before it.
 _MEMORY = 40
+# What is saved of a closure beside its arrays.
+_COLUMNS = (
+    "first", "second", "overlap", "residual_m", "inlier_ratio", "found_by", "consistent", "verdict", "reason",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +74,39 @@ class LoopClosure:
     inlier_ratio: float
     found_by: FoundBy
     consistent: int
-    verdict: Literal["accepted", "rejected"]
+    verdict: Verdict
     reason: str
 
     @property
     def link(self) -> Link:
         """As consistency sees it."""
         return Link(self.first, self.second, self.T_first_second, self.covariance)
+
+
+def closures_state(closures: Sequence[LoopClosure]) -> State:
+    """All of several closures, column by column: an array of them is written sooner than arrays of each."""
+    state: State = {name: [getattr(closure, name) for closure in closures] for name in _COLUMNS}
+    state["T_first_second"] = stack([closure.T_first_second for closure in closures], (4, 4))
+    state["covariance"] = stack([closure.covariance for closure in closures], (6, 6))
+    return state
+
+
+def restored_closures(saved: Saved) -> list[LoopClosure]:
+    """The closures with a state."""
+    firsts = saved.integers("first")
+    T_first_second = saved.array("T_first_second", (len(firsts), 4, 4))
+    covariance = saved.array("covariance", (len(firsts), 6, 6))
+    found_by, verdicts = saved.texts("found_by"), saved.texts("verdict")
+    if not (set(found_by) <= set(get_args(FoundBy)) and set(verdicts) <= set(get_args(Verdict))):
+        raise saved.refuse(f"closures found by {set(found_by)} were {set(verdicts)}")
+    columns = (
+        firsts, saved.integers("second"), T_first_second, covariance, saved.numbers("overlap"),
+        saved.numbers("residual_m"), saved.numbers("inlier_ratio"), found_by, saved.integers("consistent"), verdicts,
+        saved.texts("reason"),
+    )  # fmt: skip
+    if {len(column) for column in columns} != {len(firsts)}:
+        raise saved.refuse("closures have columns of several lengths")
+    return [LoopClosure(*values) for values in zip(*columns, strict=True)]
 
 
 class LoopDetector:
@@ -88,6 +122,20 @@ class LoopDetector:
     def nbytes(self) -> int:
         """Memory of what is kept."""
         return self._kept.nbytes
+
+    def state(self) -> State:
+        """The closures, and the estimates of keyframes; not what is kept of their submaps."""
+        return {
+            "keyframes": self._kept.state(),
+            "accepted": closures_state(self._accepted),
+            "pending": closures_state(self._pending),
+        }
+
+    def restore(self, saved: Saved, submaps: Iterable[FloatArray]) -> None:
+        """Go on from a state, and the points (N, 3) of all submaps there were."""
+        self._kept.restore(saved.part("keyframes"), submaps)
+        self._accepted = restored_closures(saved.part("accepted"))
+        self._pending = restored_closures(saved.part("pending"))
 
     def add(self, submap: Submap, poses: FloatArray) -> list[LoopClosure]:
         """Take the next keyframe, and say which closures are decided by now.

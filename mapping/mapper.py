@@ -9,6 +9,8 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved
+from lidarslam.core.state import State as Tree
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
@@ -79,6 +81,32 @@ class Mapper:
     def local_map(self) -> LocalMap | None:
         """What scans are laid on; None before the first."""
         return self._map
+
+    def state(self) -> Tree:
+        """The map, the last scan, and what is supposed of the next."""
+        return {
+            "sampler": self._sampler.state(),
+            "map": None if self._map is None else self._map.state(),
+            "last": None if self._state is None else dict(vars(self._state)),
+            "carrier": dict(vars(self._carrier)),
+            "expected_error_m": self._expected_error_m,
+            "lost_in_a_row": self._lost_in_a_row,
+            "was_degraded": self._was_degraded,
+            "first": None if self._first is None else self._first.state(),
+            "has_velocity": self._has_velocity,
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        self._sampler.restore(saved.part("sampler"))
+        self._map = saved.optional("map", LocalMap.restored)
+        self._state = saved.optional("last", State.restored)
+        self._carrier = Carrier.restored(saved.part("carrier"))
+        self._expected_error_m = saved.number("expected_error_m")
+        self._lost_in_a_row = saved.integer("lost_in_a_row")
+        self._was_degraded = saved.flag("was_degraded")
+        self._first = saved.optional("first", SampledScan.restored)
+        self._has_velocity = saved.flag("has_velocity")
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Lay the next scan on the map, and add it."""

@@ -8,15 +8,16 @@ joins two, only the first of the two stays held. False loops that agree with one
 there, are believed; so is a single loop between two sessions, which nothing contradicts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state import Saved, State, stack
 from mapping.edge_residuals import EdgeResiduals, bounded
-from mapping.g2o import Edge
+from mapping.g2o import Edge, edges_state, restored_edges
 from mapping.graduation import decide
 from mapping.pose_graph_config import PoseGraphConfig
 from mapping.sessions import Sessions
@@ -24,6 +25,8 @@ from mapping.sessions import Sessions
 # Levenberg-Marquardt ends when a step gains a smaller share of the error: while loops are decided upon, and at last.
 _NEARLY = 1e-4
 _CONVERGED = 1e-9
+# What is kept in mind of all that was done to a graph: iSAM2's linearisations depend on when it was asked for what.
+_POSE, _EDGE, _UPDATE, _LOOK, _LOOK_AT_ALL, _OPTIMISE = range(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,32 @@ class PoseGraph:
         self._taken_in = (0, 0)  # poses and edges, by iSAM2
         self._weights: FloatArray | None = None  # (E,) of edges, while the last optimisation stands
         self._marginals: gtsam.ISAM2 | None = None
+        self._added: list[FloatArray] = []  # poses as they were added
+        self._done: list[tuple[int, int]] = []  # what, and with which key or edge
+
+    def state(self) -> State:
+        """What was added, and the order in which that and all else was done."""
+        return {
+            "keys": np.array(self._keys, dtype=np.int64),
+            "added": stack(self._added, (4, 4)),
+            "edges": edges_state(self._edges),
+            "done": np.array(self._done, dtype=np.int64).reshape(-1, 2),
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first pose: do again all that was done, which gives the same numbers."""
+        keys, edges = saved.array("keys", (None,), np.int64).tolist(), restored_edges(saved.part("edges"))
+        added = dict(zip(keys, saved.array("added", (len(keys), 4, 4)), strict=True))
+        try:
+            for what, which in saved.array("done", (None, 2), np.int64).tolist():
+                if what == _POSE:
+                    self.add_pose(which, added[which])
+                elif what == _EDGE:
+                    self._append(edges[which])
+                else:
+                    _DO_AGAIN[what](self, which)
+        except (KeyError, IndexError, ValueError) as error:
+            raise saved.refuse(f"a pose graph that cannot have been: {error}") from error
 
     def add_pose(self, key: int, T_world_lidar: FloatArray) -> None:
         """Add a pose with its initial value (4, 4), best one that follows from `pose` of the last.
@@ -68,6 +97,8 @@ class PoseGraph:
         if key < 0 or (self._keys and key <= self._keys[-1]):
             raise ValueError(f"keys must increase from 0 on, got {key} after {self._keys[-1:]}")
         self._keys.append(key)
+        self._added.append(T_world_lidar)
+        self._done.append((_POSE, key))
         self._sessions.add(key)
         self._values.insert(key, gtsam.Pose3(T_world_lidar))
         self._marginals = None
@@ -82,12 +113,17 @@ class PoseGraph:
             raise ValueError(f"an edge joins two poses that were added, got {edge.first} and {edge.second}")
         if not np.isfinite(edge.T_first_second).all():
             raise ValueError(f"the motion from {edge.first} to {edge.second} must be finite")
-        self._edges.append(replace(edge, covariance=bounded(edge.covariance, self._config)))
+        self._append(replace(edge, covariance=bounded(edge.covariance, self._config)))
+
+    def _append(self, edge: Edge) -> None:
+        self._done.append((_EDGE, len(self._edges)))
+        self._edges.append(edge)
         self._sessions.join(edge.first, edge.second)
         self._weights = self._marginals = None
 
     def update(self) -> None:
         """Take in what was added since the last update."""
+        self._done.append((_UPDATE, 0))
         poses, edges = self._taken_in
         joined = any(self._sessions.first(key) != key for key in self._held)
         if self._isam is None or joined:
@@ -123,12 +159,14 @@ class PoseGraph:
 
     def pose(self, key: int) -> FloatArray:
         """The best that is known of one pose, (4, 4); quicker than all of them."""
+        self._done.append((_LOOK, key))
         known = self._isam_knows_better and self._isam is not None and self._isam.valueExists(key)
         pose = self._isam.calculateEstimatePose3(key) if known else self._values.atPose3(key)  # type: ignore[union-attr]
         return np.asarray(pose.matrix(), dtype=np.float64)
 
     def poses(self) -> FloatArray:
         """The best that is known, (N, 4, 4) in the order of keys: as optimised, as updated, or as added."""
+        self._done.append((_LOOK_AT_ALL, 0))
         self._catch_up()
         return _matrices(self._values)
 
@@ -139,7 +177,9 @@ class PoseGraph:
 
     def optimise(self) -> Optimised:
         """Optimise all poses together, and decide which loops to believe; the next update goes on from there."""
-        before, start = self.poses(), self._values
+        self._done.append((_OPTIMISE, 0))
+        self._catch_up()
+        before, start = _matrices(self._values), self._values
         residuals = EdgeResiduals(self._edges, self._keys)
         loops = np.array([edge.kind == "loop" for edge in self._edges], dtype=bool)
 
@@ -164,7 +204,7 @@ class PoseGraph:
         were not believed say nothing; before the first optimisation, or since something was added, those say little
         that are far off.
         """
-        self._catch_up()
+        self.poses()
         if self._marginals is None:
             self._marginals = gtsam.ISAM2(_isam_parameters(self._config))
             self._marginals.update(self._graph(self._weights), self._values)
@@ -204,6 +244,14 @@ class PoseGraph:
             kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(self._config.loop_kernel_sigmas)
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)
         return gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise)
+
+
+_DO_AGAIN: dict[int, Callable[[PoseGraph, int], object]] = {
+    _UPDATE: lambda graph, _: graph.update(),
+    _LOOK: lambda graph, key: graph.pose(key),
+    _LOOK_AT_ALL: lambda graph, _: graph.poses(),
+    _OPTIMISE: lambda graph, _: graph.optimise(),
+}
 
 
 def _isam_parameters(config: PoseGraphConfig) -> gtsam.ISAM2Params:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
+from lidarslam.core.state import Saved
 from mapping.config import MappingConfig
 
 # Accelerations of carriers, one standard deviation, rotation about each axis and translation along it: what is
@@ -64,6 +65,17 @@ class State:
         return cls(stamp, np.eye(4), np.zeros(6) if velocity is None else velocity, np.diag(sigmas**2))
 
     @classmethod
+    def restored(cls, saved: Saved) -> "State":
+        """What was saved, which is all of it."""
+        return cls(
+            saved.number("stamp"),
+            saved.array("T_world_lidar", (4, 4)),
+            saved.array("velocity", (6,)),
+            saved.array("covariance", (12, 12)),
+            saved.number("seen_until_s"),
+        )
+
+    @classmethod
     def astray(cls, stamp: float, T_world_lidar: FloatArray, velocity: FloatArray) -> "State":
         """Somewhere near here, moving anyhow."""
         sigmas = np.concatenate([_ASTRAY, _ANY_VELOCITY])
@@ -81,6 +93,11 @@ class Carrier:
 
     rotation: float = _USUAL[0]
     translation: float = _USUAL[1]
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "Carrier":
+        """What was saved, which is all of it."""
+        return cls(saved.number("rotation"), saved.number("translation"))
 
     @property
     def acceleration(self) -> FloatArray:

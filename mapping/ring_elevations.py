@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state import Saved
 
 # Histogram of elevations: fine beside the third of a degree between the lasers of dense sensors.
 _BIN_DEG = 0.02
-_BINS = round(180.0 / _BIN_DEG)
+BINS = round(180.0 / _BIN_DEG)
 # A bin belongs to a laser when it holds this share of what the fullest within a degree holds; the rest is strays.
 _LEAST_SHARE = 0.02
 _AROUND = round(1.0 / _BIN_DEG)
@@ -40,6 +41,12 @@ class ElevationTable:
     lowest: float
     cells_per_unit: float
 
+    @classmethod
+    def restored(cls, saved: Saved) -> "ElevationTable":
+        """What was saved, which is all of it."""
+        labels = saved.array("labels", (_CELLS,), np.int16)
+        return cls(labels, saved.number("lowest"), saved.number("cells_per_unit"))
+
     def rings(self, points: FloatArray) -> NDArray[np.int16]:
         """The ring (N,) of each point (N, 3), -1 where none fits."""
         x, y, z = points.T.astype(np.float32)
@@ -60,13 +67,13 @@ class ElevationTable:
 def elevation_histogram(points: FloatArray) -> NDArray[np.int64]:
     """How many of the points (N, 3), the nearest of each degree left out, lie in each bin of elevation."""
     elevations = np.rad2deg(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-    bins = np.clip(((elevations + 90.0) / _BIN_DEG).astype(np.int64), 0, _BINS - 1)
+    bins = np.clip(((elevations + 90.0) / _BIN_DEG).astype(np.int64), 0, BINS - 1)
     # The nearest of each degree: low lasers meet the ground near by only.
     order = np.lexsort((np.linalg.norm(points, axis=1), bins // _AROUND))
-    counts = np.bincount(bins // _AROUND, minlength=_BINS // _AROUND)
+    counts = np.bincount(bins // _AROUND, minlength=BINS // _AROUND)
     rank = np.arange(len(points)) - np.repeat(np.cumsum(counts) - counts, counts)
     far = order[rank >= _NEAR_SHARE * np.repeat(counts, counts)]
-    return np.bincount(bins[far], minlength=_BINS)
+    return np.bincount(bins[far], minlength=BINS)
 
 
 def elevation_table(histogram: NDArray[np.int64]) -> ElevationTable | None:
@@ -84,7 +91,7 @@ def elevation_table(histogram: NDArray[np.int64]) -> ElevationTable | None:
     too_wide = ((last - first) * _BIN_DEG > _WIDEST_DEG).any()
     if len(first) > _MOST_RINGS or too_wide or strays > _MOST_STRAYS or (len(first) > 1 and covered > _MOST_COVERED):
         return None
-    held = histogram * np.arange(_BINS)
+    held = histogram * np.arange(BINS)
     centres = np.add.reduceat(held, edges)[::2] / np.add.reduceat(histogram, edges)[::2]
     return _table((centres + 0.5) * _BIN_DEG - 90.0)
 

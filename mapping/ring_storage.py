@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state import Saved
 
 # Rings have more points than this on average, and there are no more of them.
 _FEWEST_POINTS = 50
@@ -28,6 +29,11 @@ class StorageOrder:
 
     seam: float
     sense: int
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "StorageOrder":
+        """What was saved, which is all of it."""
+        return cls(saved.number("seam"), saved.integer("sense"))
 
     def rings(self, points: FloatArray) -> NDArray[np.int16]:
         """The ring (N,) of each point (N, 3), numbered as stored."""

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from mapping.ring_elevations import ElevationTable, elevation_histogram, elevation_table
+from lidarslam.core.state import Saved, State
+from mapping.ring_elevations import BINS, ElevationTable, elevation_histogram, elevation_table
 from mapping.ring_storage import StorageOrder, storage_order
 
 Rings = NDArray[np.integer]
@@ -50,6 +51,25 @@ class RingFinder:
     def source(self) -> RingSource | None:
         """Where the rings come from; None before there was a scan to tell."""
         return self._source
+
+    def state(self) -> State:
+        """How rings are found, and what is known of the lasers."""
+        return {
+            "source": None if self._source is None else self._source.name,
+            "histogram": self._histogram,
+            "table": None if self._table is None else dict(vars(self._table)),
+            "order": None if self._order is None else dict(vars(self._order)),
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        source = saved.optional_text("source")
+        if source is not None and source not in RingSource.__members__:
+            raise saved.refuse(f"rings come from {source}")
+        self._source = None if source is None else RingSource[source]
+        self._histogram = saved.optional_array("histogram", (BINS,), np.int64)
+        self._table = saved.optional("table", ElevationTable.restored)
+        self._order = saved.optional("order", StorageOrder.restored)
 
     def rings(self, points: FloatArray, rings: Rings | None) -> Rings | None:
         """The ring (N,) of each of the points (N, 3), -1 for strays; None for sensors without rings.

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.thinning import one_per_cell
 from mapping.config import MappingConfig
 from mapping.features import extract_features
@@ -51,6 +52,30 @@ class SampledScan:
     def __len__(self) -> int:
         return len(self.points)
 
+    def state(self) -> State:
+        """All of it."""
+        names = ("stamp", "cell_m", "range_m", "points", "elevations", "times", "keys", "edges", "edge_times")
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "SampledScan":
+        """The sample with a state."""
+        points, edges = saved.array("points", (None, 3)), saved.array("edges", (None, 3))
+        keys = saved.array("keys", (None,), np.intp)
+        if len(keys) and not 0 <= keys.min() <= keys.max() < len(points):
+            raise saved.refuse(f"keys go beyond {len(points)} points")
+        return cls(
+            saved.number("stamp"),
+            saved.number("cell_m"),
+            saved.number("range_m"),
+            points,
+            saved.array("elevations", (len(points),)),
+            saved.optional_array("times", (len(points),)),
+            keys,
+            edges,
+            saved.optional_array("edge_times", (len(edges),)),
+        )
+
     @property
     def seen_until_s(self) -> float:
         """From the stamp to the last point; 0 when the scan is compensated already."""
@@ -71,6 +96,15 @@ class Sampler:
         self._rings = RingFinder()
         self._cell_range_m = 0.0  # the median range that the cell size was chosen for
         self._range_m = 0.0
+
+    def state(self) -> State:
+        """The scale of the scene, and how rings are found."""
+        return {"cell_range_m": self._cell_range_m, "range_m": self._range_m, "rings": self._rings.state()}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self._cell_range_m, self._range_m = saved.number("cell_range_m"), saved.number("range_m")
+        self._rings.restore(saved.part("rings"))
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""

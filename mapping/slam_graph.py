@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
+from lidarslam.core.state import Saved, State, stack
 from mapping.correction import corrected
-from mapping.g2o import Edge, GraphFile
+from mapping.g2o import Edge, GraphFile, edges_state, restored_edges
 from mapping.global_map import GlobalMap
 from mapping.graph_config import SlamGraphConfig, TrajectoryEdgeConfig
 from mapping.graph_scan import GraphScan
 from mapping.keyframe import KeyframeSelector
-from mapping.loop_closure import LoopClosure, LoopDetector, Submap
+from mapping.loop_closure import LoopClosure, LoopDetector, Submap, closures_state, restored_closures
 from mapping.pose_graph import PoseGraph
 from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
@@ -69,6 +70,12 @@ class _Way:
         self.length_m = 0.0
         self.lost = False
 
+    def restore(self, saved: Saved) -> None:
+        """Go on from what was saved, which is all of it."""
+        self.T_keyframe_lidar = saved.optional_array("T_keyframe_lidar", (4, 4))
+        self.covariance = saved.array("covariance", (6, 6))
+        self.length_m, self.lost = saved.number("length_m"), saved.flag("lost")
+
     def go(self, scan: GraphScan, step_m: float) -> None:
         """One scan further."""
         self.length_m += step_m
@@ -87,14 +94,15 @@ class SlamGraph:
     Args:
         config: how.
         directory: where submaps are kept meanwhile, in a file without a name; None: where temporary files are.
+        file: where they are kept instead, so that `restore` finds them.
     """
 
-    def __init__(self, config: SlamGraphConfig, directory: Path | None = None) -> None:
+    def __init__(self, config: SlamGraphConfig, directory: Path | None = None, file: Path | None = None) -> None:
         self._config = config
         self._selector = KeyframeSelector(config.keyframes)
         self._detector = LoopDetector(config.loops)
         self._graph = PoseGraph(config.optimiser)
-        self._store = SubmapStore(directory)
+        self._store = SubmapStore(directory, file)
         self._is_submap_open = False  # is more to come of what is seen from the last keyframe?
         self._submap: GlobalMap | None = None  # of the last keyframe, in its frame
         self.scan_poses: list[FloatArray] = []  # as refined, each recording's in its own world
@@ -107,6 +115,65 @@ class SlamGraph:
         self.keyframe_ms: list[float] = []  # wall time of each, drawing left out
         self._edges: list[Edge] = []
         self._closures: list[LoopClosure] = []
+
+    def state(self) -> State:
+        """All of it, but for what lies in the file of submaps.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        known = np.array([covariance is not None for covariance in self._registered], dtype=np.bool_)
+        covariances = [np.zeros((6, 6)) if covariance is None else covariance for covariance in self._registered]
+        return {
+            "selector": self._selector.state(),
+            "detector": self._detector.state(),
+            "graph": self._graph.state(),
+            "store": self._store.state(),
+            "is_submap_open": self._is_submap_open,
+            "submap": None if self._submap is None else self._submap.state(),
+            "scan_poses": stack(self.scan_poses, (4, 4)),
+            "first_scans": list(self._first_scans),
+            "keyframe_scans": list(self._keyframe_scans),
+            "keyframe_way_m": list(self._keyframe_way_m),
+            "registered": known,
+            "registered_covariance": stack(covariances, (6, 6)),
+            "sessions": list(self._sessions),
+            "way": dict(vars(self._way)),
+            "way_m": self._way_m,
+            "session": int(self._session),
+            "keyframe_ms": list(self.keyframe_ms),
+            "edges": edges_state(self._edges),
+            "closures": closures_state(self._closures),
+        }
+
+    @classmethod
+    def restored(cls, config: SlamGraphConfig, saved: Saved, file: Path) -> "SlamGraph":
+        """The graph with a state, whose submaps lie in a file.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        graph = cls(config)
+        graph._store.close()
+        graph._store = SubmapStore.restored(saved.part("store"), file)
+        graph._selector.restore(saved.part("selector"))
+        graph._detector.restore(saved.part("detector"), (means.points for means in graph._store))
+        graph._graph.restore(saved.part("graph"))
+        graph._is_submap_open = saved.flag("is_submap_open")
+        graph._submap = saved.optional("submap", GlobalMap.restored)
+        graph.scan_poses = list(saved.array("scan_poses", (None, 4, 4)))
+        graph._first_scans = saved.integers("first_scans")
+        graph._keyframe_scans, graph._sessions = saved.integers("keyframe_scans"), saved.integers("sessions")
+        graph._keyframe_way_m, graph.keyframe_ms = saved.numbers("keyframe_way_m"), saved.numbers("keyframe_ms")
+        count = len(graph._keyframe_scans)
+        known = saved.array("registered", (count,), np.bool_)
+        covariances = saved.array("registered_covariance", (count, 6, 6))
+        graph._registered = [C if there else None for C, there in zip(covariances, known, strict=True)]
+        graph._way.restore(saved.part("way"))
+        graph._way_m, graph._session = saved.number("way_m"), saved.integer("session")
+        graph._edges = restored_edges(saved.part("edges"))
+        graph._closures = restored_closures(saved.part("closures"))
+        return graph
 
     def begin_recording(self) -> None:
         """The next scan is the first of another recording: nobody knows where it lies, nor how it got there."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state import Saved, State
 from mapping.patches import PATCH_COLUMNS, PatchTable
 from mapping.symmetric import SYMMETRIC, eigenvalues, eigenvectors
 from mapping.voxel_table import ABSENT, Keys, Rows, VoxelTable, cell_keys, key_cells, key_steps
@@ -65,6 +66,29 @@ class SurfelGrid:
 
     def __len__(self) -> int:
         return len(self._table)
+
+    def state(self) -> State:
+        """The cells in the order of their rows, and what was worked out of each."""
+        count = len(self)
+        return {
+            "cell_m": self.cell_m,
+            "keys": self._keys[:count],
+            "sums": self._sums[:count],
+            "patches": self._patches[:count],
+            "patch_counts": self._patch_counts[:count],
+        }
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "SurfelGrid":
+        """The grid with a state."""
+        grid = cls(saved.number("cell_m"))
+        grid._keys = saved.array("keys", (None,), np.int64)
+        count = len(grid._keys)
+        grid._sums = saved.array("sums", (count, _COLUMNS), np.float32)
+        grid._patches = saved.array("patches", (count, PATCH_COLUMNS))
+        grid._patch_counts = saved.array("patch_counts", (count,), np.float32)
+        grid._table.rebuild(grid._keys)
+        return grid
 
     def add(self, points: FloatArray, elevations: FloatArray) -> None:
         """Add points (N, 3) of the world, seen by the sensor at these angles (N,) above its own equator, radians."""

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 from odometry.config import ConsistencyConfig
@@ -49,6 +50,15 @@ class ConsistencyCheck:
         self._config = config
         self._held: FloatArray | None = None
         self._T_held_prev = np.eye(4)
+
+    def state(self) -> State:
+        """The scan that is held, and the way since."""
+        return {"held": self._held, "T_held_prev": self._T_held_prev}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self._held = saved.optional_array("held", (None, 3))
+        self._T_held_prev = saved.array("T_held_prev", (4, 4))
 
     @staticmethod
     def sample(scan: Scan) -> Scan:

@@ -5,6 +5,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from odometry.interface import Motion
 
@@ -72,6 +73,14 @@ class ExternalOdometry:
         start, end = float(stamps[right - 1]), float(stamps[right])
         is_hole = end - start > self._largest_interval_s
         return (start, end) if is_hole and min(stamp - start, end - stamp) > _SAME_INSTANT_S else None
+
+    def state(self) -> State:
+        """The pose of the last scan that was covered."""
+        return {"T_odom_prev": self._T_odom_prev}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        self._T_odom_prev = saved.optional_array("T_odom_prev", (4, 4))
 
     def close(self) -> None:
         """Nothing is held."""

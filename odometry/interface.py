@@ -5,6 +5,7 @@ from typing import Protocol
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +26,32 @@ class Motion:
     failure: str | None = None
     covariance: FloatArray | None = None
 
+    def state(self) -> State:
+        """All of it."""
+        return dict(vars(self))
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "Motion":
+        """The motion with a state."""
+        return cls(
+            saved.array("T_prev_curr", (4, 4)),
+            saved.integer("points_used"),
+            saved.optional_text("failure"),
+            saved.optional_array("covariance", (6, 6)),
+        )
+
 
 class Odometry(Protocol):
     """Says, scan after scan, how the sensor moved since the last one."""
 
     def estimate(self, scan: Scan) -> Motion:
         """The motion since the previous scan given to this method; a scan that cannot be used gives a prediction."""
+
+    def state(self) -> State | None:
+        """What it remembers of the scans so far; None where that cannot be had, and it has to be given them again."""
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
 
     def close(self) -> None:
         """Let go of whatever the method holds."""

@@ -20,6 +20,7 @@ import numpy as np
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from odometry.config import KissConfig
 from odometry.interface import Motion
 from odometry.kiss_worker import READY, REPLY_FLOATS, REQUEST_HEADER, read_array
@@ -115,6 +116,18 @@ class KissOdometry:
         if last is None:
             return self._begin(_TimedPose(scan.stamp, pose.T_map_lidar))
         return Motion(self._motion(last, pose, scan.stamp), int(reply[16]))
+
+    def state(self) -> State | None:
+        """None: the library does not give its state away."""
+        return None
+
+    def restore(self, saved: Saved) -> None:
+        """There is no state to go on from.
+
+        Raises:
+            InputError: always.
+        """
+        raise saved.refuse("KISS-ICP has no state")
 
     def close(self) -> None:
         """End the child process."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, orthonormalize
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from odometry.alignment import Aligned
 from odometry.alignment_search import align_best
 from odometry.image_config import ImageConfig
@@ -44,6 +45,26 @@ class _Sweep:
     stamp: float
     middle: float
 
+    def state(self) -> State:
+        """All of it."""
+        tensors = {**vars(self.images), "features": self.features}
+        arrays = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
+        return {**arrays, "stamp": self.stamp, "middle": self.middle}
+
+    @classmethod
+    def restored(cls, saved: Saved, device: str) -> "_Sweep":
+        """The sweep with a state."""
+
+        def tensor(name: str, *shape: int | None) -> Tensor:
+            return torch.from_numpy(saved.array(name, shape, np.float32)).to(device)
+
+        points = tensor("points", 1, 3, None, None)
+        height, width = points.shape[2:]
+        offsets, normals = tensor("offsets", 1, height, width), tensor("normals", 1, 3, height, width)
+        images = SweepImages(points, normals, offsets, tensor("low", 1), tensor("high", 1))
+        features = tensor("features", 1, None, None, None)
+        return cls(images, features, saved.number("stamp"), saved.number("middle"))
+
 
 class LearnedOdometry:
     """Motions between consecutive scans from a trained network.
@@ -67,6 +88,17 @@ class LearnedOdometry:
             return Motion(np.eye(4), 0, "the scan is empty")
         with torch.inference_mode(), _threads(self._config.threads):
             return self._estimate(self._sweep(scan))
+
+    def state(self) -> State:
+        """The last sweep, the rows of images, and the motion up to there."""
+        last = None if self._last is None else self._last.state()
+        return {"last": last, "imager": self._imager.state(), "way": self._way.state()}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        self._last = saved.optional("last", lambda last: _Sweep.restored(last, self._config.device))
+        self._imager.restore(saved.part("imager"))
+        self._way.restore(saved.part("way"))
 
     def close(self) -> None:
         """Nothing is held."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.state import Saved, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +21,11 @@ class Leg:
     velocity: FloatArray
     bend: FloatArray
     interval_s: float
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "Leg":
+        """The leg with a state, which is all of it."""
+        return cls(saved.array("velocity", (6,)), saved.array("bend", (6,)), saved.number("interval_s"))
 
     def pose_after(self, seconds: float) -> FloatArray:
         """(4, 4) in the frame of the earlier middle, so long after it: the velocity changes evenly."""
@@ -40,6 +46,15 @@ class Retimer:
     def forget(self) -> None:
         """The way on is not known: the next motion begins anew."""
         self.last, self._T_middle_stamp = None, np.eye(4)
+
+    def state(self) -> State:
+        """The last leg, and where its scan's stamp lies."""
+        return {"last": None if self.last is None else dict(vars(self.last)), "T_middle_stamp": self._T_middle_stamp}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self.last = saved.optional("last", Leg.restored)
+        self._T_middle_stamp = saved.array("T_middle_stamp", (4, 4))
 
     def between_stamps(
         self, T_prev_curr: FloatArray, bend: FloatArray, middles: tuple[float, float], stamps: tuple[float, float]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from odometry.image_config import ImageConfig
 from odometry.normals import surface_normals
 from odometry.projection import ImageGrid, project
@@ -26,6 +27,21 @@ class Imager:
         self._device = torch.device(device)
         self._grid: ImageGrid | None = None
         self._grid_points = 0  # of the scan that the grid is from
+
+    def state(self) -> State:
+        """The elevations of the rows, and how many points they are from."""
+        grid = self._grid
+        limits = None if grid is None else {"low": grid.elevation_low, "high": grid.elevation_high}
+        return {"limits": limits, "points": self._grid_points}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self._grid = saved.optional("limits", self._grid_between)
+        self._grid_points = saved.integer("points")
+
+    def _grid_between(self, limits: Saved) -> ImageGrid:
+        low, high = limits.number("low"), limits.number("high")
+        return ImageGrid(self._config.rows, self._config.columns, low, high)
 
     def images(self, scans: Sequence[Scan]) -> SweepImages:
         """The scans as images, normals included."""

@@ -10,7 +10,9 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.state_file import read_state, write_state
 
 
 @pytest.fixture
@@ -111,3 +113,9 @@ def room_truth(drive: Callable[[FloatArray], FloatArray]) -> Trajectory:
 def room_scans(room: Room, drive: Callable[[FloatArray], FloatArray], room_truth: Trajectory) -> list[Scan]:
     """Twenty rolling sweeps along the drive, stamped in their middle."""
     return [room.sweep(drive, float(stamp)) for stamp in room_truth.stamps]
+
+
+@pytest.fixture
+def through_disk(tmp_path: Path) -> Callable[[State], Saved]:
+    """Writes a state and reads it back."""
+    return lambda state: (write_state(tmp_path / "state.npz", state), read_state(tmp_path / "state.npz"))[1]

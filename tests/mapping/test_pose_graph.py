@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, rotation_angle
+from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import chain
 from mapping.edge_residuals import EdgeResiduals, bounded
 from mapping.g2o import Edge, EdgeKind, read_g2o
@@ -245,6 +246,40 @@ def test_isam_closes_loops_and_bears_false_ones(rng: np.random.Generator) -> Non
         graph.update()
     assert drift > 1.0
     assert_near(graph.poses()[4:80:4], truth[4:80:4], 0.1)
+
+
+@pytest.mark.parametrize("optimised", [False, True])
+def test_a_graph_that_is_restored_goes_on_as_it_would_have(
+    rng: np.random.Generator, through_disk: Callable[[State], Saved], optimised: bool
+) -> None:
+    """To the last bit, though iSAM2 was updated now and then, looked at, and had loops to bear."""
+    truth = laps(80)
+    edges = with_errors([*chained(truth), edge(truth, 3, 43, TIGHT, "loop"), edge(truth, 20, 60, TIGHT, "loop")], rng)
+    start = drifted(edges, 80)
+
+    def feed(graph: PoseGraph, keys: range) -> None:
+        for key in keys:
+            graph.add_pose(key, graph.pose(key - 1) @ edges[key - 1].T_first_second if key else start[0])
+            for one in edges:
+                if one.second == key:
+                    graph.add_edge(one)
+            if key % 3 == 2:
+                graph.update()
+            if key % 5 == 4:
+                graph.poses()
+
+    whole, begun, restored = PoseGraph(CONFIG), PoseGraph(CONFIG), PoseGraph(CONFIG)
+    feed(whole, range(50))
+    feed(begun, range(50))
+    if optimised:
+        whole.optimise()
+        begun.optimise()
+    restored.restore(through_disk(begun.state()))
+    for graph in (whole, restored):
+        feed(graph, range(50, 80))
+    np.testing.assert_array_equal(restored.poses(), whole.poses())
+    np.testing.assert_array_equal(restored.covariances([0, 79]), whole.covariances([0, 79]))
+    np.testing.assert_array_equal(restored.optimise().poses, whole.optimise().poses)
 
 
 def test_the_graph_goes_on_after_it_was_optimised() -> None:

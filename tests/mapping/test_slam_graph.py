@@ -1,14 +1,17 @@
 """A walk round a block of corridors, with a drift that is known: loops are closed, and nothing else is."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
+from lidarslam.core.state import Saved, State
 from mapping.graph_config import SlamGraphConfig, TrajectoryEdgeConfig
 from mapping.graph_scan import GraphScan
 from mapping.pose_graph import Optimised
@@ -240,6 +243,55 @@ def test_a_run_without_a_scan_has_nothing_to_correct() -> None:
     assert graph.finish() is None
     graph.draw(np.zeros((3, 3)), np.eye(4), VOXEL_M)  # nothing to draw into, and no harm done
     graph.close()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.97, 1.0])
+def test_a_graph_that_is_restored_goes_on_to_the_same_result(
+    walk: Walk,
+    closed: tuple[SlamGraph, Corrected],
+    through_disk: Callable[[State], Saved],
+    tmp_path: Path,
+    share: float,
+) -> None:
+    """The last two after loops were closed, so that iSAM2 has been through something."""
+    scans, file = list(walk.scans()), tmp_path / "submaps.bin"
+    begun = SlamGraph(CONFIG, file=file)
+    until = int(share * len(scans))
+    go_on(begun, scans[:until])
+    saved = through_disk(begun.state())
+    go_on(begun, scans[until : until + 20])  # more lies in the file by the time that it is killed
+    begun.close()
+    graph = SlamGraph.restored(CONFIG, saved, file)
+    go_on(graph, scans[until:])
+    result = graph.finish()
+    assert result is not None
+    whole, expected = closed
+    np.testing.assert_array_equal(result.T_world_lidar, expected.T_world_lidar)
+    np.testing.assert_array_equal(result.keyframe_scans, expected.keyframe_scans)
+    assert result.believed == expected.believed
+    for found, closure in zip(result.closures, expected.closures, strict=True):
+        for name, value in vars(closure).items():
+            np.testing.assert_array_equal(getattr(found, name), value)
+    drawn = graph.draw_map(result, VOXEL_M)
+    np.testing.assert_array_equal(drawn.means().rows, whole.draw_map(expected, VOXEL_M).means().rows)
+
+
+def test_a_file_of_submaps_that_was_changed_is_refused(
+    walk: Walk, through_disk: Callable[[State], Saved], tmp_path: Path
+) -> None:
+    file = tmp_path / "submaps.bin"
+    graph = SlamGraph(CONFIG, file=file)
+    go_on(graph, list(walk.scans())[:20])
+    saved = through_disk(graph.state())
+    graph.close()
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"submaps\.bin: is damaged"):
+        SlamGraph.restored(CONFIG, saved, file)
+    file.write_bytes(content[:100])
+    with pytest.raises(InputError, match=r"submaps\.bin: is damaged"):
+        SlamGraph.restored(CONFIG, saved, file)
 
 
 def test_drift_grows_with_the_way() -> None:

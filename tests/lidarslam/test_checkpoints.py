@@ -1,0 +1,270 @@
+"""When states are saved, who may be at work on a run, and where a resumed one goes on in its recording."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from lidarslam import checkpoints
+from lidarslam.checkpoint_config import CheckpointConfig
+from lidarslam.checkpoints import Checkpoints
+from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.recording import Recording
+from lidarslam.localisation import OdometryAlone
+from lidarslam.pipeline import Pipeline
+from lidarslam.resuming import scans_left
+from lidarslam.run_directory import RunDirectory
+from lidarslam.state_file import read_state
+from lidarslam.unfinished import About, Unfinished, require_whole
+from mapping.config import GlobalMapConfig
+from odometry.config import ConsistencyConfig
+from odometry.consistency import ConsistencyCheck
+from odometry.external import ExternalOdometry
+
+
+class Clock:
+    """A time that goes on when it is told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
+
+
+class Still:
+    """A pipeline with hardly a state, which takes a while."""
+
+    def __init__(self, clock: Clock, seconds: float) -> None:
+        self.clock, self.seconds = clock, seconds
+
+    def state(self) -> State:
+        self.clock.now += self.seconds
+        return {}
+
+
+@pytest.fixture
+def unfinished(tmp_path: Path) -> Iterator[Unfinished]:
+    with Unfinished.claim(tmp_path, {}, resume=False) as claimed:
+        yield claimed
+
+
+@pytest.mark.parametrize(("cost_s", "pause_s"), [(0.01, 10.0), (0.2, 10.0), (1.0, 50.0)])
+def test_saving_takes_two_percent_of_the_time_at_most(
+    unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch, cost_s: float, pause_s: float
+) -> None:
+    clock = Clock(monkeypatch)
+    warnings: list[str] = []
+    kept = Checkpoints(unfinished, CheckpointConfig(), lambda: {"number": 1}, warnings.append)
+    pipeline = cast(Pipeline, Still(clock, cost_s))
+    clock.now += 9.99
+    assert not kept.is_due()
+    clock.now += 0.02
+    assert kept.is_due()
+    kept.keep(pipeline)
+    assert read_state(unfinished.state).integer("number") == 1
+    clock.now += pause_s - 0.01
+    assert not kept.is_due()
+    clock.now += 0.02
+    assert kept.is_due()
+    assert not warnings
+
+
+def test_a_disk_that_is_full_does_not_end_the_run(unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, _: State) -> None:
+        raise OutputError(f"{path}: cannot be written (No space left on device)")
+
+    monkeypatch.setattr(checkpoints, "write_state", fail)
+    warnings: list[str] = []
+    kept = Checkpoints(unfinished, CheckpointConfig(every_scans=2), dict, warnings.append)
+    pipeline = cast(Pipeline, Still(Clock(monkeypatch), 0.0))
+    assert [kept.is_due(), kept.is_due()] == [False, True]
+    kept.keep(pipeline)
+    assert [kept.is_due(), kept.is_due()] == [False, True]
+    assert "the state could not be saved" in warnings[0]
+    assert "No space left" in warnings[0]
+
+
+@dataclass
+class Counting:
+    """Keeps every second scan's state in memory."""
+
+    states: list[tuple[int, State]] = field(default_factory=list)
+    out: int = 0
+    asked: int = 0
+
+    def is_due(self) -> bool:
+        self.asked += 1
+        return self.asked % 2 == 0
+
+    def keep(self, pipeline: Pipeline) -> None:
+        assert pipeline.held is not None
+        self.states.append((self.out, pipeline.state()))
+
+
+def make_pipeline(truth: Trajectory, keeper: Counting | None = None) -> tuple[Pipeline, ExternalOdometry]:
+    odometry = ExternalOdometry(truth)
+    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), keeper=keeper), odometry
+
+
+def test_nothing_is_at_work_while_a_state_is_kept(
+    room_scans: list[Scan], room_truth: Trajectory, through_disk: Any
+) -> None:
+    """All results but that of the scan that is held are out, and the rest follows from the state."""
+    keeper = Counting()
+    pipeline, _ = make_pipeline(room_truth, keeper)
+    whole = []
+    for result in pipeline.run(room_scans[:9]):
+        whole.append(result)
+        keeper.out = len(whole)
+    assert [out for out, _ in keeper.states] == [2, 4, 6, 8]
+    pipeline, odometry = make_pipeline(room_truth)
+    saved: Saved = through_disk(keeper.states[1][1])
+    pipeline.restore(saved)
+    odometry.restore(saved.part("odometry"))
+    assert pipeline.held is not None
+    assert pipeline.held.stamp == room_scans[4].stamp
+    rest = list(pipeline.run(room_scans[5:9]))
+    assert len(rest) == 5
+    for found, expected in zip(rest, whole[4:], strict=True):
+        np.testing.assert_array_equal(found.T_world_lidar, expected.T_world_lidar)
+        np.testing.assert_array_equal(found.points, expected.points)
+        assert (found.status, found.residual_m) == (expected.status, expected.residual_m)
+
+
+class Stuttering:
+    """A recording in which some scans are missing and some go back in time."""
+
+    def __init__(self, stamps: list[float | None]) -> None:
+        self.stamps = stamps
+        self.read: list[int] = []
+
+    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+        for index in range(start, len(self.stamps) if stop is None else stop, step):
+            self.read.append(index)
+            stamp = self.stamps[index]
+            if stamp is not None:
+                yield Scan(np.full((1, 3), 1.0 + stamp), stamp)
+
+
+class Deaf:
+    """An odometry without a state, and the stamps that it was given."""
+
+    def __init__(self) -> None:
+        self.heard: list[float] = []
+
+    def estimate(self, scan: Scan) -> None:
+        self.heard.append(scan.stamp)
+
+
+STAMPS = [0.0, 1.0, None, 0.5, 2.0, 3.0, 2.5, 4.0, 5.0]
+
+
+@pytest.mark.parametrize("done", range(5))
+def test_a_run_goes_on_after_the_scan_that_was_read_last(done: int) -> None:
+    recording, in_order = Stuttering(STAMPS), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    held = Scan(np.full((1, 3), 1.0 + in_order[done]), in_order[done])
+    for saved in (Saved({"odometry": {}}), Saved({"odometry": None})):
+        odometry: Any = Deaf()
+        odometry.restore = lambda _: None
+        left = scans_left(cast(Recording, recording), range(len(STAMPS)), done, held, odometry, saved)
+        assert [scan.stamp for scan in left] == in_order[done + 1 :]
+        assert odometry.heard == ([] if saved.has("odometry") else in_order[: done + 1])
+
+
+def test_scans_dealt_with_long_ago_are_not_read_again() -> None:
+    recording = Stuttering([float(index) for index in range(10)])
+    held = Scan(np.full((1, 3), 13.0), 12.0)
+    odometry: Any = Deaf()
+    odometry.restore = lambda _: None
+    recording.stamps = [2.0 * index for index in range(10)]
+    left = scans_left(cast(Recording, recording), range(0, 10, 2), 3, held, odometry, Saved({"odometry": {}}))
+    assert [scan.stamp for scan in left] == [16.0]
+    assert recording.read == [6, 8]
+
+
+@pytest.mark.parametrize("held", [Scan(np.full((1, 3), 3.5), 2.0), Scan(np.full((1, 3), 3.0), 2.1)])
+def test_another_scan_than_the_one_that_was_read_is_noticed(held: Scan) -> None:
+    odometry: Any = Deaf()
+    odometry.restore = lambda _: None
+    with pytest.raises(InputError, match="the recording is not what it was"):
+        scans_left(cast(Recording, Stuttering(STAMPS)), range(9), 2, held, odometry, Saved({"odometry": {}}))
+
+
+def test_two_are_not_at_work_on_one_run(tmp_path: Path) -> None:
+    with Unfinished.claim(tmp_path, {"a": 1}, resume=False) as first:
+        first.begin(None)
+        for resume in (False, True):
+            with (
+                pytest.raises(OutputError, match="somebody else is at work"),
+                Unfinished.claim(tmp_path, {"a": 1}, resume=resume),
+            ):
+                pass
+        assert About.read(tmp_path) is not None
+    with Unfinished.claim(tmp_path, {"a": 1}, resume=True):
+        pass
+
+
+def test_what_failed_before_it_began_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
+        unfinished.begin(None)
+        raise RuntimeError
+    assert not list(tmp_path.iterdir())
+
+
+def test_results_that_are_not_whole_are_not_taken_for_such_by_a_failed_attempt_to_replace_them(tmp_path: Path) -> None:
+    with Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
+        unfinished.begin(None)
+    with pytest.raises(RuntimeError), Unfinished.claim(tmp_path, {"other": 1}, resume=False):
+        raise RuntimeError
+    with pytest.raises(InputError, match="did not finish"):
+        require_whole(tmp_path)
+
+
+def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> None:
+    with Unfinished.claim(tmp_path, {"a": 1}, resume=False) as unfinished:
+        unfinished.begin(None)
+        with pytest.raises(InputError, match="did not finish"):
+            require_whole(tmp_path)
+        unfinished.end(stopped=True)
+    require_whole(tmp_path)
+    with pytest.raises(OutputError, match="--resume"), RunDirectory.create(tmp_path):
+        pass
+    with Unfinished.claim(tmp_path, {"a": 1}, resume=True) as unfinished:
+        unfinished.begin(3)
+        with pytest.raises(InputError, match="did not finish"):
+            require_whole(tmp_path)
+        assert unfinished.about.resumed_after == (3,)
+        unfinished.end(stopped=False)
+    require_whole(tmp_path)
+    assert not (tmp_path / "unfinished").exists()
+
+
+def test_what_differs_is_named_and_not_too_much_of_it(tmp_path: Path) -> None:
+    with Unfinished.claim(tmp_path, {"a": {"b": 1, "c": 2}, "d": 3, "e": 4}, resume=False) as unfinished:
+        unfinished.begin(None)
+    other = {"a": {"b": 0, "c": 0}, "e": 0, "f": 0}
+    with (
+        pytest.raises(InputError, match=r"begun with a\.b 1 \(now 0\), a\.c 2 \(now 0\), d 3 \(now None\) and 2 more"),
+        Unfinished.claim(tmp_path, other, resume=True),
+    ):
+        pass
+
+
+def test_results_of_another_command_in_the_place_of_a_killed_run_are_whole(tmp_path: Path) -> None:
+    """A merge saves nothing, and is not taken for the run that was killed there."""
+    with Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
+        unfinished.begin(None)
+    with pytest.raises(RuntimeError), RunDirectory.create(tmp_path, overwrite=True):
+        raise RuntimeError
+    with pytest.raises(InputError, match="did not finish"):
+        require_whole(tmp_path)
+    with RunDirectory.create(tmp_path, overwrite=True):
+        pass
+    require_whole(tmp_path)

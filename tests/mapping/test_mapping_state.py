@@ -1,0 +1,149 @@
+"""A mapper and a map that are saved and restored go on as they would have, to the last bit."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp
+from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
+from lidarslam.core.tracking import Status
+from mapping import global_map
+from mapping.config import MappingConfig, TrackingConfig
+from mapping.global_map import GlobalMap
+from mapping.graph_config import KeyframeConfig
+from mapping.keyframe import KeyframeSelector
+from mapping.mapper import MappedScan, Mapper
+from mapping.prediction import Prior
+from mapping.rings import RingFinder, RingSource
+
+ThroughDisk = Callable[[State], Saved]
+CONFIG = MappingConfig(keypoints=600, tracking=TrackingConfig(give_up_after=2))
+
+
+@pytest.fixture(scope="module")
+def scans(room_scans: list[Scan]) -> list[Scan]:
+    """Thinned sweeps; two are of points that lie on nothing, so that the map is begun anew, and one is empty."""
+    chosen = [scan.select(np.arange(0, len(scan), 3)) for scan in room_scans[:12]]
+    for index in (5, 6):
+        noise = np.random.default_rng(index).uniform(-6.0, 6.0, (2000, 3))
+        chosen[index] = Scan(noise, chosen[index].stamp, np.linspace(0.0, 0.1, 2000))
+    chosen[9] = chosen[9].select(np.arange(0))
+    return chosen
+
+
+def assert_same(found: MappedScan, expected: MappedScan) -> None:
+    for name, value in vars(expected.state).items():
+        np.testing.assert_array_equal(getattr(found.state, name), value, err_msg=name)
+    np.testing.assert_array_equal(found.T_world_expected, expected.T_world_expected)
+    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added"):
+        assert getattr(found, name) == getattr(expected, name), name
+
+
+def test_a_mapper_goes_on(scans: list[Scan], through_disk: ThroughDisk) -> None:
+    whole = Mapper(CONFIG)
+    expected = []
+    for scan in scans:
+        expected.append(whole.process(scan, Prior()))
+    assert {mapped.status for mapped in expected} >= {Status.OK, Status.LOST}
+    assert any("a new map" in mapped.message for mapped in expected)
+    for after in (0, 1, 2, 6, 7, 8, 10):
+        first, second = Mapper(CONFIG), Mapper(CONFIG)
+        for scan in scans[:after]:
+            first.process(scan, Prior())
+        second.restore(through_disk(first.state()))
+        for scan, mapped in zip(scans[after:], expected[after:], strict=True):
+            assert_same(second.process(scan, Prior()), mapped)
+
+
+def test_a_map_that_has_forgotten_goes_on(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+    """Rows of cells are in the order in which they came, also after some were dropped."""
+    from mapping.local_map import LocalMap
+
+    def add(local_map: LocalMap, step: int, seed: int) -> None:
+        points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])
+        local_map.add(points, np.zeros(3000), points[:200], np.array([2.0 * step, 0.0, 0.0]))
+
+    whole = LocalMap(0.3, 6.0)
+    for step in range(4):
+        add(whole, step, step)
+    restored = LocalMap.restored(through_disk(whole.state()))
+    assert len(restored) == len(whole)
+    queries = rng.uniform(-4.0, 12.0, (2000, 3))
+    for step in range(4, 8):
+        add(whole, step, step)
+        add(restored, step, step)
+        for one, other in (
+            (restored.match_planes(queries, np.eye(4)), whole.match_planes(queries, np.eye(4))),
+            (restored.match_lines(queries), whole.match_lines(queries)),
+        ):
+            for name, value in vars(other).items():
+                np.testing.assert_array_equal(getattr(one, name), value)
+
+
+def test_a_global_map_goes_on(
+    rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is merged when it would have been: sums in another order are rounded otherwise."""
+    monkeypatch.setattr(global_map, "_MIN_PENDING", 2500)
+    clouds = [rng.uniform(-3.0, 3.0, (1000, 3)) for _ in range(9)]
+    whole = GlobalMap(0.5)
+    for cloud in clouds:
+        whole.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
+    for after in range(9):
+        part = GlobalMap(0.5)
+        for cloud in clouds[:after]:
+            part.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
+        restored = GlobalMap.restored(through_disk(part.state()))
+        for cloud in clouds[after:]:
+            restored.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
+        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
+
+
+@pytest.mark.parametrize("source", ["ELEVATION", "STORAGE", "FIELD", "NONE"])
+def test_rings_are_found_as_before(source: str, rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+    azimuth = np.tile(np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False), 8)
+    ring = np.repeat(np.arange(8), 720)
+    spread = {"ELEVATION": 0.0, "STORAGE": 0.015}.get(source, 0.3)
+    elevation = np.deg2rad(2.0 * ring) + spread * rng.normal(size=len(ring))
+    if source == "NONE":
+        shuffled = rng.permutation(len(ring))
+        azimuth, elevation, ring = azimuth[shuffled], elevation[shuffled], ring[shuffled]
+    if source == "FIELD":
+        elevation = np.deg2rad(2.0 * ring)
+    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    points = 5.0 * np.stack(rays, axis=1)
+    given = ring if source == "FIELD" else None
+    finder = RingFinder()
+    finder.rings(points, given)
+    assert finder.source is RingSource[source]
+    restored = RingFinder()
+    restored.restore(through_disk(finder.state()))
+    expected, found = finder.rings(points[::-1], given), restored.rings(points[::-1], given)
+    assert restored.source is finder.source
+    assert (found is None) == (expected is None)
+    if expected is not None:
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+    points = rng.uniform(-5.0, 5.0, (2000, 3))
+    selector, restored = KeyframeSelector(KeyframeConfig()), KeyframeSelector(KeyframeConfig())
+    selector.take(np.eye(4), points)
+    restored.restore(through_disk(selector.state()))
+    poses = [exp([0.0, 0.0, turn, way, 0.0, 0.0]) for turn in (0.0, 0.3, 1.0) for way in (0.0, 0.5, 0.9, 2.0)]
+    answers = [selector.is_due(pose, points) for pose in poses]
+    assert set(answers) == {True, False}
+    assert [restored.is_due(pose, points) for pose in poses] == answers
+    assert restored.is_due(np.eye(4), points + 3.0) == selector.is_due(np.eye(4), points + 3.0)
+
+
+def test_a_state_of_another_shape_is_refused(through_disk: ThroughDisk) -> None:
+    mapper = Mapper(CONFIG)
+    mapper.process(Scan(np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3)), 0.0), Prior())
+    state = mapper.state()
+    state["last"] = {**state["last"], "covariance": np.eye(6)}
+    with pytest.raises(InputError, match=r"covariance should be float64 \(12, 12\), and is float64 \(6, 6\)"):
+        Mapper(CONFIG).restore(through_disk(state))
