@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
+
+# The first call of a compiled loop takes as long as compiling it.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 
 
 @pytest.fixture
