@@ -15,8 +15,10 @@ from torch import Tensor
 
 from lidarslam.core import geometry
 from odometry.alignment_config import AlignmentConfig
-from odometry.pairing import Cloud, Movement, Pairs, filled, pair, sample
-from odometry.sweeps import SweepImages, SweepPairs
+from odometry.compiled_sums import CompiledSums
+from odometry.pair_sums import PairSums, Tally, TorchSums
+from odometry.pairing import Movement
+from odometry.sweeps import SweepPairs
 from odometry.torch_geometry import inverse
 
 # A pair whose motion changes by less than this in a step has arrived: rotation in radians, translation in metres.
@@ -83,15 +85,20 @@ def align(
             only where to start from.
     """
     state = _State(T_prev_curr, T_prev_curr.new_zeros(len(T_prev_curr), 6))
-    source = sample(sweeps.current, config.column_step)
-    target = filled(sweeps.previous, config.fill_columns)
+    sums = _sums_over(sweeps, config)
     for done in torch.linspace(0.0, 1.0, config.iterations).tolist():
         scale_m = config.coarse_m * (config.fine_m / config.coarse_m) ** min(1.0, done / config.anneal_share)
-        pairs = pair(_movement(state, sweeps), source, target, scale_m, config)
-        state, moved = _step(state, pairs, scale_m, T_prev_curr, guess_information, config)
+        H, g = sums.normal_equations(_movement(state, sweeps), scale_m)
+        state, moved = _step(state, H, g, T_prev_curr, guess_information, config)
         if done >= config.anneal_share and moved < _ARRIVED:
             break
-    return _judge(_movement(state, sweeps), source, target, config)
+    movement = _movement(state, sweeps)
+    return _judge(movement, sums.tally(movement), config)
+
+
+def _sums_over(sweeps: SweepPairs, config: AlignmentConfig) -> PairSums:
+    on_processor = sweeps.current.points.device.type == "cpu" and sweeps.current.points.dtype == torch.float32
+    return CompiledSums(sweeps, config) if on_processor else TorchSums(sweeps, config)
 
 
 def _movement(state: _State, sweeps: SweepPairs) -> Movement:
@@ -104,31 +111,16 @@ def _movement(state: _State, sweeps: SweepPairs) -> Movement:
     return Movement(state.T_prev_curr, velocity, bend)
 
 
-def _normal_equations(pairs: Pairs, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """H (B, 12, 12) and g (B, 12) of the weighted squares, for changes of T_prev_curr from the left and of the bend.
-
-    A point that is seen t seconds after the middle of its sweep, on a pixel seen t' after that of its own, moves with
-    the bend (t + t') times as it does with the motion.
-    """
-    J = torch.cat([torch.linalg.cross(pairs.moved, pairs.normals), pairs.normals], dim=-1)  # (B, N, 6)
-    J = torch.cat([J, J * pairs.offsets_s[..., None]], dim=-1)
-    weighted = J * weights[..., None]
-    return weighted.mT @ J, (weighted.mT @ pairs.residuals[..., None])[..., 0]
-
-
 def _step(
     state: _State,
-    pairs: Pairs,
-    scale_m: float,
+    H: Tensor,
+    g: Tensor,
     guess: Tensor,
     guess_information: Tensor | None,
     config: AlignmentConfig,
 ) -> tuple[_State, float]:
     """One Gauss-Newton step, and by how much it moved the pair it moved most."""
-    squared = pairs.residuals.square() / scale_m**2
-    H, g = _normal_equations(pairs, config.information_per_m2 * pairs.kept / (1.0 + squared).square())
-    # In float32 what a guess says would be lost beside what the images say of other directions.
-    H, g = H.double(), g.double()
+    H, g = config.information_per_m2 * H, config.information_per_m2 * g
     expected = _expected(config, H)
     H[:, 6:, 6:] += expected
     g[:, 6:] += state.surprise.double() @ expected
@@ -159,43 +151,35 @@ def _expected(config: AlignmentConfig, like: Tensor) -> Tensor:
     return torch.diag(sigmas**-2)
 
 
-def _judge(movement: Movement, source: Cloud, target: SweepImages, config: AlignmentConfig) -> Aligned:
+def _judge(movement: Movement, tally: Tally, config: AlignmentConfig) -> Aligned:
     """How well the images lie on one another in the end."""
-    T = movement.T_prev_curr
-    pairs = pair(movement, source, target, config.fine_m, config)
-    near = pairs.kept & (pairs.residuals.abs() < 2.0 * config.fine_m)
-    matched = near.sum(-1)
-    squares = (pairs.residuals.square() * near).sum(-1)
-    share = matched / source.valid.sum(-1).clamp(min=1)
     # What leaves the other image's view on the way says nothing, unless it is most of the scan.
-    explained, weakest = _explained(source.normals @ T[:, :3, :3].mT, pairs.inside, near)
-    in_view = pairs.inside.sum(-1) / source.valid.sum(-1).clamp(min=1)
-    explained = explained * (in_view / _MUCH_IN_VIEW).clamp(max=1.0)
-    residual_m = (squares / matched.clamp(min=1)).sqrt()
-    return Aligned(T, movement.bend, _information(pairs, near, config), share, explained, weakest, residual_m, matched)
+    explained, weakest = _explained(tally.in_view, tally.matched)
+    explained = explained * (tally.share_in_view / _MUCH_IN_VIEW).clamp(max=1.0)
+    residual_m = (tally.squares / tally.count.clamp(min=1)).sqrt()
+    T, information = movement.T_prev_curr, _information(tally.H, config).to(movement.T_prev_curr.dtype)
+    return Aligned(T, movement.bend, information, tally.share, explained, weakest, residual_m, tally.count)
 
 
-def _information(pairs: Pairs, near: Tensor, config: AlignmentConfig) -> Tensor:
+def _information(H: Tensor, config: AlignmentConfig) -> Tensor:
     """(B, 6, 6) about the motion: what is left of it when the bend is not known, by Schur's complement."""
-    H, _ = _normal_equations(pairs, near.to(pairs.residuals.dtype))
-    H = H.double()
     across, bends = H[:, :6, 6:], H[:, 6:, 6:] + _expected(config, H) / config.information_per_m2
     left: Tensor = H[:, :6, :6] - across @ torch.linalg.solve(bends, across.mT)
-    return left.to(pairs.residuals.dtype)
+    return left
 
 
-def _explained(normals: Tensor, inside: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+def _explained(everything: Tensor, matched: Tensor) -> tuple[Tensor, Tensor]:
     """The least ratio (B,), over directions (B, 3), of the information of points that lie well to that of all in view.
 
-    The smallest generalised eigenvalue of the two sums of squared normals (B, N, 3). To both a little is added, so that
+    The smallest generalised eigenvalue of the two sums (B, 3, 3) of squared normals. To both a little is added, so that
     directions of which hardly any point says anything do not count as missed.
     """
-    everything = (normals * inside[..., None]).mT @ normals
-    matched = (normals * near[..., None]).mT @ normals
     largest = everything.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1.0)
-    little = (_NEXT_TO_NOTHING * largest)[:, None, None] * torch.eye(3, dtype=normals.dtype, device=normals.device)
+    little = (_NEXT_TO_NOTHING * largest)[:, None, None] * torch.eye(
+        3, dtype=everything.dtype, device=everything.device
+    )
     root = torch.linalg.cholesky((everything + little).double())
     half = torch.linalg.solve_triangular(root, (matched + little).double(), upper=False)
     ratio, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(root, half.mT, upper=False))
     weakest = torch.linalg.solve_triangular(root.mT, vectors[..., :1], upper=True)[..., 0]
-    return ratio[:, 0].to(normals.dtype), torch.nn.functional.normalize(weakest, dim=-1).to(normals.dtype)
+    return ratio[:, 0].to(everything.dtype), torch.nn.functional.normalize(weakest, dim=-1).to(everything.dtype)
