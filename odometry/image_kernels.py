@@ -64,14 +64,18 @@ class Held(NamedTuple):
 
 @compiled
 def _arc_tangent(y: float, x: float) -> float:
-    """atan2, of a rational function without branches, exact to double precision.
+    """atan2, of a rational function without branches, so that the processor takes several at once; NaN for NaN.
 
-    Cephes Mathematical Library, atan.c (Moshier, 1989): the function libm has takes one value at a time.
+    Cephes Mathematical Library, atan.c (Moshier, 1989), exact to double precision.
     """
     ax, ay = abs(x), abs(y)
-    t = min(ax, ay) / max(ax, ay, _TINY)
+    large = ax if ax > ay else ay
+    small = ay if ax > ay else ax
+    t = small / (large if large > _TINY else _TINY)
     steep = t > 0.66
-    r = (t - 1.0) / (t + 1.0) if steep else t
+    numerator = t - 1.0 if steep else t
+    denominator = t + 1.0 if steep else 1.0
+    r = numerator / denominator
     z = r * r
     p = -8.750608600031904e-1
     p = p * z - 1.615753718733365e1
@@ -84,22 +88,40 @@ def _arc_tangent(y: float, x: float) -> float:
     q = q * z + 4.853903996359137e2
     q = q * z + 1.945506571482614e2
     angle = r + r * (z * p / q)
-    angle = angle + 0.25 * math.pi if steep else angle
+    angle = angle + (0.25 * math.pi if steep else 0.0)
     angle = 0.5 * math.pi - angle if ay > ax else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
 
 
 @compiled
-def _row_and_column(
-    x: float, y: float, z: float, low: float, rows_per_radian: float, width: int
-) -> tuple[float, float]:
-    """Whole numbers, as floats: the row, which may lie outside, and the column."""
-    row = np.floor((_arc_tangent(z, math.sqrt(x * x + y * y)) - low) * rows_per_radian + 0.5)
-    azimuth = _arc_tangent(y, x)
+def _row(elevation: float, low: float, rows_per_radian: float) -> float:
+    """A whole number, which may lie outside of the image."""
+    return float(np.floor((elevation - low) * rows_per_radian + 0.5))
+
+
+@compiled
+def _column(azimuth: float, width: int) -> float:
+    """A whole number."""
     azimuth = azimuth + _TURN if azimuth < 0.0 else azimuth
     column = np.floor(azimuth * (width / _TURN))
-    return row, column if column < width - 1.0 else width - 1.0  # NaN lies in the last column
+    return column if column < width - 1.0 else width - 1.0  # NaN lies in the last column
+
+
+@compiled
+def _angles(points: Floats, begin: int, elevations: FloatArray, azimuths: FloatArray, ranges: Floats) -> None:
+    """Write what is seen of the points (M, 3) from `begin` on: separate loops, each of which takes several at once."""
+    size = len(ranges)
+    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    for i in range(size):
+        x[i], y[i], z[i] = points[begin + i, 0], points[begin + i, 1], points[begin + i, 2]
+    for i in range(size):
+        elevations[i] = _arc_tangent(z[i], math.sqrt(x[i] * x[i] + y[i] * y[i]))
+    for i in range(size):
+        azimuths[i] = _arc_tangent(y[i], x[i])
+    for i in range(size):
+        a, b, c = np.float32(x[i]), np.float32(y[i]), np.float32(z[i])
+        ranges[i] = np.sqrt(a * a + b * b + c * c)
 
 
 @compiled
@@ -120,22 +142,21 @@ def nearest_in_pixels(
     """
     index[:] = -1
     ranges[:] = np.inf
-    row, column, distance = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK, dtype=np.float32)
+    elevations, azimuths = np.empty(_BLOCK), np.empty(_BLOCK)
+    distances = np.empty(_BLOCK, dtype=np.float32)
     for begin in range(0, len(points), _BLOCK):
         size = min(_BLOCK, len(points) - begin)
+        _angles(points, begin, elevations, azimuths, distances[:size])
         for i in range(size):
-            x, y, z = points[begin + i, 0], points[begin + i, 1], points[begin + i, 2]
-            distance[i] = np.sqrt(x * x + y * y + z * z)
-            row[i], column[i] = _row_and_column(
-                np.float64(x), np.float64(y), np.float64(z), low, rows_per_radian, width
-            )
+            elevations[i] = _row(elevations[i], low, rows_per_radian)
+            azimuths[i] = _column(azimuths[i], width)
         for i in range(size):
-            r = row[i] if len(rows) == 0 else float(rows[begin + i])
-            if not (r >= 0.0 and r < height and distance[i] > 0.0 and distance[i] < np.inf):
+            row, distance = elevations[i] if len(rows) == 0 else float(rows[begin + i]), distances[i]
+            if not (row >= 0.0 and row < height and distance > 0.0 and distance < np.inf):
                 continue
-            pixel = int(r) * width + int(column[i])
-            if distance[i] < ranges[pixel]:
-                index[pixel], ranges[pixel] = begin + i, distance[i]
+            pixel = int(row) * width + int(azimuths[i])
+            if distance < ranges[pixel]:
+                index[pixel], ranges[pixel] = begin + i, distance
 
 
 @compiled
@@ -176,11 +197,11 @@ def _compensate(x: float, y: float, z: float, t: float, velocity: FloatArray) ->
 @compiled
 def _pixel(x: float, y: float, z: float, planes: Planes) -> tuple[int, bool]:
     per_radian = (planes.height - 1) / (planes.high - planes.low)
-    row, column = _row_and_column(x, y, z, planes.low, per_radian, planes.width)
+    row = _row(_arc_tangent(z, math.sqrt(x * x + y * y)), planes.low, per_radian)
     inside = row >= 0.0 and row < planes.height
     row = row if row > 0.0 else 0.0  # and in the first row
     row = row if row < planes.height else planes.height - 1.0
-    return int(row) * planes.width + int(column), inside
+    return int(row) * planes.width + int(_column(_arc_tangent(y, x), planes.width)), inside
 
 
 @compiled

@@ -39,48 +39,41 @@ def planes(image: Floats, padded: Floats, taken: NDArray[np.bool_], around: Neig
         normals: written.
     """
     height, width = image.shape[1:]
-    sums = np.empty((11, width), dtype=np.float32)
+    sums = np.empty(11, dtype=np.float32)
     for i in range(height):
-        _scatter(image, padded, i, around, sums)
         for j in range(width):
             if taken[i, j] or not image[3, i, j] > 0.0:
                 continue
-            x, y, z = _normal(image[0, i, j], image[1, i, j], image[2, i, j], image[3, i, j], sums[:, j], around)
+            _scatter(image, padded, i, j, around, sums)
+            x, y, z = _normal(image[0, i, j], image[1, i, j], image[2, i, j], image[3, i, j], sums, around)
             normals[0, i, j], normals[1, i, j], normals[2, i, j] = x, y, z
 
 
 @compiled
-def _scatter(image: Floats, padded: Floats, i: int, around: Neighbourhood, sums: Floats) -> None:
-    """Write what the neighbours of each pixel of a row are like, about the pixel itself.
+def _scatter(image: Floats, padded: Floats, i: int, j: int, around: Neighbourhood, sums: Floats) -> None:
+    """Write what the neighbours of a pixel are like, about the pixel itself: coordinates of tens of metres would leave
+    no digits to float32.
 
-    Rows of `sums` (11, W): number, squared distance of the nearest, sums of x, y, z, xx, yy, zz, xy, yz, xz.
+    Entries of `sums` (11,): number, squared distance of the nearest, sums of x, y, z, xx, yy, zz, xy, yz, xz.
     """
-    width, gate_m = image.shape[2], np.float32(around.gate_m)
-    count, nearest, sx, sy, sz, xx, yy, zz, xy, yz, xz = sums
-    count[:], nearest[:], sx[:], sy[:], sz[:] = 0.0, np.inf, 0.0, 0.0, 0.0
-    xx[:], yy[:], zz[:], xy[:], yz[:], xz[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    cx, cy, cz, centre = image[0, i], image[1, i], image[2, i], image[3, i]
-    for down in range(2 * around.rows + 1):
-        for right in range(2 * around.columns + 1):
-            itself = down == around.rows and right == around.columns
-            px, py, pz = padded[0, i + down, right:], padded[1, i + down, right:], padded[2, i + down, right:]
-            distant = padded[3, i + down, right:]
-            for j in range(width):
-                is_near = abs(distant[j] - centre[j]) <= gate_m
-                near = np.float32(1.0) if is_near else np.float32(0.0)
-                x, y, z = (px[j] - cx[j]) * near, (py[j] - cy[j]) * near, (pz[j] - cz[j]) * near
-                squared = x * x + y * y + z * z if is_near and not itself else np.float32(np.inf)
-                nearest[j] = squared if squared < nearest[j] else nearest[j]
-                count[j] += near
-                sx[j] += x
-                sy[j] += y
-                sz[j] += z
-                xx[j] += x * x
-                yy[j] += y * y
-                zz[j] += z * z
-                xy[j] += x * y
-                yz[j] += y * z
-                xz[j] += x * z
+    cx, cy, cz, centre, gate_m = image[0, i, j], image[1, i, j], image[2, i, j], image[3, i, j], around.gate_m
+    zero = np.float32(0.0)
+    count, nearest, sx, sy, sz = 0, np.float32(np.inf), zero, zero, zero
+    xx, yy, zz, xy, yz, xz = zero, zero, zero, zero, zero, zero
+    for down in range(i, i + 2 * around.rows + 1):
+        for right in range(j, j + 2 * around.columns + 1):
+            if not abs(padded[3, down, right] - centre) <= gate_m:
+                continue
+            x, y, z = padded[0, down, right] - cx, padded[1, down, right] - cy, padded[2, down, right] - cz
+            x2, y2, z2 = x * x, y * y, z * z
+            if (down != i + around.rows or right != j + around.columns) and x2 + y2 + z2 < nearest:
+                nearest = x2 + y2 + z2
+            count += 1
+            sx, sy, sz = sx + x, sy + y, sz + z
+            xx, yy, zz = xx + x2, yy + y2, zz + z2
+            xy, yz, xz = xy + x * y, yz + y * z, xz + x * z
+    sums[0], sums[1], sums[2], sums[3], sums[4] = count, nearest, sx, sy, sz
+    sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = xx, yy, zz, xy, yz, xz
 
 
 @compiled

@@ -174,6 +174,10 @@ def _nearest(ranges: Tensor, pixel: Tensor, pixels: int) -> Tensor:
 
 def _images_of(points: Tensor, index: Tensor) -> Tensor:
     """Images (B, 4, H, W) float32 of the points (M, 3) at index (B, H, W)."""
+    if index.numel() < len(points):  # what is not shown need not be worked on
+        chosen = index.flatten()
+        shown = torch.where((chosen >= 0)[:, None], points[chosen.clamp(min=0)], 0.0)
+        points, index = shown, torch.arange(len(shown), device=index.device).view(index.shape)
     values = torch.cat([points.float(), _ranges(points)[:, None]], dim=1)
     # The row of zeros at the end is what index -1 takes.
     values = torch.cat([values, values.new_zeros(1, 4)]).T
