@@ -19,9 +19,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def compiled(function: Function) -> Function:
     """The function, compiled on its first call for the types of its arguments, and kept on disk for the next process.
 
-    It may use NumPy arrays, numbers and tuples of them, and call other compiled functions of its own file: what is kept
-    on disk is outdated when that file changes, but not when another one does. Arithmetic is IEEE's, in the order that
-    is written; divisions by zero give infinity or NaN, as in NumPy. Indices are not checked.
+    It may use NumPy arrays, numbers and tuples of them, constants of its own file, and other compiled functions by
+    their own names: what is kept on disk is outdated when a file of these functions changes. Arithmetic is IEEE's, in
+    the order that is written; divisions by zero give infinity or NaN, as in NumPy. Indices are not checked.
 
     Where nothing can be kept (a read-only installation without a home, a full disk, a damaged file), every process
     compiles anew.
@@ -33,8 +33,19 @@ def compiled(function: Function) -> Function:
         dispatcher = numba.njit(function, nogil=True, error_model="numpy")
     else:
         if hasattr(dispatcher, "_cache"):  # not where numba is switched off
+            _watch_callees(dispatcher)
             dispatcher._cache = _ForgivingCache(dispatcher._cache)
     return cast(Function, dispatcher)
+
+
+def _watch_callees(dispatcher: Any) -> None:
+    """Numba keeps machine code with the age of the function's file; add those of the functions compiled into it."""
+    function = dispatcher.py_func
+    named = (function.__globals__.get(name) for name in function.__code__.co_names)
+    callees = [other for other in named if hasattr(other, "py_func")]
+    files = [other._cache._cache_file for other in (dispatcher, *callees) if hasattr(other._cache, "_cache_file")]
+    if files:
+        files[0]._source_stamp = tuple(file._source_stamp for file in files)
 
 
 class _ForgivingCache:
