@@ -56,13 +56,13 @@ class Cells(NamedTuple):
 
 
 @compiled
-def _cell(coordinate: float) -> int:
+def cell_of(coordinate: float) -> int:
     """The cell along one axis."""
     return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 1))
 
 
 @compiled
-def _key(i: int, j: int, k: int) -> int:
+def key_of(i: int, j: int, k: int) -> int:
     return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
 
 
@@ -129,7 +129,7 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
     """Write the keys (N,) of the cells that points (N, 3) lie in."""
     scale = 1.0 / cell_m
     for n in range(len(points)):
-        keys[n] = _key(_cell(points[n, 0] * scale), _cell(points[n, 1] * scale), _cell(points[n, 2] * scale))
+        keys[n] = key_of(cell_of(points[n, 0] * scale), cell_of(points[n, 1] * scale), cell_of(points[n, 2] * scale))
 
 
 @compiled
@@ -147,9 +147,9 @@ def add_moments(
             continue
         sx, sy, sz = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         # Within the cell's own frame single precision is enough.
-        x = np.float32(sx - _cell(sx) - 0.5)
-        y = np.float32(sy - _cell(sy) - 0.5)
-        z = np.float32(sz - _cell(sz) - 0.5)
+        x = np.float32(sx - cell_of(sx) - 0.5)
+        y = np.float32(sy - cell_of(sy) - 0.5)
+        z = np.float32(sz - cell_of(sz) - 0.5)
         elevation = np.float32(elevations[n])
         cell = sums[rows[n]]
         cell[0] += np.float32(1.0)
@@ -172,8 +172,8 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     scale = 1.0 / cells.cell_m
     for n in range(len(points)):
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
-        i, j, k = _cell(x), _cell(y), _cell(z)
-        row = _find_one(_key(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+        i, j, k = cell_of(x), cell_of(y), cell_of(z)
+        row = _find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
         rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
 
 
@@ -184,7 +184,7 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
-                row = _find_one(_key(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                row = _find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
                 if row == ABSENT:
                     continue
                 count = cells.sums[row, 0]
