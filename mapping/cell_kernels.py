@@ -198,18 +198,24 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
 
 
 @compiled
-def gather(rows: Rows, cells: Cells, totals: FloatArray) -> None:
-    """Write the sums (N, 12) of cells and the 26 around each, weighted, about the middle one's centre."""
-    for n in range(len(rows)):
-        key, total = cells.keys[rows[n]], totals[n]
-        total[:] = 0.0
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                for k in range(-1, 2):
-                    step = i * STRIDE_X + j * STRIDE_Y + k
-                    row = _find_one(key + step, cells.bits, cells.table_keys, cells.table_rows)
-                    if row != ABSENT:
-                        _add_shifted(cells.sums[row], i, j, k, total)
+def middle_of(key: int) -> tuple[float, float, float]:
+    """The middle of a cell, in units of cells."""
+    mask = (1 << BITS) - 1
+    i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
+    return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5
+
+
+@compiled
+def gather(row: int, cells: Cells, total: FloatArray) -> None:
+    """Write the sums (12,) of a cell and the 26 around it, weighted, about its own centre."""
+    total[:] = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                key = cells.keys[row] + i * STRIDE_X + j * STRIDE_Y + k
+                other = _find_one(key, cells.bits, cells.table_keys, cells.table_rows)
+                if other != ABSENT:
+                    _add_shifted(cells.sums[other], i, j, k, total)
 
 
 @compiled

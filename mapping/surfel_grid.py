@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from mapping import cell_kernels as kernels
+from mapping.patch_kernels import refresh
 from mapping.patches import PATCH_COLUMNS, PatchTable
-from mapping.symmetric import SYMMETRIC, eigenvalues, eigenvectors
-from mapping.voxel_table import ABSENT, Rows, VoxelTable, key_cells, point_keys
+from mapping.symmetric import SYMMETRIC
+from mapping.voxel_table import Rows, VoxelTable, key_cells, point_keys
 
 # Columns of a cell's sums: points, first and second moments about the cell's centre in units of the cell, and first
 # and second moment of the elevation they were seen at.
@@ -23,8 +24,6 @@ _COLUMNS = 12
 
 # A cell is handed on to another grid as so many points.
 _SAMPLES = 6
-# A patch is worked out again when its cell has this many times the points it had.
-_GROWTH = 1.3
 
 
 class SurfelGrid:
@@ -64,10 +63,7 @@ class SurfelGrid:
 
     def all_patches(self, rows: Rows) -> FloatArray:
         """What cells show, row by row, as the values of a `PatchTable`; up to date in these rows (N,), or `ABSENT`."""
-        rows = rows[rows != ABSENT]
-        stale = np.flatnonzero(self._patch_counts[rows] * _GROWTH <= self._sums[rows, _COUNT])
-        if len(stale):
-            self._work_out(np.unique(rows[stale]))
+        refresh(rows, self._cells(), self._patches, self._patch_counts)
         return self._patches
 
     def means(self) -> FloatArray:
@@ -114,26 +110,6 @@ class SurfelGrid:
 
     def _cells(self) -> kernels.Cells:
         return kernels.Cells(self.cell_m, *self._table.slots, self._keys, self._sums)
-
-    def _work_out(self, rows: Rows) -> None:
-        keys = self._keys[rows]
-        total = np.empty((len(rows), _COLUMNS))
-        kernels.gather(rows, self._cells(), total)
-        counts = total[:, _COUNT]
-        mean = total[:, _FIRST] / counts[:, None]
-        covariance = total[:, _SECOND] / counts[:, None]
-        for column, (i, j) in enumerate(SYMMETRIC):
-            covariance[:, column] -= mean[:, i] * mean[:, j]
-        values = eigenvalues(covariance)
-        self._patches[rows] = PatchTable.assemble(
-            points=(key_cells(keys) + 0.5 + mean) * self.cell_m,
-            normals=eigenvectors(covariance, values[:, 0]),
-            directions=eigenvectors(covariance, values[:, 2]),
-            spreads_m=np.sqrt(np.maximum(values, 0.0)) * self.cell_m,
-            elevation_spreads=_spread(counts, total[:, _ELEVATION]),
-            counts=counts,
-        ).values
-        self._patch_counts[rows] = self._sums[rows, _COUNT]
 
     def _reserve(self, count: int) -> None:
         if count <= len(self._keys):

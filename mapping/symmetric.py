@@ -38,34 +38,46 @@ def eigenvectors(M: FloatArray, values: FloatArray) -> FloatArray:
 @compiled
 def _write_values(M: FloatArray, values: FloatArray) -> None:
     for n in range(len(M)):
-        xx, xy, xz, yy, yz, zz = M[n, 0], M[n, 1], M[n, 2], M[n, 3], M[n, 4], M[n, 5]
-        mean = (xx + yy + zz) / 3.0
-        a, b, c = xx - mean, yy - mean, zz - mean
-        off = xy * xy + xz * xz + yz * yz
-        p = math.sqrt(max((a * a + b * b + c * c + 2.0 * off) / 6.0, _TINY))
-        determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
-        angle = math.acos(min(max(determinant / (2.0 * p * p * p), -1.0), 1.0)) / 3.0
-        largest = mean + 2.0 * p * math.cos(angle)
-        smallest = mean + 2.0 * p * math.cos(angle + 2.0 * math.pi / 3.0)
-        values[n, 0], values[n, 1], values[n, 2] = smallest, 3.0 * mean - largest - smallest, largest
+        write_eigenvalues(M[n], values[n])
 
 
 @compiled
 def _write_vectors(M: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
     for n in range(len(M)):
-        xy, xz, yz = M[n, 1], M[n, 2], M[n, 4]
-        a, b, c = M[n, 0] - values[n], M[n, 3] - values[n], M[n, 5] - values[n]
-        x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
-        squared = x * x + y * y + z * z
-        for crosses in (
-            (xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz),
-            (b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz),
-        ):
-            u, v, w = crosses
-            length = u * u + v * v + w * w
-            if length > squared:
-                x, y, z, squared = u, v, w, length
-        length = math.sqrt(squared)
-        if not length > _TINY:
-            x, y, z, length = 0.0, 0.0, 1.0, 1.0
-        vectors[n, 0], vectors[n, 1], vectors[n, 2] = x / length, y / length, z / length
+        write_eigenvector(M[n], values[n], vectors[n])
+
+
+@compiled
+def write_eigenvalues(M: FloatArray, values: FloatArray) -> None:
+    """As `eigenvalues`, (3,) of one matrix (6,)."""
+    xx, xy, xz, yy, yz, zz = M[0], M[1], M[2], M[3], M[4], M[5]
+    mean = (xx + yy + zz) / 3.0
+    a, b, c = xx - mean, yy - mean, zz - mean
+    off = xy * xy + xz * xz + yz * yz
+    p = math.sqrt(max((a * a + b * b + c * c + 2.0 * off) / 6.0, _TINY))
+    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    angle = math.acos(min(max(determinant / (2.0 * p * p * p), -1.0), 1.0)) / 3.0
+    largest = mean + 2.0 * p * math.cos(angle)
+    smallest = mean + 2.0 * p * math.cos(angle + 2.0 * math.pi / 3.0)
+    values[0], values[1], values[2] = smallest, 3.0 * mean - largest - smallest, largest
+
+
+@compiled
+def write_eigenvector(M: FloatArray, value: float, vector: FloatArray) -> None:
+    """As `eigenvectors`, (3,) of one matrix (6,)."""
+    xy, xz, yz = M[1], M[2], M[4]
+    a, b, c = M[0] - value, M[3] - value, M[5] - value
+    x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
+    squared = x * x + y * y + z * z
+    for crosses in (
+        (xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz),
+        (b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz),
+    ):
+        u, v, w = crosses
+        length = u * u + v * v + w * w
+        if length > squared:
+            x, y, z, squared = u, v, w, length
+    length = math.sqrt(squared)
+    if not length > _TINY:
+        x, y, z, length = 0.0, 0.0, 1.0, 1.0
+    vector[0], vector[1], vector[2] = x / length, y / length, z / length
