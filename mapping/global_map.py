@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state import Saved, State
+from mapping import global_kernels as kernels
 
 # Three signed voxel coordinates share one 64-bit key; 21 bits reach 52 km at voxels of 5 cm.
 _BITS = 21
@@ -80,11 +81,16 @@ class _Voxels:
         """Add up the rows of equal keys."""
         if not len(keys):
             return cls.empty()
-        # A stable sort merges runs that are sorted already in linear time.
-        order = np.argsort(keys, kind="stable")
-        keys = keys[order]
-        first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
-        return cls(keys[first], np.add.reduceat(sums[order], first, axis=0))
+        unique, totals = np.empty_like(keys), np.empty_like(sums)
+        count = kernels.add_up(np.argsort(keys), keys, sums, unique, totals)
+        return cls(unique[:count].copy(), totals[:count].copy())
+
+    def merged_with(self, other: "_Voxels") -> "_Voxels":
+        """The sums of two reduced tables."""
+        unique = np.empty(len(self.keys) + len(other.keys), dtype=np.int64)
+        totals = np.empty((len(unique), 7), dtype=np.float32)
+        count = kernels.merge(self.keys, self.sums, other.keys, other.sums, unique, totals)
+        return _Voxels(unique[:count].copy(), totals[:count].copy())
 
 
 class GlobalMap:
@@ -121,9 +127,10 @@ class GlobalMap:
         """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp."""
         if not len(points):
             return
-        world = transform_points(T_world_lidar, points)
-        towards_sensor = T_world_lidar[:3, 3] - world
-        self._add(world, towards_sensor / np.linalg.norm(towards_sensor, axis=1, keepdims=True), np.ones(len(points)))
+        keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), 7), dtype=np.float32)
+        T = np.ascontiguousarray(T_world_lidar)
+        kernels.write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
+        self._wait(_Voxels(keys, sums))
 
     def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
         """Add what another map has summed up, as if its points were added here."""
@@ -148,9 +155,12 @@ class GlobalMap:
         sums[:, _VIEW] = views
         sums[:, :_COUNT] *= counts[:, None]
         sums[:, _COUNT] = counts
+        self._wait(_Voxels(_pack(cells), sums))
+
+    def _wait(self, voxels: _Voxels) -> None:
         with self._lock:
-            self._pending.append(_Voxels(_pack(cells), sums))
-            self._pending_size += len(world)
+            self._pending.append(voxels)
+            self._pending_size += len(voxels.keys)
             if self._pending_size > max(_MIN_PENDING, len(self._merged.keys) // 2):
                 self._merge()
 
@@ -184,9 +194,9 @@ class GlobalMap:
     def _merge(self) -> None:
         if not self._pending:
             return
-        joined = _Voxels.join([self._merged, *self._pending])
+        waiting = _Voxels.join(self._pending)
         self._pending, self._pending_size = [], 0
-        self._merged = _Voxels.reduce(joined.keys, joined.sums)
+        self._merged = self._merged.merged_with(_Voxels.reduce(waiting.keys, waiting.sums))
 
 
 def _pack(cells: FloatArray) -> NDArray[np.int64]:

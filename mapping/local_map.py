@@ -8,19 +8,15 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Saved, State
-from mapping.patches import FEWEST_POINTS, PatchTable
+from mapping.match_kernels import Bodies, Pulls, pull_to_bodies, pull_to_planes
+from mapping.patches import PatchTable
 from mapping.surfel_grid import SurfelGrid
 from mapping.voxel_table import ABSENT
 
 # Sizes of the grids, in cells: the finest that shows a plane decides, the coarser reach farther.
 LEVELS = (1, 2, 4)
-# A single ring bent around a corner spans a plane too, the one of its own rays. A plane that holds the rays it was seen
-# by, being seen at a flatter angle than asin of the first, counts only when the rays differ in height by the second.
-_LEAST_SINE = 0.17
-_LEAST_HEIGHT_M = 0.05
 # A patch of three cells filled evenly has a standard deviation of 0.8 cells along each axis.
 _SHORT = 0.5
-_MOST_ACROSS = 0.5
 # Memory is bounded by forgetting what is far away, now and then rather than at every scan.
 _FORGET_AFTER = 0.1
 # A sensor is tilted by less than this from the vertical, as a cosine, when it first looks.
@@ -128,32 +124,25 @@ class LocalMap:
 
         Grids finer than `first_level` are left out, for points that are not yet where they belong.
         """
-        sensor, spin_axis = T_world_lidar[:3, 3], T_world_lidar[:3, 2]
-        waiting = np.arange(len(points))
-        parts = []
-        bodies: tuple[NDArray[np.intp], PatchTable, FloatArray] | None = None
+        points = np.ascontiguousarray(points)
+        pulls, count = _room_for(3 * len(points)), 0
+        waiting, bodies = np.arange(len(points)), None
         for grid in self._planes[first_level:]:
-            there = points.take(waiting, axis=0)
-            rows = grid.look_up(there)
-            occupied = np.flatnonzero(rows != ABSENT)
-            patches = grid.patches(rows[occupied])
-            views = there.take(occupied, axis=0) - sensor
-            ranges = np.sqrt(np.einsum("ij,ij->i", views, views))
-            several_rings = patches.elevation_spreads * ranges > _LEAST_HEIGHT_M
-            chosen = np.flatnonzero(patches.is_plane & (several_rings | _are_faced(patches, views, ranges)))
-            parts.append(_pull_to_planes(waiting[occupied[chosen]], patches.select(chosen)))
-            if bodies is None:
-                body = np.flatnonzero(~patches.is_plane & several_rings & (patches.counts >= FEWEST_POINTS))
-                bodies = waiting[occupied[body]], patches.select(body), views.take(body, axis=0)
-            still = np.ones(len(waiting), dtype=np.bool_)
-            still[occupied[chosen]] = False
-            waiting = waiting[still]
+            rows = grid.look_up(points.take(waiting, axis=0))
+            patches = grid.all_patches(rows)
+            room = Bodies(np.empty(len(waiting), dtype=np.intp), np.empty(len(waiting), dtype=np.int32))
+            sensor = np.array(T_world_lidar[:3, 3])
+            count, left, others = pull_to_planes(points, waiting, rows, patches, sensor, pulls, count, room)
+            waiting = waiting[:left]
+            if bodies is None:  # what is no plane in the finest grid, and in no other
+                bodies, finest = Bodies(room.number[:others], room.rows[:others]), patches
         if bodies is not None:
-            left = np.flatnonzero(np.isin(bodies[0], waiting, assume_unique=True))
-            across_rings = _across_rings(bodies[2].take(left, axis=0), spin_axis)
-            short_m = _SHORT * self._planes[first_level].cell_m
-            parts.append(_pull_to_bodies(bodies[0][left], bodies[1].select(left), across_rings, short_m))
-        return Matches.join(parts)
+            waits = np.zeros(len(points), dtype=np.bool_)
+            waits[waiting] = True
+            T, short_m = np.ascontiguousarray(T_world_lidar), _SHORT * self._planes[first_level].cell_m
+            count = pull_to_bodies(points, waits, bodies, finest, T, short_m, pulls, count)
+        index, towards, normals, thickness_m, tilt = pulls
+        return Matches(index[:count], towards[:count], normals[:count], thickness_m[:count], tilt[:count])
 
     def match_lines(self, points: FloatArray) -> Matches:
         """For edge points (N, 3) of the world the lines they lie on."""
@@ -183,40 +172,10 @@ class LocalMap:
         return other
 
 
-def _are_faced(patches: PatchTable, views: FloatArray, ranges: FloatArray) -> NDArray[np.bool_]:
-    """Which patches (N,), seen along `views` (N, 3) of lengths `ranges` (N,), do not hold the rays they are seen by."""
-    facing = np.abs(np.einsum("ij,ij->i", views, patches.normals))
-    return np.asarray(facing > _LEAST_SINE * ranges, dtype=np.bool_)
-
-
-def _across_rings(views: FloatArray, spin_axis: FloatArray) -> FloatArray:
-    """Unit directions (N, 3) from one ring to the next at points seen along `views` (N, 3)."""
-    u = views / np.maximum(np.sqrt(np.einsum("ij,ij->i", views, views)), 1e-9)[:, None]
-    across = spin_axis - (u @ spin_axis)[:, None] * u
-    return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None], dtype=np.float64)
-
-
-def _pull_to_bodies(index: NDArray[np.intp], patches: PatchTable, across_rings: FloatArray, short_m: float) -> Matches:
-    """Towards the middle of the patch along those of its axes that it is short along.
-
-    Where the surface goes on beyond the patch, as grass does, the patch's middle is no place on it. Across the rings,
-    a patch is as short as the few rings on it are close, wherever the sensor is: the map would follow the sensor.
-    """
-    spreads = patches.spreads_m
-    axes = (patches.normals, np.cross(patches.directions, patches.normals), patches.directions)
-    parts = []
-    for column, axis in enumerate(axes):
-        along_rings = np.abs(np.einsum("ij,ij->i", axis, across_rings)) < _MOST_ACROSS
-        short = np.flatnonzero((spreads[:, column] < short_m) & along_rings)
-        thickness_m = spreads[short, column]
-        parts.append(Matches(index[short], patches.points[short], axis[short], thickness_m, np.zeros(len(short))))
-    return Matches.join(parts)
-
-
-def _pull_to_planes(index: NDArray[np.intp], patches: PatchTable) -> Matches:
-    spreads = patches.spreads_m
-    tilt = spreads[:, 0] / (np.maximum(spreads[:, 1], 1e-9) * np.sqrt(patches.counts))
-    return Matches(index, patches.points, patches.normals, spreads[:, 0], tilt)
+def _room_for(count: int) -> Pulls:
+    vectors = np.empty((2, count, 3))
+    numbers = np.empty((2, count))
+    return Pulls(np.empty(count, dtype=np.intp), *vectors, *numbers)
 
 
 def _pull_to_lines(index: NDArray[np.intp], patches: PatchTable) -> Matches:

@@ -11,14 +11,6 @@ PATCH_COLUMNS = 16
 _POINT, _NORMAL, _DIRECTION, _SPREADS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _ELEVATION, _COUNT, _IS_PLANE, _IS_LINE = 12, 13, 14, 15
 
-# Fewer points show nothing.
-FEWEST_POINTS = 6
-# Spreads are standard deviations along the principal axes. A plane is thin beside its width, and no line; a line is
-# long beside its width: LOAM asks for a largest eigenvalue of three times the next.
-_MOST_THICKNESS = 0.4
-_LEAST_WIDTH = 0.15
-_LEAST_LENGTH = 3.0**0.5
-
 
 @dataclass(frozen=True, eq=False)
 class PatchTable:
@@ -29,35 +21,6 @@ class PatchTable:
     """
 
     values: FloatArray
-
-    @classmethod
-    def assemble(
-        cls,
-        points: FloatArray,
-        normals: FloatArray,
-        directions: FloatArray,
-        spreads_m: FloatArray,
-        elevation_spreads: FloatArray,
-        counts: FloatArray,
-    ) -> "PatchTable":
-        """Put patches together and judge what they are.
-
-        Args:
-            points: (N, 3) in the middle of each patch, in the world.
-            normals: (N, 3) unit, along which the patch is thinnest.
-            directions: (N, 3) unit, along which it is longest.
-            spreads_m: (N, 3) standard deviations along the principal axes, ascending.
-            elevation_spreads: (N,) standard deviation of the angle above the sensor's equator that it was seen at.
-            counts: (N,) points it rests on.
-        """
-        values = np.empty((len(points), PATCH_COLUMNS))
-        values[:, _POINT], values[:, _NORMAL], values[:, _DIRECTION] = points, normals, directions
-        values[:, _SPREADS], values[:, _ELEVATION], values[:, _COUNT] = spreads_m, elevation_spreads, counts
-        thickness, width, length = spreads_m.T
-        enough = counts >= FEWEST_POINTS
-        values[:, _IS_PLANE] = enough & (thickness < _MOST_THICKNESS * width) & (width > _LEAST_WIDTH * length)
-        values[:, _IS_LINE] = enough & (length > _LEAST_LENGTH * width)
-        return cls(values)
 
     def __len__(self) -> int:
         return len(self.values)

@@ -1,7 +1,10 @@
 """Eigenvalues and vectors of many symmetric 3x3 matrices at once, in closed form."""
 
+import math
+
 import numpy as np
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 
 # Columns of the six distinct entries: xx, xy, xz, yy, yz, zz.
@@ -16,16 +19,9 @@ def eigenvalues(M: FloatArray) -> FloatArray:
     The trigonometric solution of the characteristic polynomial: Smith, "Eigenvalues of a symmetric 3x3 matrix",
     Communications of the ACM 4 (1961). Accurate to about 1e-8 of the largest one.
     """
-    xx, xy, xz, yy, yz, zz = M.T
-    mean = (xx + yy + zz) / 3.0
-    a, b, c = xx - mean, yy - mean, zz - mean
-    off = xy * xy + xz * xz + yz * yz
-    p = np.sqrt(np.maximum((a * a + b * b + c * c + 2.0 * off) / 6.0, _TINY))
-    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
-    angle = np.arccos(np.clip(determinant / (2.0 * p**3), -1.0, 1.0)) / 3.0
-    largest = mean + 2.0 * p * np.cos(angle)
-    smallest = mean + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
-    return np.stack([smallest, 3.0 * mean - largest - smallest, largest], axis=1)
+    values = np.empty((len(M), 3))
+    _write_values(np.ascontiguousarray(M), values)
+    return values
 
 
 def eigenvectors(M: FloatArray, values: FloatArray) -> FloatArray:
@@ -34,22 +30,54 @@ def eigenvectors(M: FloatArray, values: FloatArray) -> FloatArray:
     The rows of M - value * I span the plane across the eigenvector: the longest of their cross products is along it.
     Any unit vector where the eigenvalue is not simple.
     """
-    xx, xy, xz, yy, yz, zz = M.T
-    a, b, c = xx - values, yy - values, zz - values
-    crosses = np.stack(
-        [
-            np.stack([xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy], axis=1),
-            np.stack([xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz], axis=1),
-            np.stack([b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz], axis=1),
-        ],
-        axis=1,
-    )
-    squared = np.einsum("nij,nij->ni", crosses, crosses)
-    longest = squared.argmax(axis=1)
-    rows = np.arange(len(M))
-    lengths = np.sqrt(squared[rows, longest])
-    known = lengths > _TINY
-    vectors = np.zeros((len(M), 3))
-    vectors[:, 2] = 1.0
-    vectors[known] = crosses[rows, longest][known] / lengths[known, None]
+    vectors = np.empty((len(M), 3))
+    _write_vectors(np.ascontiguousarray(M), np.ascontiguousarray(values), vectors)
     return vectors
+
+
+@compiled
+def _write_values(M: FloatArray, values: FloatArray) -> None:
+    for n in range(len(M)):
+        write_eigenvalues(M[n], values[n])
+
+
+@compiled
+def _write_vectors(M: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
+    for n in range(len(M)):
+        write_eigenvector(M[n], values[n], vectors[n])
+
+
+@compiled
+def write_eigenvalues(M: FloatArray, values: FloatArray) -> None:
+    """As `eigenvalues`, (3,) of one matrix (6,)."""
+    xx, xy, xz, yy, yz, zz = M[0], M[1], M[2], M[3], M[4], M[5]
+    mean = (xx + yy + zz) / 3.0
+    a, b, c = xx - mean, yy - mean, zz - mean
+    off = xy * xy + xz * xz + yz * yz
+    p = math.sqrt(max((a * a + b * b + c * c + 2.0 * off) / 6.0, _TINY))
+    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    angle = math.acos(min(max(determinant / (2.0 * p * p * p), -1.0), 1.0)) / 3.0
+    largest = mean + 2.0 * p * math.cos(angle)
+    smallest = mean + 2.0 * p * math.cos(angle + 2.0 * math.pi / 3.0)
+    values[0], values[1], values[2] = smallest, 3.0 * mean - largest - smallest, largest
+
+
+@compiled
+def write_eigenvector(M: FloatArray, value: float, vector: FloatArray) -> None:
+    """As `eigenvectors`, (3,) of one matrix (6,)."""
+    xy, xz, yz = M[1], M[2], M[4]
+    a, b, c = M[0] - value, M[3] - value, M[5] - value
+    x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
+    squared = x * x + y * y + z * z
+    for crosses in (
+        (xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz),
+        (b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz),
+    ):
+        u, v, w = crosses
+        length = u * u + v * v + w * w
+        if length > squared:
+            x, y, z, squared = u, v, w, length
+    length = math.sqrt(squared)
+    if not length > _TINY:
+        x, y, z, length = 0.0, 0.0, 1.0, 1.0
+    vector[0], vector[1], vector[2] = x / length, y / length, z / length

@@ -10,14 +10,16 @@ the change is expected to go on as between the motions before.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from lidarslam.core import geometry
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from odometry.alignment_config import AlignmentConfig
-from odometry.pairing import Cloud, Movement, Pairs, filled, pair, sample
-from odometry.sweeps import SweepImages, SweepPairs
-from odometry.torch_geometry import inverse
+from odometry.compiled_sums import CompiledSums
+from odometry.pair_sums import PairSums, Tally, TorchSums
+from odometry.pairing import Movement
+from odometry.sweeps import SweepPairs
 
 # A pair whose motion changes by less than this in a step has arrived: rotation in radians, translation in metres.
 _ARRIVED = 1e-4
@@ -61,10 +63,45 @@ class Aligned:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The unknowns: the motion (B, 4, 4), and the bend (B, 6) beyond the expected one."""
+    """The unknowns: the motions (B, 4, 4), and the bends (B, 6) beyond the expected ones."""
 
-    T_prev_curr: Tensor
-    surprise: Tensor
+    T_prev_curr: FloatArray
+    surprise: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess:
+    """Motions (B, 4, 4) and the information (B, 6, 6) about them, for a change from the left; None: not to be kept."""
+
+    T_prev_curr: FloatArray
+    information: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Before:
+    """What sets the pace: intervals (B,), and the velocities (B, 6) and intervals (B,) of the motions before, or None.
+
+    So few numbers that NumPy is several times as fast with them as torch.
+    """
+
+    interval_s: FloatArray
+    last_velocity: FloatArray | None
+    last_interval_s: FloatArray | None
+
+    @classmethod
+    def of(cls, sweeps: SweepPairs) -> "_Before":
+        last = sweeps.last
+        known = (None, None) if last is None else (_array(last.velocity), _array(last.interval_s))
+        return cls(_array(sweeps.interval_s), *known)
+
+    def movement(self, state: _State) -> Movement:
+        """The change of velocity goes on as before, but for the surprise."""
+        velocity = log(state.T_prev_curr) / self.interval_s[:, None]
+        bend = state.surprise
+        if self.last_velocity is not None and self.last_interval_s is not None:
+            share = self.interval_s / (self.interval_s + self.last_interval_s)
+            bend = bend + share[:, None] * (velocity - self.last_velocity)
+        return Movement(state.T_prev_curr, velocity, bend)
 
 
 @torch.no_grad()
@@ -82,120 +119,85 @@ def align(
         guess_information: (B, 6, 6) inverse covariance of the guesses, for a change from the left; None: they are
             only where to start from.
     """
-    state = _State(T_prev_curr, T_prev_curr.new_zeros(len(T_prev_curr), 6))
-    source = sample(sweeps.current, config.column_step)
-    target = filled(sweeps.previous, config.fill_columns)
-    for done in torch.linspace(0.0, 1.0, config.iterations).tolist():
+    guess = _Guess(_array(T_prev_curr), None if guess_information is None else _array(guess_information))
+    before, sums = _Before.of(sweeps), _sums_over(sweeps, config)
+    state = _State(guess.T_prev_curr, np.zeros((len(guess.T_prev_curr), 6)))
+    for done in np.linspace(0.0, 1.0, config.iterations).tolist():
         scale_m = config.coarse_m * (config.fine_m / config.coarse_m) ** min(1.0, done / config.anneal_share)
-        pairs = pair(_movement(state, sweeps), source, target, scale_m, config)
-        state, moved = _step(state, pairs, scale_m, T_prev_curr, guess_information, config)
+        H, g = sums.normal_equations(before.movement(state), scale_m)
+        state, moved = _step(state, H, g, guess, config)
         if done >= config.anneal_share and moved < _ARRIVED:
             break
-    return _judge(_movement(state, sweeps), source, target, config)
+    movement = before.movement(state)
+    return _judge(movement, sums.tally(movement), config, T_prev_curr)
 
 
-def _movement(state: _State, sweeps: SweepPairs) -> Movement:
-    """The change of velocity goes on as before, but for the surprise."""
-    velocity = _log(state.T_prev_curr) / sweeps.interval_s[:, None]
-    bend = state.surprise
-    if sweeps.last is not None:
-        share = sweeps.interval_s / (sweeps.interval_s + sweeps.last.interval_s)
-        bend = bend + share[:, None] * (velocity - sweeps.last.velocity)
-    return Movement(state.T_prev_curr, velocity, bend)
+def _array(values: Tensor) -> FloatArray:
+    return np.ascontiguousarray(values.double().numpy(force=True))
 
 
-def _normal_equations(pairs: Pairs, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """H (B, 12, 12) and g (B, 12) of the weighted squares, for changes of T_prev_curr from the left and of the bend.
-
-    A point that is seen t seconds after the middle of its sweep, on a pixel seen t' after that of its own, moves with
-    the bend (t + t') times as it does with the motion.
-    """
-    J = torch.cat([torch.linalg.cross(pairs.moved, pairs.normals), pairs.normals], dim=-1)  # (B, N, 6)
-    J = torch.cat([J, J * pairs.offsets_s[..., None]], dim=-1)
-    weighted = J * weights[..., None]
-    return weighted.mT @ J, (weighted.mT @ pairs.residuals[..., None])[..., 0]
+def _sums_over(sweeps: SweepPairs, config: AlignmentConfig) -> PairSums:
+    on_processor = sweeps.current.points.device.type == "cpu" and sweeps.current.points.dtype == torch.float32
+    return CompiledSums(sweeps, config) if on_processor else TorchSums(sweeps, config)
 
 
-def _step(
-    state: _State,
-    pairs: Pairs,
-    scale_m: float,
-    guess: Tensor,
-    guess_information: Tensor | None,
-    config: AlignmentConfig,
-) -> tuple[_State, float]:
+def _step(state: _State, H: FloatArray, g: FloatArray, guess: _Guess, config: AlignmentConfig) -> tuple[_State, float]:
     """One Gauss-Newton step, and by how much it moved the pair it moved most."""
-    squared = pairs.residuals.square() / scale_m**2
-    H, g = _normal_equations(pairs, config.information_per_m2 * pairs.kept / (1.0 + squared).square())
-    # In float32 what a guess says would be lost beside what the images say of other directions.
-    H, g = H.double(), g.double()
-    expected = _expected(config, H)
+    H, g = config.information_per_m2 * H, config.information_per_m2 * g
+    expected = _expected(config)
     H[:, 6:, 6:] += expected
-    g[:, 6:] += state.surprise.double() @ expected
-    if guess_information is not None:
-        away = _log(state.T_prev_curr @ inverse(guess))
-        H[:, :6, :6] += guess_information
-        g[:, :6] += (guess_information @ away[..., None])[..., 0]
-    H += _LEAST_INFORMATION * torch.eye(12, dtype=H.dtype, device=H.device)
-    delta = -torch.linalg.solve(H, g[..., None])[..., 0].to(guess.dtype)
+    g[:, 6:] += state.surprise @ expected
+    if guess.information is not None:
+        away = log(state.T_prev_curr @ inverse(guess.T_prev_curr))
+        H[:, :6, :6] += guess.information
+        g[:, :6] += (guess.information @ away[..., None])[..., 0]
+    H += _LEAST_INFORMATION * np.eye(12)
+    delta = -np.linalg.solve(H, g[..., None])[..., 0]
     step, change = delta[:, :6], delta[:, 6:]
-    step = step * (config.largest_step / step.abs().amax(-1, keepdim=True).clamp(min=config.largest_step))
-    return _State(_exp(step) @ state.T_prev_curr, state.surprise + change), float(step.abs().max())
+    largest = np.abs(step).max(axis=1, keepdims=True)
+    step = step * (config.largest_step / np.maximum(largest, config.largest_step))
+    return _State(exp(step) @ state.T_prev_curr, state.surprise + change), float(np.abs(step).max())
 
 
-def _log(T: Tensor) -> Tensor:
-    """Twists (B, 6) of motions (B, 4, 4); of so few, NumPy is several times as fast as torch."""
-    return torch.from_numpy(geometry.log(T.double().numpy(force=True))).to(T)
-
-
-def _exp(twist: Tensor) -> Tensor:
-    """Motions (B, 4, 4) of twists (B, 6)."""
-    return torch.from_numpy(geometry.exp(twist.double().numpy(force=True))).to(twist)
-
-
-def _expected(config: AlignmentConfig, like: Tensor) -> Tensor:
+def _expected(config: AlignmentConfig) -> FloatArray:
     """(6, 6) inverse covariance of the surprise."""
-    sigmas = like.new_tensor([config.surprise_rad_s] * 3 + [config.surprise_m_s] * 3)
-    return torch.diag(sigmas**-2)
+    return np.diag([config.surprise_rad_s**-2.0] * 3 + [config.surprise_m_s**-2.0] * 3)
 
 
-def _judge(movement: Movement, source: Cloud, target: SweepImages, config: AlignmentConfig) -> Aligned:
-    """How well the images lie on one another in the end."""
-    T = movement.T_prev_curr
-    pairs = pair(movement, source, target, config.fine_m, config)
-    near = pairs.kept & (pairs.residuals.abs() < 2.0 * config.fine_m)
-    matched = near.sum(-1)
-    squares = (pairs.residuals.square() * near).sum(-1)
-    share = matched / source.valid.sum(-1).clamp(min=1)
+def _judge(movement: Movement, tally: Tally, config: AlignmentConfig, like: Tensor) -> Aligned:
+    """How well the images lie on one another in the end; in tensors of another's kind."""
     # What leaves the other image's view on the way says nothing, unless it is most of the scan.
-    explained, weakest = _explained(source.normals @ T[:, :3, :3].mT, pairs.inside, near)
-    in_view = pairs.inside.sum(-1) / source.valid.sum(-1).clamp(min=1)
-    explained = explained * (in_view / _MUCH_IN_VIEW).clamp(max=1.0)
-    residual_m = (squares / matched.clamp(min=1)).sqrt()
-    return Aligned(T, movement.bend, _information(pairs, near, config), share, explained, weakest, residual_m, matched)
+    explained, weakest = _explained(tally.in_view, tally.matched)
+    explained = explained * np.minimum(tally.share_in_view / _MUCH_IN_VIEW, 1.0)
+    residual_m = np.sqrt(tally.squares / np.maximum(tally.count, 1))
+    return Aligned(
+        T_prev_curr=torch.from_numpy(movement.T_prev_curr).to(like),
+        bend=torch.from_numpy(movement.bend).to(like),
+        information=torch.from_numpy(_information(tally.H, config)).to(like),
+        share=torch.from_numpy(tally.share).to(like),
+        explained=torch.from_numpy(explained).to(like),
+        weakest=torch.from_numpy(weakest).to(like),
+        residual_m=torch.from_numpy(residual_m).to(like),
+        matched=torch.from_numpy(tally.count).to(like.device),
+    )
 
 
-def _information(pairs: Pairs, near: Tensor, config: AlignmentConfig) -> Tensor:
+def _information(H: FloatArray, config: AlignmentConfig) -> FloatArray:
     """(B, 6, 6) about the motion: what is left of it when the bend is not known, by Schur's complement."""
-    H, _ = _normal_equations(pairs, near.to(pairs.residuals.dtype))
-    H = H.double()
-    across, bends = H[:, :6, 6:], H[:, 6:, 6:] + _expected(config, H) / config.information_per_m2
-    left: Tensor = H[:, :6, :6] - across @ torch.linalg.solve(bends, across.mT)
-    return left.to(pairs.residuals.dtype)
+    across, bends = H[:, :6, 6:], H[:, 6:, 6:] + _expected(config) / config.information_per_m2
+    return np.asarray(H[:, :6, :6] - across @ np.linalg.solve(bends, np.swapaxes(across, 1, 2)))
 
 
-def _explained(normals: Tensor, inside: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+def _explained(everything: FloatArray, matched: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The least ratio (B,), over directions (B, 3), of the information of points that lie well to that of all in view.
 
-    The smallest generalised eigenvalue of the two sums of squared normals (B, N, 3). To both a little is added, so that
+    The smallest generalised eigenvalue of the two sums (B, 3, 3) of squared normals. To both a little is added, so that
     directions of which hardly any point says anything do not count as missed.
     """
-    everything = (normals * inside[..., None]).mT @ normals
-    matched = (normals * near[..., None]).mT @ normals
-    largest = everything.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1.0)
-    little = (_NEXT_TO_NOTHING * largest)[:, None, None] * torch.eye(3, dtype=normals.dtype, device=normals.device)
-    root = torch.linalg.cholesky((everything + little).double())
-    half = torch.linalg.solve_triangular(root, (matched + little).double(), upper=False)
-    ratio, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(root, half.mT, upper=False))
-    weakest = torch.linalg.solve_triangular(root.mT, vectors[..., :1], upper=True)[..., 0]
-    return ratio[:, 0].to(normals.dtype), torch.nn.functional.normalize(weakest, dim=-1).to(normals.dtype)
+    largest = np.maximum(np.diagonal(everything, axis1=1, axis2=2).max(axis=1), 1.0)
+    little = (_NEXT_TO_NOTHING * largest)[:, None, None] * np.eye(3)
+    root = np.linalg.cholesky(everything + little)
+    half = np.linalg.solve(root, matched + little)
+    ratio, vectors = np.linalg.eigh(np.linalg.solve(root, np.swapaxes(half, 1, 2)))
+    weakest = np.linalg.solve(np.swapaxes(root, 1, 2), vectors[:, :, :1])[:, :, 0]
+    return ratio[:, 0], np.asarray(weakest / np.linalg.norm(weakest, axis=1, keepdims=True))

@@ -2,11 +2,16 @@
 
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from odometry import normal_kernels as kernels
 from odometry.normal_config import NormalConfig
+
+Floats = NDArray[np.float32]
 
 # A neighbourhood that is narrower than this share of its range is narrower than the rounding of its coordinates.
 _NARROWEST = 1e-5
@@ -41,6 +46,39 @@ def surface_normals(images: Tensor, config: NormalConfig) -> Tensor:
     if images.shape[3] < 2 * max(config.columns, config.wide_columns) + 1:
         raise ValueError(f"images of {images.shape[3]} columns are narrower than the neighbourhood")
     images = images[:, :4].float()
+    if images.device.type == "cpu":
+        return torch.stack([_compiled(image, config) for image in images]) if len(images) else images[:, :3].clone()
+    return _on_any_device(images, config)
+
+
+def _compiled(image: Tensor, config: NormalConfig) -> Tensor:
+    """Normals (3, H, W) of one image (4, H, W) in the processor's memory."""
+    values = np.ascontiguousarray(image.numpy())
+    normals = np.zeros((3, *values.shape[1:]), dtype=np.float32)
+    taken = np.zeros(values.shape[1:], dtype=np.bool_)
+    tries = [(config.gate_m, config.columns)]
+    if config.wide_gate_m is not None:
+        tries.append((config.wide_gate_m, config.wide_columns))
+    for gate_m, columns in tries:
+        around = kernels.Neighbourhood(
+            rows=config.rows, columns=columns, gate_m=gate_m, most_apart_m=2.0 * config.gate_m,
+            min_neighbours=config.min_neighbours, max_flatness=config.max_flatness, min_spread=config.min_spread,
+        )  # fmt: skip
+        kernels.planes(values, _padded(values, config.rows, columns), taken, around, normals)
+        taken = np.asarray((normals != 0.0).any(axis=0), dtype=np.bool_)
+    return torch.from_numpy(normals)
+
+
+def _padded(image: Floats, rows: int, columns: int) -> Floats:
+    """The image (4, H, W) with so many rows above and below, and columns that go on round; infinitely far if empty."""
+    padded = np.pad(image, ((0, 0), (0, 0), (columns, columns)), mode="wrap")
+    padded = np.pad(padded, ((0, 0), (rows, rows), (0, 0)))
+    padded[3][padded[3] <= 0.0] = np.inf
+    return padded
+
+
+def _on_any_device(images: Tensor, config: NormalConfig) -> Tensor:
+    """Normals (B, 3, H, W) of images (B, 4, H, W)."""
     normals = _planes(images, config, config.gate_m, config.columns)
     if config.wide_gate_m is not None:
         missing = ~has_normal(normals, 1)[:, None] & (images[:, 3:] > 0.0)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lidarslam.core.geometry import FloatArray
 from odometry.alignment_config import AlignmentConfig
 from odometry.normals import has_normal
 from odometry.projection import ImageGrid
@@ -27,7 +28,7 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Movement:
-    """What alignment estimates of a pair of sweeps.
+    """What alignment estimates of B pairs of sweeps.
 
     Attributes:
         T_prev_curr: (B, 4, 4) from the middle of the current sweep to the middle of the previous one.
@@ -36,9 +37,9 @@ class Movement:
             previous one below.
     """
 
-    T_prev_curr: Tensor
-    velocity: Tensor
-    bend: Tensor
+    T_prev_curr: FloatArray
+    velocity: FloatArray
+    bend: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +105,12 @@ def pair(movement: Movement, source: Cloud, target: SweepImages, scale_m: float,
     The target's pixels are as measured, each at its own time: points are taken to that time, placed, and compared
     there. The time is that of the pixel they would fall into otherwise, right but for the seam of the sweep.
     """
-    T = movement.T_prev_curr
-    moved = transform_points(T, compensate(source.points, source.offsets, movement.velocity + movement.bend))
+    parts = (movement.T_prev_curr, movement.velocity + movement.bend, movement.velocity - movement.bend)
+    T, late, early = (torch.from_numpy(part).to(source.points) for part in parts)
+    moved = transform_points(T, compensate(source.points, source.offsets, late))
     pixel, _ = _place(moved, target)
     offsets = target.offsets.flatten(1).gather(1, pixel)
-    seen = compensate(moved, -offsets, movement.velocity - movement.bend)
+    seen = compensate(moved, -offsets, early)
     pixel, inside = _place(seen, target)
     reference, planes = _gather(target.points, pixel), _gather(target.normals, pixel)
     difference = seen - reference

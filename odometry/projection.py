@@ -3,8 +3,11 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from odometry.image_kernels import nearest_in_pixels
 
 # A scan's elevations are taken between these quantiles, so that single stray points do not stretch the rows.
 _STRAY_SHARE = 0.002
@@ -103,6 +106,9 @@ def project(
         rings: (M,) integers, 0 the lowest laser; negative ones are left out.
     """
     points = _at_least_float32(points)
+    if points.device.type == "cpu" and points.dtype == torch.float32 and image is None and count == 1:
+        index = _compiled(points, grid, rings)
+        return Projection(_images_of(points, index), index)
     row, column = grid.place(points)
     row = (row + 0.5).floor() if rings is None else _rows_of_rings(rings, grid.rows)
     image = torch.zeros_like(row, dtype=torch.int64) if image is None else image
@@ -113,6 +119,21 @@ def project(
     index = _nearest(_ranges(points), torch.where(kept, pixel, pixels), pixels)
     index = index.view(count, grid.rows, grid.columns)
     return Projection(_images_of(points, index), index)
+
+
+def _compiled(points: Tensor, grid: ImageGrid, rings: Tensor | None) -> Tensor:
+    """The nearest point (1, H, W) in each pixel of one image, -1 without, in the processor's memory."""
+    index = np.empty(grid.rows * grid.columns, dtype=np.int64)
+    nearest_m = np.empty(len(index), dtype=np.float32)
+    rows = np.empty(0, dtype=np.int64) if rings is None else _rows_of_rings(rings, grid.rows).long().numpy()
+    height = grid.elevation_high - grid.elevation_low
+    # A single row covers all between the two: its centre lies in their middle.
+    low = grid.elevation_low if grid.rows > 1 else grid.elevation_low + 0.5 * height
+    per_radian = max(grid.rows - 1, 1) / height
+    nearest_in_pixels(
+        points.detach().contiguous().numpy(), rows, low, per_radian, grid.rows, grid.columns, index, nearest_m
+    )
+    return torch.from_numpy(index).view(1, grid.rows, grid.columns)
 
 
 def rotate_columns(images: Tensor, shift: Tensor | int) -> Tensor:
@@ -153,6 +174,10 @@ def _nearest(ranges: Tensor, pixel: Tensor, pixels: int) -> Tensor:
 
 def _images_of(points: Tensor, index: Tensor) -> Tensor:
     """Images (B, 4, H, W) float32 of the points (M, 3) at index (B, H, W)."""
+    if index.numel() < len(points):  # what is not shown need not be worked on
+        chosen = index.flatten()
+        shown = torch.where((chosen >= 0)[:, None], points[chosen.clamp(min=0)], 0.0)
+        points, index = shown, torch.arange(len(shown), device=index.device).view(index.shape)
     values = torch.cat([points.float(), _ranges(points)[:, None]], dim=1)
     # The row of zeros at the end is what index -1 takes.
     values = torch.cat([values, values.new_zeros(1, 4)]).T

@@ -7,12 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.state_file import read_state, write_state
+
+# The first call of a compiled loop takes as long as compiling it.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 
 
 @pytest.fixture

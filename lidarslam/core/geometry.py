@@ -4,6 +4,8 @@ Free functions, no mutation, broadcasting over leading dimensions. A tangent vec
 part)`, rotation first, as GTSAM orders it: `xi = (omega, v)`, shape (..., 6).
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -70,6 +72,8 @@ def _series(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def exp(xi: ArrayLike) -> FloatArray:
     """SE(3) exponential of tangent vectors (..., 6), rotation first (Rodrigues' formula and the left Jacobian)."""
     xi = np.asarray(xi, dtype=np.float64)
+    if xi.size == 6:
+        return _exp_one(xi).reshape(*xi.shape[:-1], 4, 4)
     omega, v = xi[..., :3], xi[..., 3:]
     K = skew(omega)
     K2 = K @ K
@@ -81,6 +85,8 @@ def exp(xi: ArrayLike) -> FloatArray:
 
 def log(T: FloatArray) -> FloatArray:
     """SE(3) logarithm (..., 6) of transforms (..., 4, 4), rotation first; the inverse of `exp` for angles below pi."""
+    if T.size == 16:
+        return _log_one(T).reshape(*T.shape[:-2], 6)
     flat = T.reshape(-1, 4, 4)  # SciPy goes through quaternions, which stay accurate close to pi
     omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec().reshape(*T.shape[:-2], 3)
     angle = np.linalg.norm(omega, axis=-1)
@@ -91,6 +97,66 @@ def log(T: FloatArray) -> FloatArray:
     K = skew(omega)
     V_inv = np.eye(3) - 0.5 * K + coefficient[..., None, None] * (K @ K)
     return np.concatenate([omega, (V_inv @ T[..., :3, 3:4])[..., 0]], axis=-1)
+
+
+def _exp_one(xi: FloatArray) -> FloatArray:
+    """As `exp`, (4, 4) of the only tangent vector; for so little, arrays cost ten times as much as the arithmetic."""
+    a, b, c, x, y, z = xi.reshape(6).tolist()
+    angle = math.sqrt(a * a + b * b + c * c)
+    if not math.isfinite(angle):
+        return np.full((4, 4), np.nan)
+    s, v, j = _coefficients(angle)
+    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
+    u, w, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x v
+    return np.array(
+        [
+            [1.0 - v * (bb + cc), v * ab - s * c, v * ac + s * b, x + v * u + j * (b * h - c * w)],
+            [v * ab + s * c, 1.0 - v * (aa + cc), v * bc - s * a, y + v * w + j * (c * u - a * h)],
+            [v * ac - s * b, v * bc + s * a, 1.0 - v * (aa + bb), z + v * h + j * (a * w - b * u)],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _log_one(T: FloatArray) -> FloatArray:
+    """As `log`, (6,) of the only transform."""
+    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = T.reshape(4, 4).tolist()
+    # Each row of 4 q q^T is a multiple of the quaternion; that with the largest diagonal is the best conditioned.
+    i, j, k = r21 - r12, r02 - r20, r10 - r01
+    rows = (
+        (1.0 + r00 + r11 + r22, i, j, k),
+        (i, 1.0 + r00 - r11 - r22, r01 + r10, r02 + r20),
+        (j, r01 + r10, 1.0 - r00 + r11 - r22, r12 + r21),
+        (k, r02 + r20, r12 + r21, 1.0 - r00 - r11 + r22),
+    )
+    w, i, j, k = rows[max(range(4), key=lambda n: rows[n][n])]
+    sine = math.sqrt(i * i + j * j + k * k)
+    angle = 2.0 * math.atan2(sine, abs(w))
+    scale = math.copysign(angle / sine if sine > 0.0 else 0.0, w)
+    a, b, c = scale * i, scale * j, scale * k
+    if angle < _SMALL_ANGLE:
+        coefficient = 1.0 / 12.0 + angle**2 / 720.0
+    else:
+        s, v, _ = _coefficients(angle)
+        coefficient = (1.0 - s / (2.0 * v)) / angle**2
+    u, g, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x t
+    return np.array(
+        [
+            *(a, b, c),
+            x - 0.5 * u + coefficient * (b * h - c * g),
+            y - 0.5 * g + coefficient * (c * u - a * h),
+            z - 0.5 * h + coefficient * (a * g - b * u),
+        ]
+    )
+
+
+def _coefficients(angle: float) -> tuple[float, float, float]:
+    """As `_series`."""
+    if angle < _SMALL_ANGLE:
+        a2 = angle * angle
+        return 1.0 - a2 / 6.0, 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
+    sine, half = math.sin(angle), math.sin(0.5 * angle)
+    return sine / angle, 2.0 * half * half / (angle * angle), (angle - sine) / (angle * angle * angle)
 
 
 def displacement_m(xi: FloatArray, range_m: float) -> float:

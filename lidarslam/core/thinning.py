@@ -1,13 +1,22 @@
 """Fewer points with the same coverage."""
 
+import threading
+
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 
 # Cells share this many slots; where two meet in one slot, one of them is dropped (a few per cent of a large scan).
 _SLOTS = 1 << 20
-_PRIMES = np.array([73_856_093, 19_349_669, 83_492_791], dtype=np.int32)
+_PRIME_X, _PRIME_Y, _PRIME_Z = 73_856_093, 19_349_669, 83_492_791
+# Farther away, in cells, all is one cell: integers go no farther.
+_FARTHEST = float(1 << 31)
+
+_room = (
+    threading.local()
+)  # the slots, which need not be cleared: to have them anew for every scan takes longer than all
 
 
 def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
@@ -20,13 +29,38 @@ def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
         points: (N, 3).
         cell_m: edge of a cell.
     """
-    scaled = points.astype(np.float32)
-    scaled *= np.float32(1.0 / cell_m)
-    cells = np.floor(scaled, out=scaled).astype(np.int32)
-    cells *= _PRIMES  # wraps around, as a hash may
-    slots = cells[:, 0] + cells[:, 1] + cells[:, 2]
-    slots &= _SLOTS - 1
-    order = np.arange(len(points), dtype=np.int32)
-    last_comer = np.empty(_SLOTS, dtype=np.int32)
-    last_comer[slots] = order
-    return np.flatnonzero(last_comer[slots] == order)
+    if not hasattr(_room, "last_comer"):
+        _room.last_comer = np.empty(_SLOTS, dtype=np.int32)
+    kept = np.empty(len(points), dtype=np.intp)
+    slots = np.empty(len(points), dtype=np.int32)
+    _write_slots(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots)
+    return kept[: _last_comers(slots, _room.last_comer, kept)]
+
+
+@compiled
+def _cell(scaled: np.float32) -> int:
+    cell = np.floor(scaled)
+    # Written so that NaN goes to zero.
+    return int(cell) if cell > -_FARTHEST and cell < _FARTHEST else 0
+
+
+@compiled
+def _write_slots(points: FloatArray, per_metre: np.float32, slots: NDArray[np.int32]) -> None:
+    """Write the slot (N,) of the cell that each of the points (N, 3) lies in."""
+    for n in range(len(points)):
+        x, y, z = np.float32(points[n, 0]), np.float32(points[n, 1]), np.float32(points[n, 2])
+        mixed = _cell(x * per_metre) * _PRIME_X + _cell(y * per_metre) * _PRIME_Y + _cell(z * per_metre) * _PRIME_Z
+        slots[n] = mixed & (_SLOTS - 1)
+
+
+@compiled
+def _last_comers(slots: NDArray[np.int32], last_comer: NDArray[np.int32], kept: NDArray[np.intp]) -> int:
+    """Write which points are the last in their slots (N,), ascending; return how many."""
+    for n in range(len(slots)):
+        last_comer[slots[n]] = n
+    count = 0
+    for n in range(len(slots)):
+        if last_comer[slots[n]] == n:
+            kept[count] = n
+            count += 1
+    return count

@@ -144,6 +144,27 @@ def test_every_function_broadcasts_over_leading_dimensions(rng):
         )
 
 
+@pytest.mark.parametrize("angle", [*ANGLES, np.pi, 5.0])
+def test_one_motion_is_as_one_of_many(angle):
+    """A single motion goes through numbers, several through arrays."""
+    for seed in range(5):
+        xi = turn(angle, seed)
+        T = g.exp(np.stack([xi, xi]))
+        np.testing.assert_allclose(g.exp(xi), T[0], atol=1e-14 * max(1.0, np.abs(T).max()))
+        one, several = g.log(T[0]), g.log(T)[1]
+        # Half a turn is one to either side.
+        np.testing.assert_allclose(g.exp(one), g.exp(several), atol=1e-9)
+        if angle < 3.1:
+            np.testing.assert_allclose(one, several, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+def test_what_is_no_motion_does_not_stop_anything(bad):
+    with np.errstate(all="ignore"):
+        assert g.exp(np.full(6, bad)).shape == (4, 4)
+        assert g.log(np.full((4, 4), bad)).shape == (6,)
+
+
 def test_nothing_is_changed_in_place():
     T = g.exp(turn(1.0))
     T.setflags(write=False)

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from odometry.normal_config import NormalConfig
-from odometry.normals import _eigenvalues, _null_vector, surface_normals
+from odometry.normals import _eigenvalues, _null_vector, _on_any_device, surface_normals
 
 CONFIG = NormalConfig()
 FIRST_TRY = NormalConfig(wide_gate_m=None)
@@ -284,3 +284,19 @@ def test_normals_of_sparse_points_are_numbers(spread):
     assert normals.isfinite().all()
     length = normals.norm(dim=1)
     assert ((length < 1e-6) | ((length - 1.0).abs() < 1e-4)).all()
+
+
+@pytest.mark.parametrize("config", [CONFIG, FIRST_TRY, NormalConfig(rows=2, columns=2, wide_columns=3, gate_m=0.2)])
+@pytest.mark.parametrize("noise_m", [0.01, 0.03])
+def test_the_compiled_loop_finds_what_torch_finds(config: NormalConfig, noise_m: float) -> None:
+    """On a processor a loop does what torch does elsewhere; where a neighbourhood is just a plane, rounding decides."""
+    image = image_of(rays(), room(rays())[0], noise_m)
+    image[..., ::7, 20:60] = 0.0
+    images = torch.cat([image, image.roll(50, -1)])
+    loop, torchs = surface_normals(images, config), _on_any_device(images, config)
+    there, also = loop.norm(dim=1) > 0.0, torchs.norm(dim=1) > 0.0
+    assert there.float().mean() > 0.3
+    assert (there != also).float().mean() < 1e-3
+    cosine = (loop * torchs).sum(dim=1)[there & also]
+    assert (cosine < 1.0 - 1e-4).float().mean() < 1e-3
+    assert not loop[:, :, image[0, 3] == 0.0][0].any()

@@ -265,3 +265,25 @@ def test_mirrored_images_are_of_mirrored_clouds() -> None:
     before = project(points, GRID)
     assert torch.equal(mirrored.index, before.index.flip(2))
     assert torch.equal(mirror(before.images), mirrored.images)
+
+
+@pytest.mark.parametrize("by_ring", [False, True])
+def test_the_compiled_loop_shows_the_points_that_torch_shows(by_ring: bool) -> None:
+    """Images of processors' memory are made by a loop, others and batches by torch: here as the first of two."""
+    points = random_cloud(30_000).float()
+    points[::50] *= 0.5  # nearer than others in their pixel
+    points[5], points[6], points[7] = math.nan, math.inf, 0.0
+    points[8] = torch.tensor([1.0, 0.0, 9.0])  # above the grid
+    rings = torch.arange(len(points)) % 40 - 2 if by_ring else None
+    one = project(points, GRID, rings=rings)
+    two = project(points, GRID, torch.zeros(len(points), dtype=torch.int64), 2, rings)
+    assert (one.index >= 0).sum() > 1000
+    torch.testing.assert_close(one.index[0], two.index[0], rtol=0.0, atol=0.0)
+    torch.testing.assert_close(one.images[0], two.images[0], rtol=0.0, atol=0.0)
+
+
+def test_a_row_of_one_shows_what_torch_shows() -> None:
+    grid = ImageGrid(1, 90, math.radians(-15.0), math.radians(15.0))
+    points = random_cloud(3_000).float()
+    one, two = project(points, grid), project(points, grid, torch.zeros(len(points), dtype=torch.int64), 2)
+    torch.testing.assert_close(one.index[0], two.index[0], rtol=0.0, atol=0.0)

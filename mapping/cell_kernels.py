@@ -1,0 +1,237 @@
+"""The loops over points and cells behind `VoxelTable` and `SurfelGrid`, compiled.
+
+Tables are open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows` (2^bits,)
+int32. A cell's sums are (12,) float32: points, first and second moments about the cell's centre in units of the cell
+(x, y, z, xx, xy, xz, yy, yz, zz), and first and second moment of the elevation they were seen at.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+
+Keys = NDArray[np.int64]
+Rows = NDArray[np.int32]
+Floats = NDArray[np.float32]
+
+ABSENT = -1
+EMPTY = -1
+# Three signed cell coordinates share one 64-bit key. It is linear in them: a neighbour's key is the cell's plus a
+# constant. 21 bits reach 52 km at cells of 5 cm; what is farther counts as lying there.
+BITS = 21
+OFFSET = 1 << (BITS - 1)
+STRIDE_X, STRIDE_Y = 1 << (2 * BITS), 1 << BITS
+ORIGIN = OFFSET * (STRIDE_X + STRIDE_Y + 1)
+# Fibonacci hashing: the multiplier is 2^64 over the golden ratio.
+_MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
+_ABOVE_BITS = 3
+
+# Weight of a neighbour's points in a patch, by how many coordinates it differs in: near ones decide.
+_NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
+# A cell that has seen so many points knows its surface; it is left as it is, and drift does not smear it.
+_MOST_POINTS = 60.0
+
+
+class Cells(NamedTuple):
+    """The arrays of a grid of M cells.
+
+    Attributes:
+        cell_m: edge of a cell.
+        bits: the table has two to the power of these slots.
+        table_keys, table_rows: the hash table.
+        keys: (M,) of the cells, by row.
+        sums: (M, 12) of their points' moments.
+    """
+
+    cell_m: float
+    bits: int
+    table_keys: Keys
+    table_rows: Rows
+    keys: Keys
+    sums: Floats
+
+
+@compiled
+def cell_of(coordinate: float) -> int:
+    """The cell along one axis."""
+    return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 1))
+
+
+@compiled
+def key_of(i: int, j: int, k: int) -> int:
+    return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
+
+
+@compiled
+def _home(key: int, bits: int) -> int:
+    """The slot where the search for a key begins; cells above one another share a line of the processor's cache."""
+    column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
+    return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
+
+
+@compiled
+def _find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
+    slot = _home(key, bits)
+    while table_keys[slot] != EMPTY:
+        if table_keys[slot] == key:
+            return int(table_rows[slot])
+        slot = (slot + 1) & ((1 << bits) - 1)
+    return ABSENT
+
+
+@compiled
+def find(keys: Keys, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows) -> None:
+    """Write the rows (N,) of keys (N,), `ABSENT` where there is none."""
+    for n in range(len(keys)):
+        rows[n] = _find_one(keys[n], bits, table_keys, table_rows)
+
+
+@compiled
+def insert(
+    keys: Keys, begin: int, count: int, most: int, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows
+) -> tuple[int, int]:
+    """Write the rows of keys (N,) from `begin` on, of new keys the next ones, until the table holds `most`.
+
+    Returns:
+        How far it got, and how many rows there are now.
+    """
+    for n in range(begin, len(keys)):
+        slot = _home(keys[n], bits)
+        while table_keys[slot] != EMPTY and table_keys[slot] != keys[n]:
+            slot = (slot + 1) & ((1 << bits) - 1)
+        if table_keys[slot] == EMPTY:
+            if count >= most:
+                return n, count
+            table_keys[slot] = keys[n]
+            table_rows[slot] = count
+            count += 1
+        rows[n] = table_rows[slot]
+    return len(keys), count
+
+
+@compiled
+def place(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows) -> None:
+    """Put unique new keys (N,) with their rows (N,) into a table that has room for them."""
+    for n in range(len(keys)):
+        slot = _home(keys[n], bits)
+        while table_keys[slot] != EMPTY:
+            slot = (slot + 1) & ((1 << bits) - 1)
+        table_keys[slot] = keys[n]
+        table_rows[slot] = rows[n]
+
+
+@compiled
+def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
+    """Write the keys (N,) of the cells that points (N, 3) lie in."""
+    scale = 1.0 / cell_m
+    for n in range(len(points)):
+        keys[n] = key_of(cell_of(points[n, 0] * scale), cell_of(points[n, 1] * scale), cell_of(points[n, 2] * scale))
+
+
+@compiled
+def add_moments(
+    points: FloatArray, elevations: FloatArray, keys: Keys, rows: Rows, cell_m: float, grid_keys: Keys, sums: Floats
+) -> None:
+    """Add points (N, 3), seen at angles (N,), to the sums of their cells, unless these have seen enough before."""
+    scale = 1.0 / cell_m
+    growing = np.empty(len(rows), dtype=np.bool_)
+    for n in range(len(rows)):
+        growing[n] = sums[rows[n], 0] < _MOST_POINTS
+        grid_keys[rows[n]] = keys[n]
+    for n in range(len(rows)):
+        if not growing[n]:
+            continue
+        sx, sy, sz = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
+        # Within the cell's own frame single precision is enough.
+        x = np.float32(sx - cell_of(sx) - 0.5)
+        y = np.float32(sy - cell_of(sy) - 0.5)
+        z = np.float32(sz - cell_of(sz) - 0.5)
+        elevation = np.float32(elevations[n])
+        cell = sums[rows[n]]
+        cell[0] += np.float32(1.0)
+        cell[1] += x
+        cell[2] += y
+        cell[3] += z
+        cell[4] += x * x
+        cell[5] += x * y
+        cell[6] += x * z
+        cell[7] += y * y
+        cell[8] += y * z
+        cell[9] += z * z
+        cell[10] += elevation
+        cell[11] += elevation * elevation
+
+
+@compiled
+def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
+    """Write the rows (N,) of the cells that points (N, 3) lie in, else of the nearest around; or `ABSENT`."""
+    scale = 1.0 / cells.cell_m
+    for n in range(len(points)):
+        x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
+        i, j, k = cell_of(x), cell_of(y), cell_of(z)
+        row = _find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+        rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
+
+
+@compiled
+def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
+    """Of the occupied cells around an empty one, that whose mean is nearest to a point; all in units of cells."""
+    nearest, least = ABSENT, np.inf
+    for a in range(i - 1, i + 2):
+        for b in range(j - 1, j + 2):
+            for c in range(k - 1, k + 2):
+                row = _find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                if row == ABSENT:
+                    continue
+                count = cells.sums[row, 0]
+                dx = cells.sums[row, 1] / count + (a + 0.5 - x)
+                dy = cells.sums[row, 2] / count + (b + 0.5 - y)
+                dz = cells.sums[row, 3] / count + (c + 0.5 - z)
+                squared = dx * dx + dy * dy + dz * dz
+                if squared < least:
+                    nearest, least = row, squared
+    return nearest
+
+
+@compiled
+def middle_of(key: int) -> tuple[float, float, float]:
+    """The middle of a cell, in units of cells."""
+    mask = (1 << BITS) - 1
+    i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
+    return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5
+
+
+@compiled
+def gather(row: int, cells: Cells, total: FloatArray) -> None:
+    """Write the sums (12,) of a cell and the 26 around it, weighted, about its own centre."""
+    total[:] = 0.0
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                key = cells.keys[row] + i * STRIDE_X + j * STRIDE_Y + k
+                other = _find_one(key, cells.bits, cells.table_keys, cells.table_rows)
+                if other != ABSENT:
+                    _add_shifted(cells.sums[other], i, j, k, total)
+
+
+@compiled
+def _add_shifted(sums: Floats, i: int, j: int, k: int, total: FloatArray) -> None:
+    """Add moments about the centre of a cell so many cells away to moments about the own centre."""
+    weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]
+    n, x, y, z = np.float64(sums[0]), np.float64(sums[1]), np.float64(sums[2]), np.float64(sums[3])
+    total[0] += weight * n
+    total[1] += weight * (x + i * n)
+    total[2] += weight * (y + j * n)
+    total[3] += weight * (z + k * n)
+    total[4] += weight * (sums[4] + 2 * i * x + i * i * n)
+    total[5] += weight * (sums[5] + i * y + j * x + i * j * n)
+    total[6] += weight * (sums[6] + i * z + k * x + i * k * n)
+    total[7] += weight * (sums[7] + 2 * j * y + j * j * n)
+    total[8] += weight * (sums[8] + j * z + k * y + j * k * n)
+    total[9] += weight * (sums[9] + 2 * k * z + k * k * n)
+    total[10] += weight * sums[10]
+    total[11] += weight * sums[11]

@@ -1,0 +1,257 @@
+"""The loops over pairs of points and planes behind alignment on a processor, compiled.
+
+What they compute is said where torch does it for batches on any device: `odometry.pairing` and `odometry.pair_sums`.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+from odometry.image_kernels import column_of, row_of, write_angles
+
+Floats = NDArray[np.float32]
+
+# Points that are worked on together, so that the processor takes several at once.
+BLOCK = 256
+# Sine of the angle between beam and surface below which pixels are not taken as any wider.
+_MOST_GRAZING = 0.2
+
+
+class Sweep(NamedTuple):
+    """Points that are held against an image.
+
+    Attributes:
+        points, normals: (N, 3).
+        offsets: (N,) seconds from the middle of the sweep.
+    """
+
+    points: Floats
+    normals: Floats
+    offsets: Floats
+
+
+class Planes(NamedTuple):
+    """An image that points are held against.
+
+    Attributes:
+        pixels: (H * W, 7) point, normal and seconds from the middle of the sweep, of each pixel.
+        height, width: H and W.
+        low, high: elevation of the centres of the first and the last row, radians.
+        rolling: whether any of the seconds is not zero.
+    """
+
+    pixels: Floats
+    height: int
+    width: int
+    low: float
+    high: float
+    rolling: bool
+
+
+class Gates(NamedTuple):
+    """What a point may differ by from the pixel it is held against; see `AlignmentConfig`."""
+
+    gate_m: float
+    gate_share: float
+    least_cosine: float
+
+
+class Motion(NamedTuple):
+    """T_prev_curr (4, 4), and the velocities (6,) in the middles of the previous and of the current sweep."""
+
+    T: FloatArray
+    early: FloatArray
+    late: FloatArray
+
+
+class Held(NamedTuple):
+    """A block of points held against planes, as `odometry.pairing.Pairs` has them; each (256,)."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    u: FloatArray
+    v: FloatArray
+    w: FloatArray
+    residuals: FloatArray
+    offsets_s: FloatArray
+    inside: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+
+
+@compiled
+def fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels: Floats) -> None:
+    """Write the pixels (H * W, 7) of images (3, H, W), (3, H, W), (H, W); see `odometry.pairing.filled`."""
+    height, width = offsets.shape
+    for i in range(height):
+        for j in range(width):
+            source = j
+            for step in range(2 * columns + 1):
+                distance = (step + 1) // 2 * (1 if step % 2 == 1 else -1)  # 0, 1 to the left, 1 to the right, 2 ...
+                c = (j - distance) % width
+                u, v, w = normals[0, i, c], normals[1, i, c], normals[2, i, c]
+                if u * u + v * v + w * w > 0.5:
+                    source = c
+                    break
+            pixel = pixels[i * width + j]
+            for axis in range(3):
+                pixel[axis], pixel[3 + axis] = points[axis, i, source], normals[axis, i, source]
+            pixel[6] = offsets[i, source]
+
+
+@compiled
+def _compensate(x: float, y: float, z: float, t: float, velocity: FloatArray) -> tuple[float, float, float]:
+    """A point as seen from the middle of the sweep, t seconds before it was measured; see `odometry.sweeps`."""
+    a, b, c = velocity[0], velocity[1], velocity[2]
+    u = b * z - c * y + velocity[3]
+    v = c * x - a * z + velocity[4]
+    w = a * y - b * x + velocity[5]
+    half = 0.5 * t
+    return (
+        x + t * (u + half * (b * w - c * v)),
+        y + t * (v + half * (c * u - a * w)),
+        z + t * (w + half * (a * v - b * u)),
+    )
+
+
+@compiled
+def _place(
+    held: Held, size: int, planes: Planes, angles: tuple[FloatArray, FloatArray], pixels: NDArray[np.int64]
+) -> None:
+    """Write the pixels of a block of points, and whether they are inside; `angles` (256,) are room."""
+    elevations, azimuths = angles
+    per_radian = (planes.height - 1) / (planes.high - planes.low)
+    write_angles(held.x[:size], held.y[:size], held.z[:size], elevations, azimuths)
+    for i in range(size):
+        row = row_of(elevations[i], planes.low, per_radian)
+        held.inside[i] = row >= 0.0 and row < planes.height
+        row = row if row > 0.0 else 0.0  # NaN lies in the first row
+        row = row if row < planes.height else planes.height - 1.0
+        pixels[i] = int(row) * planes.width + int(column_of(azimuths[i], planes.width))
+
+
+@compiled
+def _hold(
+    begin: int, size: int, sweep: Sweep, planes: Planes, motion: Motion, scale_m: float, gates: Gates, held: Held
+) -> None:
+    """Hold a block of points against the planes of the pixels that they fall into; see `odometry.pairing.pair`."""
+    T, angles, pixels = motion.T, (np.empty(BLOCK), np.empty(BLOCK)), np.empty(BLOCK, dtype=np.int64)
+    for i in range(size):
+        n = begin + i
+        a, b, c, t = sweep.points[n, 0], sweep.points[n, 1], sweep.points[n, 2], np.float64(sweep.offsets[n])
+        x, y, z = _compensate(np.float64(a), np.float64(b), np.float64(c), t, motion.late)
+        held.x[i] = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        held.y[i] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        held.z[i] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        held.offsets_s[i] = t
+    _place(held, size, planes, angles, pixels)
+    if planes.rolling:
+        for i in range(size):
+            t = np.float64(planes.pixels[pixels[i], 6])
+            held.offsets_s[i] += t
+            held.x[i], held.y[i], held.z[i] = _compensate(held.x[i], held.y[i], held.z[i], -t, motion.early)
+        _place(held, size, planes, angles, pixels)
+    for i in range(size):
+        n, p = begin + i, planes.pixels[pixels[i]]
+        x, y, z = held.x[i], held.y[i], held.z[i]
+        u, v, w = np.float64(p[3]), np.float64(p[4]), np.float64(p[5])
+        dx, dy, dz = x - p[0], y - p[1], z - p[2]
+        squared = x * x + y * y + z * z
+        across = max(abs(x * u + y * v + z * w), _MOST_GRAZING * math.sqrt(squared))
+        gate = gates.gate_m + gates.gate_share * squared / max(across, 1e-6) + scale_m
+        a, b, c = sweep.normals[n, 0], sweep.normals[n, 1], sweep.normals[n, 2]
+        cosine = (
+            (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c) * u
+            + (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c) * v
+            + (T[2, 0] * a + T[2, 1] * b + T[2, 2] * c) * w
+        )
+        near = dx * dx + dy * dy + dz * dz < gate * gate
+        held.kept[i] = held.inside[i] and near and cosine > gates.least_cosine
+        held.u[i], held.v[i], held.w[i] = u, v, w
+        held.residuals[i] = dx * u + dy * v + dz * w
+
+
+@compiled
+def _room() -> Held:
+    # Arrays of their own: of views of one, the compiler cannot tell that they do not overlap.
+    x, y, z, residuals = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    u, v, w, offsets_s = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    inside, kept = np.empty(BLOCK, dtype=np.bool_), np.empty(BLOCK, dtype=np.bool_)
+    return Held(x, y, z, u, v, w, residuals, offsets_s, inside, kept)
+
+
+@compiled
+def normal_equations(
+    sweep: Sweep, planes: Planes, motion: Motion, scale_m: float, gates: Gates, H: FloatArray, g: FloatArray
+) -> None:
+    """Write H (12, 12) and g (12,) of the squares of residuals, with Geman and McClure's weights of this scale."""
+    H[:], g[:], J, held = 0.0, 0.0, np.empty(12), _room()
+    for begin in range(0, len(sweep.points), BLOCK):
+        size = min(BLOCK, len(sweep.points) - begin)
+        _hold(begin, size, sweep, planes, motion, scale_m, gates, held)
+        for i in range(size):
+            if held.kept[i]:
+                root = 1.0 + (held.residuals[i] / scale_m) ** 2
+                _add(i, held, 1.0 / (root * root), H, g, J)
+
+
+@compiled
+def judge(
+    sweep: Sweep, planes: Planes, motion: Motion, scale_m: float, gates: Gates, H: FloatArray, in_view: FloatArray,
+    matched: FloatArray,
+) -> tuple[int, int, float]:  # fmt: skip
+    """Sums over the points in view, and over those that lie well, which is within twice the scale.
+
+    Args:
+        sweep, planes, motion, scale_m, gates: as for `normal_equations`.
+        H: (12, 12), written: as of `normal_equations`, with weights of 1, of those that lie well.
+        in_view, matched: (3, 3), written: of the squares of the normals in the previous frame.
+
+    Returns:
+        How many are in view, how many lie well, and the sum of the latter's squared residuals.
+    """
+    H[:], in_view[:], matched[:], J, g, held = 0.0, 0.0, 0.0, np.empty(12), np.zeros(12), _room()
+    seen, count, squares, turned = 0, 0, 0.0, np.empty(3)
+    for begin in range(0, len(sweep.points), BLOCK):
+        size = min(BLOCK, len(sweep.points) - begin)
+        _hold(begin, size, sweep, planes, motion, scale_m, gates, held)
+        for i in range(size):
+            if not held.inside[i]:
+                continue
+            seen += 1
+            a, b, c = sweep.normals[begin + i, 0], sweep.normals[begin + i, 1], sweep.normals[begin + i, 2]
+            for j in range(3):
+                turned[j] = motion.T[j, 0] * a + motion.T[j, 1] * b + motion.T[j, 2] * c
+            _add_square(turned, in_view)
+            if held.kept[i] and abs(held.residuals[i]) < 2.0 * scale_m:
+                _add_square(turned, matched)
+                count += 1
+                squares += held.residuals[i] ** 2
+                _add(i, held, 1.0, H, g, J)
+    return seen, count, squares
+
+
+@compiled
+def _add_square(vector: FloatArray, total: FloatArray) -> None:
+    for i in range(3):
+        for j in range(3):
+            total[i, j] += vector[i] * vector[j]
+
+
+@compiled
+def _add(i: int, held: Held, weight: float, H: FloatArray, g: FloatArray, J: FloatArray) -> None:
+    """Add one point's share to H (12, 12) and g (12,); J (12,) is room."""
+    x, y, z, u, v, w = held.x[i], held.y[i], held.z[i], held.u[i], held.v[i], held.w[i]
+    J[0], J[1], J[2] = y * w - z * v, z * u - x * w, x * v - y * u
+    J[3], J[4], J[5] = u, v, w
+    for j in range(6):
+        J[6 + j] = held.offsets_s[i] * J[j]
+    for j in range(12):
+        weighted = weight * J[j]
+        g[j] += weighted * held.residuals[i]
+        for k in range(12):
+            H[j, k] += weighted * J[k]

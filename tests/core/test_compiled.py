@@ -1,0 +1,136 @@
+"""Compiled loops work, and go on working when nothing can be kept on disk, or what is kept is damaged or outdated."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.compiled import compiled
+
+SOURCE = """
+from lidarslam.core.compiled import compiled
+
+@compiled
+def total(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+"""
+CALLEE = """
+from lidarslam.core.compiled import compiled
+
+@compiled
+def factor(value):
+    return {factor} * value
+"""
+CALLER = """
+from lidarslam.core.compiled import compiled
+from callee import factor
+
+@compiled
+def scaled(value):
+    return factor(value)
+"""
+
+Load = Callable[[str, str], ModuleType]
+
+
+@pytest.fixture
+def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
+    """Write a module, and load it as a new process would."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write_and_load(name: str, source: str) -> ModuleType:
+        file = tmp_path / f"{name}.py"
+        if not file.exists() or file.read_text() != source:
+            file.write_text(source)
+        module = ModuleType(name)
+        monkeypatch.setitem(sys.modules, name, module)
+        # Python's own cache goes by whole seconds.
+        exec(compile(source, str(file), "exec"), module.__dict__)
+        return module
+
+    return write_and_load
+
+
+def loaded_from_disk(function: Any) -> int:
+    return sum(function.stats.cache_hits.values())
+
+
+def kept(folder: Path) -> list[Path]:
+    return sorted(folder.glob("__pycache__/*.nb[ic]"))
+
+
+def test_computes_and_is_kept_for_the_next_process(load: Load, tmp_path: Path) -> None:
+    first = load("sums", SOURCE)
+    assert first.total(np.arange(4.0)) == 6.0
+    assert loaded_from_disk(first.total) == 0
+    assert kept(tmp_path)
+    second = load("sums", SOURCE)
+    assert second.total(np.arange(4.0)) == 6.0
+    assert loaded_from_disk(second.total) == 1
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [b"", b"\x80\x04broken", b"\x00" * 500])
+def test_a_damaged_file_costs_time_only_and_is_made_anew(load: Load, tmp_path: Path, ending: str, left: bytes) -> None:
+    load("sums", SOURCE).total(np.arange(4.0))
+    damaged = [file for file in kept(tmp_path) if file.suffix == f".{ending}"]
+    assert damaged
+    for file in damaged:
+        file.write_bytes(left)
+    again = load("sums", SOURCE)
+    assert again.total(np.arange(4.0)) == 6.0
+    assert loaded_from_disk(again.total) == 0
+    healed = load("sums", SOURCE)
+    assert healed.total(np.arange(4.0)) == 6.0
+    assert loaded_from_disk(healed.total) == 1
+
+
+def test_a_full_disk_costs_time_only(load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    module = load("sums", SOURCE)
+    monkeypatch.setattr(module.total._cache._cache_file, "save", full)
+    assert module.total(np.arange(4.0)) == 6.0
+    assert not kept(tmp_path)
+
+
+def test_where_no_folder_will_do_nothing_is_kept() -> None:
+    """A function without a file is as one in a folder that cannot be written, for a user without a home."""
+    names: dict[str, Any] = {}
+    exec(compile(SOURCE, "<nowhere>", "exec"), names)
+    assert names["total"](np.arange(4.0)) == 6.0
+
+
+def test_numba_may_be_switched_off() -> None:
+    code = "from lidarslam.core.thinning import one_per_cell; import numpy as np; print(one_per_cell(np.eye(3), 9.0))"
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[2]", done.stderr
+
+
+def test_a_change_of_what_is_called_outdates_what_calls(load: Load) -> None:
+    for factor in (2.0, 10.0):
+        load("callee", CALLEE.format(factor=factor))
+        assert load("caller", CALLER).scaled(3.0) == 3.0 * factor
+    load("callee", CALLEE.format(factor=10.0))
+    unchanged = load("caller", CALLER)
+    assert unchanged.scaled(3.0) == 30.0
+    assert loaded_from_disk(unchanged.scaled) == 1
+
+
+def test_division_by_zero_gives_infinity_as_in_numpy() -> None:
+    @compiled
+    def inverse(value: float) -> float:
+        return 1.0 / value
+
+    assert inverse(0.0) == np.inf

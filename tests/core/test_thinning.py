@@ -1,0 +1,47 @@
+"""Thinning against the same hash written with arrays."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.thinning import one_per_cell
+
+
+def by_arrays(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
+    """The last comer of every slot; integers of 32 bits wrap around, as a hash may."""
+    cells = np.floor(points.astype(np.float32) * np.float32(1.0 / cell_m)).astype(np.int32)
+    slots = (cells * np.array([73_856_093, 19_349_669, 83_492_791], dtype=np.int32)).sum(axis=1, dtype=np.int32)
+    last = {int(slot) & ((1 << 20) - 1): n for n, slot in enumerate(slots)}
+    return np.array(sorted(last.values()), dtype=np.intp)
+
+
+@pytest.mark.parametrize("cell_m", [0.05, 0.7, 10.0])
+def test_equals_the_hash_with_arrays(rng: np.random.Generator, cell_m: float) -> None:
+    points = rng.normal(0.0, 15.0, (30_000, 3))
+    np.testing.assert_array_equal(one_per_cell(points, cell_m), by_arrays(points, cell_m))
+    # The slots of the scan before are still there.
+    np.testing.assert_array_equal(one_per_cell(points[::7], cell_m), by_arrays(points[::7], cell_m))
+
+
+def test_nearly_every_cell_keeps_one(rng: np.random.Generator) -> None:
+    points = rng.uniform(-10.0, 10.0, (20_000, 3))
+    cells = np.floor(points)
+    kept = one_per_cell(points, 1.0)
+    assert len(np.unique(cells[kept], axis=0)) == len(kept)
+    assert len(kept) > 0.98 * len(np.unique(cells, axis=0))
+
+
+def test_any_layout_of_points_will_do(rng: np.random.Generator) -> None:
+    points = rng.normal(0.0, 15.0, (1_000, 3))
+    np.testing.assert_array_equal(one_per_cell(np.asfortranarray(points), 0.5), one_per_cell(points, 0.5))
+    readonly = points.copy()
+    readonly.setflags(write=False)
+    np.testing.assert_array_equal(one_per_cell(readonly, 0.5), one_per_cell(points, 0.5))
+
+
+def test_what_is_no_place_does_no_harm() -> None:
+    points = np.array([[np.nan, 0.0, 0.0], [np.inf, 1e300, -np.inf], [1e30, 1e30, 1e30], [5.0, 5.0, 5.0]])
+    with np.errstate(over="ignore"):
+        assert 3 in one_per_cell(points, 0.1)
+    assert len(one_per_cell(np.empty((0, 3)), 0.1)) == 0
