@@ -18,8 +18,11 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, format_tum, read_tum
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.stamp_order import in_stamp_order
 from lidarslam.localisation import Localiser, OdometryAlone, ScanToMap
 from lidarslam.loop_closing import GraphOutcome, begin_graph, finish_graph
 from lidarslam.pipeline import Pipeline, ScanResult
@@ -126,6 +129,7 @@ class Tracked:
     Attributes:
         recording, truth, log: what it was, its ground truth, what came of it.
         asked: how many scans were asked for.
+        faults: what was left out of them, and what is wrong with them.
         total_ms: wall time of each scan.
         global_map: of the poses as they were found; None when no scan could be believed.
         error: what ended it before its last scan, None when nothing did.
@@ -135,6 +139,7 @@ class Tracked:
     truth: Trajectory | None
     log: ScanLog
     asked: int
+    faults: Faults
     total_ms: list[float]
     global_map: GlobalMap | None
     error: InputError | KeyboardInterrupt | None
@@ -170,13 +175,24 @@ def track(
     """
     config, truth = request.config, _ground_truth(recording, log)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
-    scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
+    for warning in recording.warnings:
+        log.warn(warning)
+    faults = Faults()
+    scans = take_in(recording, chosen, faults)
     watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     error = _process(pipeline, scans, watch)
-    if not len(log):
-        why = "" if error is None else f": {_reason(error)}"
-        raise NoScanError(f"{request.source}: no scan could be used{why}", isinstance(error, KeyboardInterrupt))
-    return Tracked(recording, truth, log, len(chosen), watch.total_ms, pipeline.global_map, error)
+    if not log.points_read:
+        why = "; ".join(_why_none(log, faults, error))
+        raise NoScanError(f"{request.source}: no scan could be used: {why}", isinstance(error, KeyboardInterrupt))
+    return Tracked(recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, error)
+
+
+def _why_none(log: ScanLog, faults: Faults, error: InputError | KeyboardInterrupt | None) -> Iterator[str]:
+    if error is not None:
+        yield _reason(error)
+    yield from faults.warnings()
+    if len(log):
+        yield f"{len(log)} scans without a valid point, {log.points_dropped} invalid ones (NaN, at the origin, too far)"
 
 
 def write_results(
@@ -188,10 +204,12 @@ def write_results(
     global_map = tracked.global_map if closed is None else closed.global_map
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
-    metrics = _write_trajectories(directory, tracked.recording.T_cam_lidar, tracked.truth, log)
+    metrics = _write_trajectories(directory, _camera(tracked.recording, log), tracked.truth, log)
     map_points = write_map(directory, global_map, config.global_map, request.pcd)
     voxel_size_m = None if global_map is None else global_map.voxel_size_m
-    skipped = 0 if tracked.stopped else tracked.asked - len(log)
+    for warning in tracked.faults.warnings():
+        log.warn(warning)
+    skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     summary = summarise(log, tracked.total_ms, map_points, voxel_size_m, skipped, closed)
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, tracked.stopped)
@@ -209,11 +227,7 @@ def require_apart(out: Path, source: Path) -> None:
 
 def in_order(scans: Iterable[Scan]) -> Iterator[Scan]:
     """The scans whose stamps increase; no trajectory could hold the others."""
-    latest = -np.inf
-    for scan in scans:
-        if scan.stamp > latest:
-            latest = scan.stamp
-            yield scan
+    return in_stamp_order(scans, lambda scan: scan.stamp, Faults(), may_be_set_back=True)
 
 
 @dataclass
@@ -279,6 +293,15 @@ def _ground_truth(recording: Recording, log: ScanLog) -> Trajectory | None:
         return recording.ground_truth
     except InputError as error:
         log.warn(f"no metrics: {error}")
+        return None
+
+
+def _camera(recording: Recording, log: ScanLog) -> FloatArray | None:
+    """T_cam_lidar; a damaged calibration costs the camera's frame, not the run."""
+    try:
+        return recording.T_cam_lidar
+    except InputError as error:
+        log.warn(f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame: {error}")
         return None
 
 

@@ -38,6 +38,7 @@ class ScanLog:
     statuses: list[Status] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
     stage_ms: list[list[float]] = field(default_factory=list)
+    points_read: int = 0
     points_dropped: int = 0
     warnings: list[str] = field(default_factory=list)
     _T_world_lidar: list[FloatArray] = field(default_factory=list)
@@ -74,6 +75,7 @@ class ScanLog:
         self.statuses.append(result.status)
         self.messages.append(result.message)
         self.stage_ms.append(ms)
+        self.points_read += result.points_read
         self.points_dropped += result.points_dropped
         self._T_world_lidar.append(result.T_world_lidar)
         self._T_odom_lidar.append(result.T_odom_lidar)
