@@ -7,7 +7,7 @@ a damaged or unusual definition of some other topic must not matter.
 
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -76,7 +76,7 @@ class BagFile:
         try:
             counts = self._read_index()
         except InputError as error:
-            counts = self._read_without_index(error)
+            counts = self._read_file_alone(error)
         self.topics: tuple[Topic, ...] = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
 
     def _read_index(self) -> dict[tuple[str, str], int]:
@@ -87,14 +87,18 @@ class BagFile:
                 counts[key] = counts.get(key, 0) + connection.msgcount
         return counts
 
-    def _read_without_index(self, error: InputError) -> dict[tuple[str, str], int]:
-        """Count what can still be read; the error stands where that is nothing."""
+    def _read_file_alone(self, error: InputError) -> dict[tuple[str, str], int]:
+        """Leave a folder's metadata aside, and a file's index too where it must be; the error stands if all fails."""
         file = self._storage_file()
         if file is None:
             raise error
-        suffix = file.suffix if self._ros2 else ".bag"
+        if file != self.path:
+            self.path, folder = file, self.path
+            self.damage = f"{folder}: its metadata.yaml is missing or damaged, so {file.name} was read by itself"
+            with suppress(InputError):
+                return self._read_index()
         try:
-            salvage = Salvage(file, suffix, _expand)
+            salvage = Salvage(file, file.suffix if self._ros2 else ".bag", _expand)
         except Exception as reason:  # not even the beginning makes sense
             raise error from reason
         if not salvage.counts:
@@ -225,11 +229,12 @@ class BagFile:
     def _remedy(self) -> str:
         if self.path.is_dir():
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files instead of the folder"
+        suffix = self.path.suffix if self._ros2 else ".bag"
         return {
             ".bag": f"try `rosbag reindex {self.path}`, or copy the bag again",
             ".mcap": f"try `mcap recover {self.path} -o recovered.mcap`, or copy the bag again",
             ".db3": f"try `sqlite3 {self.path} .recover | sqlite3 recovered.db3`, or copy the bag again",
-        }.get(self.path.suffix, "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml")
+        }.get(suffix, "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml")
 
 
 @cache

@@ -125,7 +125,9 @@ class _Rosbag1(_Walk):
     def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
         header = _fields(_take(file, *struct.unpack("<I", _take(file, 4))))
         (size,) = struct.unpack("<I", _take(file, 4))
-        kind = header[b"op"]
+        kind = header.get(b"op")
+        if kind is None:
+            raise ValueError("a record of no kind")
         if kind == b"\x05" and whole:
             if size > _LONGEST_RECORD:
                 raise ValueError(f"a chunk of {size:,} bytes")
@@ -210,6 +212,8 @@ class _Sqlite(_Walk):
     def messages(self) -> Iterator[SalvagedMessage]:
         uri = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
+            # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
+            database.execute("PRAGMA writable_schema=ON")
             topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
             rows = database.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED")
             try:

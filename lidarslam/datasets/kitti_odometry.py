@@ -184,3 +184,12 @@ class KittiOdometryRecording:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
         if self._pose_file is not None and not self._has_calibration:
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
+        elif self._pose_file is not None and (poses := self._count_poses(self._pose_file)) not in (0, last + 1):
+            yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
+
+    def _count_poses(self, path: Path) -> int:
+        """Zero where the file is damaged, which the truth tells when it is asked for."""
+        try:
+            return len(read_kitti_poses(path))
+        except InputError:
+            return 0

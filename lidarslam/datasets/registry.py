@@ -91,6 +91,10 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     for candidate, reader in READERS.items():
         if reader.recognises(source):
             return candidate
+    if source.is_dir() and not any(source.iterdir()):
+        raise InputError(f"{source}: the folder is empty; name the one with the recording")
+    if source.suffix.lower() in SCAN_SUFFIXES:
+        raise InputError(f"{source}: is a single scan; give the folder it lies in")
     layouts = "; ".join(reader.reads for reader in READERS.values())
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
 

@@ -97,8 +97,8 @@ class ScanFolderRecording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Where the stamps come from, and files that are no scans."""
-        return self._layout.notes
+        """How the stamps were mended."""
+        return self._layout.warnings
 
     def _read(self, index: int, faults: Faults) -> Scan:
         table, points = self._table(index)
@@ -177,7 +177,7 @@ class ScanFolderRecording:
             ground_truth=self._layout.truth,
             point_time=self._describe_point_time(first),
             fields=tuple(PointField(n, str(table.dtype[n].base)) for n in table.dtype.names or ()),
-            notes=(*self.warnings, *unreadable.warnings()),
+            notes=(*self._layout.notes, *self.warnings, *unreadable.warnings()),
         )
 
     def _last_stamp(self) -> float:

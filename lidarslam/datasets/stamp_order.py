@@ -16,6 +16,8 @@ T = TypeVar("T")
 _DOUBTFUL_STEP_S = 1.0
 # How many scans are looked at to tell.
 _LOOKED_AT = 6
+# Of more than so many, one that is so many usual steps away from the middle one is a stray one.
+_FEW, _FAR_STEPS = 2, 60
 # So many scans in a row that are in order among themselves, but before what was reached, are no strays.
 _SET_BACK = 10
 
@@ -84,8 +86,12 @@ class _Order:
         return True
 
     def _leads_on(self, stamps: list[float]) -> bool:
-        """Whether the first belongs to the most of these stamps that can follow one another and the latest."""
+        """Whether the first is near most of these stamps, and belongs to the most that can follow one another."""
         ahead = np.array(stamps)
+        if len(ahead) > _FEW:
+            ordered = np.sort(ahead)
+            far_s = _DOUBTFUL_STEP_S + _FAR_STEPS * float(np.median(np.diff(ordered)))
+            ahead[np.abs(ahead - ordered[(len(ordered) - 1) // 2]) > far_s] = np.nan
         ahead[ahead <= self._latest] = np.nan
         return bool(increasing_rows(ahead)[0])
 

@@ -38,7 +38,10 @@ def read_stamps(path: Path) -> FloatArray:
             try:
                 stamps[row] = _parse_stamp(line)
             except ValueError:
-                raise InputError(f"{path}: expected one stamp a line, got {line[:60]!r} at line {row + 1}") from None
+                raise InputError(
+                    f"{path}: expected one stamp a line, got {line[:60]!r} at line {row + 1}; mend it, or move the file"
+                    " away to use the rate"
+                ) from None
     return stamps
 
 
