@@ -12,7 +12,7 @@ from lidarslam.core.geometry import FloatArray
 
 # Clock readings count from 1970; what lies outside these years is a number of another kind.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
-_DATE = re.compile(r"\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
+_DATE = re.compile(r"(\d{4}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2}(?:\.\d*)?)Z?", re.ASCII)
 _SECONDS_NAME = re.compile(r"\d+\.\d+")
 _INTEGER_NAME = re.compile(r"\d{12,19}")
 _SECONDS_NANOSECONDS_NAME = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})")
@@ -46,8 +46,8 @@ def read_stamps(path: Path) -> FloatArray:
 
 
 def _parse_stamp(text: str) -> float:
-    if _DATE.match(text):
-        return float(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64)) * 1e-9
+    if match := _DATE.fullmatch(text):
+        return float(np.datetime64(f"{match[1]}T{match[2]}", "ns").astype(np.int64)) * 1e-9
     seconds = _clock_seconds(int(text)) if text.isdecimal() else None
     if seconds is None:
         seconds = float(text)
