@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -175,8 +175,8 @@ def track(
     """
     config, truth = request.config, _ground_truth(recording, log)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
-    for warning in recording.warnings:
-        log.warn(warning)
+    with suppress(InputError):  # it is told when the scans are read
+        log.warnings.extend(recording.warnings)
     faults = Faults()
     scans = take_in(recording, chosen, faults)
     watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
@@ -207,8 +207,7 @@ def write_results(
     metrics = _write_trajectories(directory, _camera(tracked.recording, log), tracked.truth, log)
     map_points = write_map(directory, global_map, config.global_map, request.pcd)
     voxel_size_m = None if global_map is None else global_map.voxel_size_m
-    for warning in tracked.faults.warnings():
-        log.warn(warning)
+    log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     summary = summarise(log, tracked.total_ms, map_points, voxel_size_m, skipped, closed)
     directory.write_json(files.SUMMARY, summary.to_json())

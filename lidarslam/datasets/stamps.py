@@ -12,6 +12,8 @@ from lidarslam.core.geometry import FloatArray
 
 # Clock readings count from 1970; what lies outside these years is a number of another kind.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
+# Thousands of years are no time in seconds, and nanoseconds would be lost on them.
+_LATEST_S = 1e11
 _DATE = re.compile(r"(\d{4}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2}(?:\.\d*)?)Z?", re.ASCII)
 _SECONDS_NAME = re.compile(r"\d+\.\d+")
 _INTEGER_NAME = re.compile(r"\d{12,19}")
@@ -51,7 +53,7 @@ def _parse_stamp(text: str) -> float:
     seconds = _clock_seconds(int(text)) if text.isdecimal() else None
     if seconds is None:
         seconds = float(text)
-    if not np.isfinite(seconds):
+    if not abs(seconds) < _LATEST_S:
         raise ValueError(f"{text} is no stamp")
     return seconds
 
@@ -78,7 +80,7 @@ def stamps_from_names(stems: Sequence[str]) -> FloatArray | None:
 
 def _stamp_from_name(stem: str) -> float | None:
     if _SECONDS_NAME.fullmatch(stem):
-        return float(stem)
+        return seconds if (seconds := float(stem)) < _LATEST_S else None
     if _INTEGER_NAME.fullmatch(stem):
         return _clock_seconds(int(stem))
     match = _SECONDS_NANOSECONDS_NAME.fullmatch(stem)

@@ -443,3 +443,20 @@ def test_poses_of_which_some_are_missing_are_counted(tmp_path, tables):
         warnings = " ".join(summary["warnings"])
         assert f"has {lines} poses for the scans up to number 3" in warnings
         assert ("times.txt has 7 lines for the scans up to number 3" in warnings) == (lines == 9)
+
+
+@pytest.mark.parametrize("stamp", ["1e300", "-1e300", "1e12", "123456789012345", "inf", "nan"])
+def test_stamps_beyond_all_time_are_told(tmp_path, tables, stamp):
+    folder = write_folder(tmp_path / "drive", tables[:3])
+    (folder / "times.txt").write_text(f"0.0\n0.1\n{stamp}\n")
+    code, _, said = run(folder)
+    assert code == 1
+    assert f"expected one stamp a line, got '{stamp}' at line 3" in said
+
+
+@pytest.mark.parametrize("first", [-9e10, -1.0, 4.9e8, 2.5e9, 9e10])
+def test_stamps_of_any_clock_are_shown_and_run(tmp_path, tables, first):
+    folder = write_folder(tmp_path / "drive", tables[:3])
+    (folder / "times.txt").write_text("".join(f"{first + 0.1 * i:.3f}\n" for i in range(3)))
+    code, summary, _ = run(folder, asked=3)
+    assert (code, summary["scans"]) == (0, 3)
