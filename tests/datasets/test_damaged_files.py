@@ -293,3 +293,30 @@ def test_clouds_that_say_what_is_not_so(
             path.unlink()
         folder.rmdir()
     assert check(ros2_kit.write({"/points": clouds})) >= 1
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "plain.bin"])
+def test_a_header_that_promises_more_than_there_is(tmp_path, table, name):
+    """One point more, and so many that making room for them would fill any memory."""
+    data = FORMATS[name](table)
+    for promised in ("121", "1000000000000"):
+        lie = data.replace(b"POINTS 120", f"POINTS {promised}".encode())
+        lie = lie.replace(b"element vertex 120", f"element vertex {promised}".encode())
+        if name.endswith(".npy"):  # whose header has a length of its own
+            length = len(f"({promised},), ") - len("(120,), ")
+            lie = data.replace(b"(120,), }" + b" " * length, f"({promised},), }}".encode())
+        assert lie != data
+        (tmp_path / name).write_bytes(lie)
+        with pytest.raises(InputError, match="truncated"):
+            next(open_recording(tmp_path).scans())
+
+
+def test_pickled_objects_are_never_unpickled(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (Path(tmp_path / "sprung").touch, ())
+
+    np.save(tmp_path / "0.npy", np.array([Trap()], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="it holds pickled objects, which could run any program"):
+        next(open_recording(tmp_path).scans())
+    assert not (tmp_path / "sprung").exists()
