@@ -1,6 +1,7 @@
 """The command line: every command parses, imports what it needs, calls one function, and says what came of it."""
 
 import errno
+import io
 import logging
 import os
 import signal
@@ -68,6 +69,9 @@ def _drop_unwritable_output() -> None:
 @click.option("-v", "--verbose", is_flag=True, help="Say more about what is going on.")
 def main(verbose: bool) -> None:
     """Trajectories and maps from recorded LiDAR runs, and how good they are."""
+    for stream in (sys.stdout, sys.stderr):  # a file's name may hold what the terminal cannot show
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     level = logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="lidarslam: %(message)s", stream=sys.stderr)
 

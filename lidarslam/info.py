@@ -8,8 +8,8 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.registry import open_recording
 
-# Later than this a stamp is a date; below it counts from some start.
-_EPOCH_FROM_S = 5e8
+# Between these a stamp is a date; else it counts from some start.
+_EPOCH_FROM_S, _EPOCH_UNTIL_S = 5e8, 5e9
 
 
 def describe_source(source: Path, config: ReaderConfig) -> str:
@@ -61,7 +61,7 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
 
 
 def _instant(stamp: float) -> str:
-    if stamp < _EPOCH_FROM_S:
+    if not _EPOCH_FROM_S <= stamp < _EPOCH_UNTIL_S:
         return f"{stamp:.3f} s"
     return f"{datetime.fromtimestamp(stamp, timezone.utc):%Y-%m-%d %H:%M:%S} UTC ({stamp:.3f})"
 

@@ -15,7 +15,6 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.datasets.recording import Recording
-from lidarslam.scan_order import in_order
 from lidarslam.unfinished import About
 from odometry.interface import Odometry
 
@@ -68,16 +67,14 @@ def lost_before(out: Path, config: Config, run: dict[str, Any]) -> int | None:
     return lost
 
 
-def scans_left(
-    recording: Recording, chosen: range, done: int, held: Scan, odometry: Odometry, saved: Saved
-) -> Iterator[Scan]:
+def scans_left(scans: Iterator[Scan], held: Scan, odometry: Odometry, saved: Saved) -> Iterator[Scan]:
     """The scans after the one that was read last, with an odometry that knows of all those before.
 
+    Those before are read again, so that what is wrong with them is counted again.
+
     Args:
-        recording: all of it.
-        chosen: which scans the run takes.
-        done: how many it has taken, the last one not counted.
-        held: the last one.
+        scans: all that the run takes, from the first on.
+        held: the last one that was read.
         odometry: new; takes its state, or where it has none all the scans again.
         saved: with the odometry's state.
 
@@ -86,13 +83,9 @@ def scans_left(
     """
     if saved.has("odometry"):
         odometry.restore(saved.part("odometry"))
-        # As many scans of the recording or more lie before the one that was read last.
-        chosen = chosen[done:]
-        scans = iter(recording.scans(chosen.start, chosen.stop, chosen.step))
         return _after(scans, held)
-    logger.warning("the odometry is run again over the %d scans before", done + 1)
-    everything = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
-    return _after(_estimated_again(everything, held, odometry), held)
+    logger.warning("the odometry is run again over the scans before %.6f s", held.stamp)
+    return _after(_estimated_again(scans, held, odometry), held)
 
 
 def _estimated_again(scans: Iterator[Scan], held: Scan, odometry: Odometry) -> Iterator[Scan]:
@@ -105,7 +98,7 @@ def _estimated_again(scans: Iterator[Scan], held: Scan, odometry: Odometry) -> I
 def _after(scans: Iterator[Scan], held: Scan) -> Iterator[Scan]:
     for scan in scans:
         if scan.stamp == held.stamp and np.array_equal(scan.points, held.points):
-            return in_order(scans, held.stamp)
+            return scans
         if scan.stamp > held.stamp:
             break
     raise InputError(

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +21,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, format_tum, read_tum
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.localisation import Localiser, OdometryAlone, ScanToMap
@@ -30,7 +32,6 @@ from lidarslam.prefetch import prefetch
 from lidarslam.resuming import describe_computed, lost_before, scans_left
 from lidarslam.run_directory import RunDirectory
 from lidarslam.scan_log import ScanLog
-from lidarslam.scan_order import in_order
 from lidarslam.summary import RunSummary, summarise
 from lidarslam.unfinished import Unfinished
 from lidarslam.viewer import NullViewer, Viewer
@@ -178,6 +179,7 @@ class Tracked:
     Attributes:
         recording, truth, log: what it was, its ground truth, what came of it.
         asked: how many scans were asked for.
+        faults: what was left out of them, and what is wrong with them.
         total_ms: wall time of each scan.
         global_map: of the poses as they were found; None when no scan could be believed.
         error: what ended it before its last scan, None when nothing did.
@@ -187,6 +189,7 @@ class Tracked:
     truth: Trajectory | None
     log: ScanLog
     asked: int
+    faults: Faults
     total_ms: list[float]
     global_map: GlobalMap | None
     error: InputError | KeyboardInterrupt | None
@@ -230,20 +233,31 @@ def track(
         InputError: the recording is not the one that the run was begun with.
     """
     config, truth = request.config, _ground_truth(recording, log)
+    with suppress(InputError):  # it is told when the scans are read
+        for warning in recording.warnings:
+            log.warn(warning)
+    faults = Faults()
+    scans = take_in(recording, chosen, faults)
     watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     keeper = None if unfinished is None else _keeper(config, unfinished, watch, graph)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, keeper)
-    if unfinished is None or unfinished.saved is None:
-        scans = in_order(recording.scans(chosen.start, chosen.stop, chosen.step))
-    else:
-        scans = _restore(unfinished.saved, pipeline, watch, recording, chosen, odometry)
+    if unfinished is not None and unfinished.saved is not None:
+        scans = _restore(unfinished.saved, pipeline, watch, scans, odometry)
     if unfinished is not None:
         _begin(request, unfinished, log)
     error = _process(pipeline, scans, watch)
-    if not len(log):
-        why = "" if error is None else f": {_reason(error)}"
-        raise NoScanError(f"{request.source}: no scan could be used{why}", isinstance(error, KeyboardInterrupt))
-    return Tracked(recording, truth, log, len(chosen), watch.total_ms, pipeline.global_map, error)
+    if not log.points_read:
+        why = "; ".join(_why_none(log, faults, error))
+        raise NoScanError(f"{request.source}: no scan could be used: {why}", isinstance(error, KeyboardInterrupt))
+    return Tracked(recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, error)
+
+
+def _why_none(log: ScanLog, faults: Faults, error: InputError | KeyboardInterrupt | None) -> Iterator[str]:
+    if error is not None:
+        yield _reason(error)
+    yield from faults.warnings()
+    if len(log):
+        yield f"{len(log)} scans without a valid point, {log.points_dropped} invalid ones (NaN, at the origin, too far)"
 
 
 def _keeper(config: Config, unfinished: Unfinished, watch: "_Watch", graph: "SlamGraph | None") -> Checkpoints:
@@ -257,15 +271,15 @@ def _keeper(config: Config, unfinished: Unfinished, watch: "_Watch", graph: "Sla
 
 
 def _restore(
-    saved: Saved, pipeline: Pipeline, watch: "_Watch", recording: Recording, chosen: range, odometry: Odometry
+    saved: Saved, pipeline: Pipeline, watch: "_Watch", scans: Iterator[Scan], odometry: Odometry
 ) -> Iterator[Scan]:
-    """Go on from a state; the scans that are left."""
-    part, log = saved.part("pipeline"), watch.log
+    """Go on from a state; of all the scans, those that are left."""
+    part = saved.part("pipeline")
     pipeline.restore(part)
     if pipeline.held is None:
         raise saved.refuse("no scan is held")
-    watch.total_ms = saved.array("total_ms", (len(log),)).tolist()
-    return scans_left(recording, chosen, len(log), pipeline.held, odometry, part)
+    watch.total_ms = saved.array("total_ms", (len(watch.log),)).tolist()
+    return scans_left(scans, pipeline.held, odometry, part)
 
 
 def _begin(request: RunRequest, unfinished: Unfinished, log: ScanLog) -> None:
@@ -293,10 +307,11 @@ def write_results(
     global_map = tracked.global_map if closed is None else closed.global_map
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
-    metrics = _write_trajectories(directory, tracked.recording.T_cam_lidar, tracked.truth, log)
+    metrics = _write_trajectories(directory, _camera(tracked.recording, log), tracked.truth, log)
     map_points = write_map(directory, global_map, config.global_map, request.pcd)
     voxel_size_m = None if global_map is None else global_map.voxel_size_m
-    skipped = 0 if tracked.stopped else tracked.asked - len(log)
+    log.warnings.extend(tracked.faults.warnings())
+    skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     summary = summarise(log, tracked.total_ms, map_points, voxel_size_m, skipped, closed)
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, tracked.stopped)
@@ -377,6 +392,15 @@ def _ground_truth(recording: Recording, log: ScanLog) -> Trajectory | None:
         return recording.ground_truth
     except InputError as error:
         log.warn(f"no metrics: {error}")
+        return None
+
+
+def _camera(recording: Recording, log: ScanLog) -> FloatArray | None:
+    """T_cam_lidar; a damaged calibration costs the camera's frame, not the run."""
+    try:
+        return recording.T_cam_lidar
+    except InputError as error:
+        log.warn(f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame: {error}")
         return None
 
 

@@ -93,6 +93,7 @@ class ScanLog:
     stamps: "array[float]" = field(default_factory=_doubles)
     statuses: list[Status] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
+    points_read: int = 0
     points_dropped: int = 0
     warnings: list[str] = field(default_factory=list)
     # Numbers after one another: an array of its own for each pose would take twice the memory.
@@ -139,6 +140,7 @@ class ScanLog:
             "statuses": [status.value for status in self.statuses],
             "messages": list(self.messages),
             "stage_ms": self.stage_ms,
+            "points_read": self.points_read,
             "points_dropped": self.points_dropped,
             "warnings": list(self.warnings),
             "T_world_lidar": _poses(self._T_world_lidar),
@@ -156,6 +158,7 @@ class ScanLog:
             _doubles(stamps),
             [Status(status) for status in statuses],
             messages,
+            saved.integer("points_read"),
             saved.integer("points_dropped"),
             saved.texts("warnings"),
             _doubles(saved.array("stage_ms", (len(stamps), len(STAGES)))),
@@ -183,6 +186,7 @@ class ScanLog:
         self.stamps.append(result.stamp)
         self.statuses.append(result.status)
         self.messages.append(result.message)
+        self.points_read += result.points_read
         self.points_dropped += result.points_dropped
         self._stage_ms.extend(ms)
         self._T_world_lidar.extend(result.T_world_lidar.ravel())

@@ -2,7 +2,7 @@
 
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -14,6 +14,10 @@ from lidarslam.core.tracking import Status
 from lidarslam.loop_closing import GraphOutcome, LoopReport
 from lidarslam.pipeline import STAGES
 from lidarslam.scan_log import ScanLog
+
+# A time between scans that is longer than usual by so much of it, and so many seconds, is a gap.
+_PAUSE_OF_STEP = 2.0
+_SHORTEST_PAUSE_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -212,7 +216,7 @@ def summarise(
         log: its scans.
         total_ms: wall time of each scan, from the one before finished to this one finished.
         map_points, map_voxel_size_m: of the written map.
-        skipped: scans that were asked for and did not come, or came with a stamp not after the one before.
+        skipped: scans that were asked for and did not come, for no reason that the log warns of.
         closed: what its pose graph did to it, if it had one.
     """
     trajectory = log.trajectory
@@ -248,7 +252,8 @@ def _lost_stretches(log: ScanLog) -> tuple[LostStretch, ...]:
 def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
     warnings = list(log.warnings)
     if skipped:
-        warnings.append(f"{skipped} scans were left out: missing, or with stamps not after the scan before")
+        warnings.append(f"{skipped} scans that were asked for did not come")
+    warnings.extend(_pauses(log))
     if log.points_dropped:
         share = log.points_dropped / max(1, len(log))
         warnings.append(
@@ -257,6 +262,19 @@ def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
     if degraded := log.statuses.count(Status.DEGRADED):
         warnings.append(f"{degraded} scans are believed only in part (status degraded; scans.csv says why)")
     return tuple(warnings)
+
+
+def _pauses(log: ScanLog) -> Iterator[str]:
+    """Where scans are missing, by the stamps; a pause is told by its length beside the usual time between scans."""
+    steps = np.diff(log.stamps)
+    usual_s = float(np.median(steps)) if len(steps) else 0.0
+    pauses = np.flatnonzero(steps > usual_s + max(_PAUSE_OF_STEP * usual_s, _SHORTEST_PAUSE_S))
+    if len(pauses):
+        longest = int(pauses[np.argmax(steps[pauses])])
+        yield (
+            f"{len(pauses)} gaps in the stamps, where scans are missing or a clock was set; the longest:"
+            f" {steps[longest]:.1f} s after scan {longest}"
+        )
 
 
 def peak_rss_mb() -> float:

@@ -215,16 +215,37 @@ def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch
     assert any(warning.startswith("2 scans were left out") for warning in outcome.summary.warnings)
 
 
-def test_a_damaged_scan_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:
+def test_a_damaged_scan_is_left_out_and_counted(recording: Path, tmp_path: Path) -> None:
     (recording / "000012.npy").write_bytes(b"not an array")
     outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
-    assert outcome.stopped is not None
-    assert "000012.npy" in outcome.stopped
+    assert outcome.stopped is None
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["scans"] == 19
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
+    (warning,) = (warning for warning in summary["warnings"] if "left out" in warning)
+    assert warning.startswith("1 scans were left out: they could not be read")
+    assert "000012.npy" in warning
+
+
+def test_damage_that_no_scan_can_be_left_out_for_ends_the_run_with_what_there_is(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lidarslam.datasets.scan_folder import ScanFolderRecording
+
+    read = ScanFolderRecording.scans
+
+    def broken(self: Any, *chosen: Any) -> Any:
+        yield from list(read(self, *chosen))[:12]
+        raise InputError("the disk broke")
+
+    monkeypatch.setattr(ScanFolderRecording, "scans", broken)
+    outcome = execute(RunRequest(recording, tmp_path / "run", load_config(None, KISS_ICP)), quiet)
+    assert outcome.stopped == "the disk broke"
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["scans"] == 12
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
     assert (tmp_path / "run" / "map.ply").exists()
-    assert any("stopped after" in warning for warning in summary["warnings"])
+    assert "stopped after 12 scans: the disk broke" in summary["warnings"]
 
 
 def test_an_interruption_ends_the_run_with_what_there_is(recording: Path, tmp_path: Path) -> None:

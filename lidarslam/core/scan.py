@@ -14,6 +14,8 @@ from lidarslam.core.trajectory import Trajectory
 
 # No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
 _MAX_RANGE_M = 10_000.0
+# No LiDAR has more lasers; a number beyond is that of something else, or damaged.
+_MOST_RINGS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,9 @@ class Scan:
         """Make a scan of what a driver delivers, leaving out invalid points together with their times and rings.
 
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
-        the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite.
+        the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite; where
+        that is more than half of the others, the times are worth nothing and are left out instead. So are rings when
+        one of them is no number of a laser.
         """
         raw = np.asarray(points, dtype=np.float64)
         if raw.size and raw.shape[-1] != 3:
@@ -74,14 +78,20 @@ class Scan:
         largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])  # ten times as fast as max(axis=1)
         valid = (largest > 0.0) & (largest < _MAX_RANGE_M)
         if offsets is not None:
-            valid &= np.isfinite(offsets)
+            timed = valid & np.isfinite(offsets)
+            if 2 * np.count_nonzero(timed) < np.count_nonzero(valid):
+                offsets = None
+            else:
+                valid = timed
         dropped = int(len(xyz) - np.count_nonzero(valid))
         if dropped:
             kept = np.flatnonzero(valid)
             xyz = xyz.take(kept, axis=0)  # four times as fast as indexing with the mask
             offsets = None if offsets is None else offsets[kept]
             lasers = None if lasers is None else lasers[kept]
-        # Invalid points may carry NaN for a ring, which no integer can hold: cast what is left.
+        # Invalid points may carry NaN for a ring, which no integer can hold: judge and cast what is left.
+        if lasers is not None and not ((lasers >= 0) & (lasers < _MOST_RINGS)).all():
+            lasers = None
         return cls(xyz, float(stamp), offsets, None if lasers is None else lasers.astype(np.int32), dropped)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":

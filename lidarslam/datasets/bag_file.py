@@ -1,12 +1,13 @@
 """Messages of rosbag1 and rosbag2 files; the only file that imports rosbags.
 
-Point clouds are decoded with fixed definitions, never with those in the bag: the definition of PointCloud2 has not
-changed, bags may lack definitions, and a damaged or unusual definition of some other topic must not matter.
+A file whose index cannot be read is read without it, as far as it goes. Point clouds are decoded with fixed
+definitions, never with those in the bag: the definition of PointCloud2 has not changed, bags may lack definitions, and
+a damaged or unusual definition of some other topic must not matter.
 """
 
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,11 +15,14 @@ from typing import cast
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag1.reader import decompressors as rosbag1_decompressors
 from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS as mcap_decompressors
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.bag_salvage import Salvage
 from lidarslam.datasets.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
 from lidarslam.datasets.point_cloud2 import DecodedCloud, PointCloud2Message, decode_point_cloud2
 from lidarslam.datasets.recording import Topic
@@ -28,7 +32,10 @@ RosbagReader = Rosbag1Reader | Rosbag2Reader
 POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 CLOUD_TYPES = (POINT_CLOUD2_TYPE, *CUSTOM_MESSAGE_TYPES)
 
+STORAGE_SUFFIXES = (".db3", ".mcap")
+
 _LAST_MESSAGES_NS = 1_000_000_000
+_LONGEST_FRAME_ID = 256
 
 
 @dataclass(frozen=True)
@@ -38,31 +45,78 @@ class BagMessage:
     Attributes:
         record_ns: when it was recorded, nanoseconds.
         header_ns: the stamp of its header, nanoseconds.
+        frame_id: of its header: the sensor it comes from.
     """
 
     record_ns: int
     header_ns: int
+    frame_id: str
     message_type: str
     raw: bytes
 
 
 class BagFile:
-    """A rosbag1 `.bag`, a rosbag2 folder, or a single `.db3` or `.mcap`; opened for every pass, closed after it."""
+    """A rosbag1 `.bag`, a rosbag2 folder, or a single `.db3` or `.mcap`; opened for every pass, closed after it.
+
+    Attributes:
+        topics: what it holds.
+        damage: why it is read without its index, as far as it goes; None when the index is sound.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Read the index.
+        """Read the index, or the whole file where that cannot be read.
 
         Raises:
-            InputError: the bag is damaged, has no index, or is of no readable kind.
+            InputError: the bag is damaged so that nothing of it can be read, or it is of no readable kind.
         """
         self.path = path
-        self._ros2 = path.suffix != ".bag" or path.is_dir()
+        self._ros2 = path.is_dir() or not is_rosbag1(path)
+        self._salvage: Salvage | None = None
+        self.damage: str | None = None
+        try:
+            counts = self._read_index()
+        except InputError as error:
+            counts = self._read_file_alone(error)
+        self.topics: tuple[Topic, ...] = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
+
+    def _read_index(self) -> dict[tuple[str, str], int]:
+        counts: dict[tuple[str, str], int] = {}
         with self._opened() as reader, self._damage("its index cannot be read"):
-            counts: dict[tuple[str, str], int] = {}
             for connection in reader.connections:
                 key = (connection.topic, connection.msgtype)
                 counts[key] = counts.get(key, 0) + connection.msgcount
-            self.topics: tuple[Topic, ...] = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
+        return counts
+
+    def _read_file_alone(self, error: InputError) -> dict[tuple[str, str], int]:
+        """Leave a folder's metadata aside, and a file's index too where it must be; the error stands if all fails."""
+        file = self._storage_file()
+        if file is None:
+            raise error
+        if file != self.path:
+            self.path, folder = file, self.path
+            self.damage = f"{folder}: its metadata.yaml is missing or damaged, so {file.name} was read by itself"
+            with suppress(InputError):
+                return self._read_index()
+        try:
+            salvage = Salvage(file, file.suffix if self._ros2 else ".bag", _expand)
+        except Exception as reason:  # not even the beginning makes sense
+            raise error from reason
+        if not salvage.counts:
+            raise error
+        self._salvage = salvage
+        damage = "" if salvage.damage is None else f": {salvage.damage}"
+        self.damage = (
+            f"{file}: has no index that can be read, so its {salvage.counts.total()} messages were read one after"
+            f" another as far as they go{damage}; {self._remedy()}"
+        )
+        return dict(salvage.counts)
+
+    def _storage_file(self) -> Path | None:
+        """The one file with the messages; None when a folder has several, whose order only its index tells."""
+        if not self.path.is_dir():
+            return self.path if not self._ros2 or self.path.suffix in STORAGE_SUFFIXES else None
+        files = [entry for entry in self.path.iterdir() if entry.suffix in STORAGE_SUFFIXES and entry.is_file()]
+        return files[0] if len(files) == 1 else None
 
     def messages(self, topic: Topic) -> Iterator[BagMessage]:
         """All messages of a topic in the order they were recorded, not decoded.
@@ -70,11 +124,26 @@ class BagFile:
         Raises:
             InputError: the bag is damaged, at the message where it is.
         """
+        if self._salvage is not None:
+            yield from self._salvaged(self._salvage, topic)
+            return
         with self._opened() as reader:
             yield from self._stream(reader, topic, None)
 
+    def _salvaged(self, salvage: Salvage, topic: Topic) -> Iterator[BagMessage]:
+        with closing(salvage.messages(topic.name, topic.message_type)) as messages:
+            for message in messages:
+                with self._damage("a message cannot be read"):
+                    found = self._message(message.record_ns, message.raw, topic)
+                yield found
+
     def last_message(self, topic: Topic) -> BagMessage | None:
         """The message of a topic recorded last, found from the end of the bag; None if there is none."""
+        if self._salvage is not None:
+            last = None
+            for message in self.messages(topic):
+                last = message
+            return last
         with self._opened() as reader:
             with self._damage("its index cannot be read"):
                 end_ns, length_ns = reader.end_time, reader.duration
@@ -128,22 +197,23 @@ class BagFile:
                     _, record_ns, raw = next(source)
                 except StopIteration:
                     return
-                message = BagMessage(record_ns, self._header_ns(raw), topic.message_type, raw)
+                message = self._message(record_ns, raw, topic)
             count += 1
             yield message
 
-    def _header_ns(self, raw: bytes) -> int:
-        """The header's stamp, which stands at a fixed place; looking there spares decoding the message."""
+    def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
+        """With the header's stamp and frame, which stand at fixed places; looking there spares decoding the message."""
         if self._ros2:
             if raw[0] != 0:
                 raise InputError(
                     f"{self.path}: its messages are not plain CDR; if they are compressed, give the rosbag2 folder with"
                     f" its metadata.yaml instead of the file"
                 )
-            seconds, nanoseconds = struct.unpack_from("<iI" if raw[1] == 1 else ">iI", raw, 4)
+            seconds, nanoseconds, characters = struct.unpack_from("<iII" if raw[1] == 1 else ">iII", raw, 4)
         else:
-            seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
-        return int(seconds) * 10**9 + int(nanoseconds)
+            seconds, nanoseconds, characters = struct.unpack_from("<III", raw, 4)
+        frame_id = raw[16 : 16 + min(characters, _LONGEST_FRAME_ID)].rstrip(b"\0").decode(errors="replace")
+        return BagMessage(record_ns, int(seconds) * 10**9 + int(nanoseconds), frame_id, topic.message_type, raw)
 
     @contextmanager
     def _damage(self, what: str) -> Iterator[None]:
@@ -159,13 +229,25 @@ class BagFile:
     def _remedy(self) -> str:
         if self.path.is_dir():
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files instead of the folder"
+        suffix = self.path.suffix if self._ros2 else ".bag"
         return {
             ".bag": f"try `rosbag reindex {self.path}`, or copy the bag again",
             ".mcap": f"try `mcap recover {self.path} -o recovered.mcap`, or copy the bag again",
             ".db3": f"try `sqlite3 {self.path} .recover | sqlite3 recovered.db3`, or copy the bag again",
-        }.get(self.path.suffix, "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml")
+        }.get(suffix, "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml")
 
 
 @cache
 def _typestore(ros2: bool) -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+
+
+def is_rosbag1(path: Path) -> bool:
+    """Whether a file is called like a bag of ROS 1; a recorder that was killed leaves `.bag.active`."""
+    return path.name.endswith((".bag", ".bag.active"))
+
+
+def _expand(compression: str, data: bytes, size: int) -> bytes:
+    if compression in mcap_decompressors:
+        return mcap_decompressors[compression](data, size)
+    return rosbag1_decompressors[compression](data)

@@ -15,6 +15,9 @@ class ReaderConfig(BaseModel):
 
     name: str | None = Field(None, description="reader to use; null: the one that recognises the source")
     topic: str | None = Field(None, description="point cloud topic of a bag; null: the only one there is")
+    frame_id: str | None = Field(
+        None, description="sensor of a bag's topic, where several send to it; null: the one of the first scans"
+    )
     sequence: str | None = Field(None, description="sequence of a KITTI odometry root, such as 04")
     rate_hz: float = Field(10.0, gt=0.0, description="scans a second, for recordings without stamps")
     time_field: str | None = Field(None, description="point field with the per-point time; null: found by its name")

@@ -17,6 +17,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.kitti_calibration import read_tr
 from lidarslam.datasets.kitti_correction import correct_elevation
 from lidarslam.datasets.recording import PointField, Recording, RecordingInfo
@@ -114,6 +115,10 @@ class KittiOdometryRecording:
         return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
 
     @property
+    def _has_calibration(self) -> bool:
+        return (self._folder / "calib.txt").is_file()
+
+    @property
     def _pose_file(self) -> Path | None:
         folder = self._folder.resolve()
         candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
@@ -122,13 +127,15 @@ class KittiOdometryRecording:
     def __len__(self) -> int:
         return len(self._files)
 
-    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`, without times: they are motion compensated.
 
         Raises:
-            InputError: the range makes no sense, or a scan file is damaged.
+            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
         """
-        return (self._read(index) for index in scan_indices(len(self), start, stop, step))
+        return readable_scans(scan_indices(len(self), start, stop, step), self._read, faults)
 
     def _read(self, index: int) -> Scan:
         points = read_bin(self._files[index])[:, :3]
@@ -139,9 +146,9 @@ class KittiOdometryRecording:
         """What `lidarslam info` prints.
 
         Raises:
-            InputError: the first scan is damaged.
+            InputError: no scan can be read.
         """
-        first = self._read(0)
+        _, first, unreadable = first_readable(self._folder, range(len(self)), self._read)
         return RecordingInfo(
             reader="kitti-odometry",
             scans=len(self),
@@ -151,19 +158,38 @@ class KittiOdometryRecording:
             points_per_scan=len(first),
             dropped_points=first.dropped,
             has_rings=False,
-            ground_truth=self._pose_file if self.T_cam_lidar is not None else None,
+            ground_truth=self._pose_file if self._has_calibration else None,
             point_time=None,
             fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
-            notes=tuple(self._notes()),
+            notes=(*self._notes(), *self.warnings, *unreadable.warnings()),
         )
 
     def _notes(self) -> Iterator[str]:
         yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
         if angle_deg := self._config.kitti_elevation_correction_deg:
             yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is missing, or more than it should be."""
+        return tuple(self._warnings())
+
+    def _warnings(self) -> Iterator[str]:
+        last = int(self._numbers[-1])
         if self._times is None:
             yield f"There is no times.txt; the stamps assume {self._config.rate_hz:g} scans a second."
-        if len(self) <= self._numbers[-1] - self._numbers[0]:
-            yield f"Of the scans {self._numbers[0]} to {self._numbers[-1]} only {len(self)} are there."
-        if self._pose_file is not None and self.T_cam_lidar is None:
+        elif last + 1 < len(self._times):
+            yield f"times.txt has {len(self._times)} lines for the scans up to number {last}."
+        if len(self) <= last - self._numbers[0]:
+            yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
+        if self._pose_file is not None and not self._has_calibration:
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
+        elif self._pose_file is not None and (poses := self._count_poses(self._pose_file)) not in (0, last + 1):
+            yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
+
+    def _count_poses(self, path: Path) -> int:
+        """Zero where the file is damaged, which the truth tells when it is asked for."""
+        try:
+            return len(read_kitti_poses(path))
+        except InputError:
+            return 0

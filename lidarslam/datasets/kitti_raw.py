@@ -14,6 +14,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.kitti_calibration import read_rectification, read_rotation_translation
 from lidarslam.datasets.kitti_correction import correct_elevation
 from lidarslam.datasets.kitti_oxts import OxtsPoses, read_oxts
@@ -113,13 +114,15 @@ class KittiRawRecording:
     def __len__(self) -> int:
         return len(self._files)
 
-    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`; per-point times come from the azimuth.
 
         Raises:
-            InputError: the range makes no sense, or a scan file is damaged.
+            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
         """
-        return (self._read(index) for index in scan_indices(len(self), start, stop, step))
+        return readable_scans(scan_indices(len(self), start, stop, step), self._read, faults)
 
     def _read(self, index: int) -> Scan:
         points = read_bin(self._files[index])[:, :3]
@@ -136,9 +139,10 @@ class KittiRawRecording:
         """What `lidarslam info` prints.
 
         Raises:
-            InputError: the first scan, an OXTS or a calibration file is damaged.
+            InputError: no scan can be read, or an OXTS or calibration file is damaged.
         """
-        first, stamps = self._read(0), self._timing.stamps
+        _, first, unreadable = first_readable(self._drive, range(len(self)), self._read)
+        stamps = self._timing.stamps
         point_time = None
         if first.time_offsets is not None and len(first):
             extent = float(first.time_offsets.min()), float(first.time_offsets.max())
@@ -155,15 +159,20 @@ class KittiRawRecording:
             ground_truth=None if self.ground_truth is None else self._drive / "oxts",
             point_time=point_time,
             fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
-            notes=tuple(self._notes()),
+            notes=(*self._notes(), *unreadable.warnings()),
         )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is missing, and stamps that were mended."""
+        first, last = self._numbers[0], self._numbers[-1]
+        gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
+        return (*self._timing.notes, *gaps)
 
     def _notes(self) -> Iterator[str]:
         if angle_deg := self._config.kitti_elevation_correction_deg:
             yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
-        yield from self._timing.notes
-        if len(self) <= self._numbers[-1] - self._numbers[0]:
-            yield f"Of the scans {self._numbers[0]} to {self._numbers[-1]} only {len(self)} are there."
+        yield from self.warnings
         if self._oxts is None:
             yield "There is no oxts folder, so there is no ground truth."
             return

@@ -65,9 +65,7 @@ def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray | None:
     if not path.is_file():
         return None
     stamps = read_stamps(path)
-    padded = np.full(max(len(stamps), int(numbers[-1]) + 1), np.nan)
-    padded[: len(stamps)] = stamps
-    return padded[numbers]
+    return np.append(stamps, np.nan)[np.minimum(numbers, len(stamps))]
 
 
 def _read_forward_stamps(path: Path, numbers: NDArray[np.intp]) -> tuple[FloatArray | None, tuple[str, ...]]:

@@ -12,7 +12,10 @@ from lidarslam.datasets.point_table import read_ascii_table, read_binary_table
 from lidarslam.datasets.scan_files import read_bytes
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
+_SIZES = ("1", "2", "4", "8")
 _LONGEST_HEADER = 65536
+# LZF's longest copy is of 264 bytes and takes three.
+_MOST_OF_A_BYTE = 88
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ def _parse_header(data: bytes) -> _Header:
     encoding = " ".join(entries["DATA"])
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"expected DATA ascii, binary or binary_compressed, got {encoding!r}")
+    if not points[0].isdecimal():
+        raise ValueError(f"expected a number of POINTS, got {points[0][:40]!r}: it is invalid")
     return _Header(_row_type(names, sizes, kinds, counts), int(points[0]), encoding, at)
 
 
@@ -72,6 +77,8 @@ def _row_type(names: list[str], sizes: list[str], kinds: list[str], counts: list
     for place, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         if kind not in _KINDS:
             raise ValueError(f"expected the TYPE F, I or U, got {kind!r}")
+        if size not in _SIZES or not count.isdecimal():
+            raise ValueError(f"expected sizes of 1, 2, 4 or 8 bytes and a COUNT, got {size[:20]!r} and {count[:20]!r}")
         # PCL calls every padding field `_`, and NumPy wants names to differ.
         unique = name if name not in names[:place] else f"{name}{place}"
         columns.append((unique, f"<{_KINDS[kind]}{size}", () if count == "1" else (int(count),)))
@@ -91,6 +98,8 @@ def _read_compressed(body: bytes, header: _Header) -> NDArray[np.void]:
         raise ValueError(
             f"expected {expected} bytes in {compressed} compressed ones, got {size} in {len(body) - 8}: it is truncated"
         )
+    if size > _MOST_OF_A_BYTE * compressed:
+        raise ValueError(f"expected {size} bytes in {compressed} compressed ones, more than LZF can hold")
     data = decompress_lzf(body[8 : 8 + compressed], size)
     table = np.empty(header.points, header.dtype)
     at = 0

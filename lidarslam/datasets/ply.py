@@ -64,6 +64,8 @@ def _parse_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], 
     elements: list[tuple[str, int, list[list[str]]]] = []
     for words in lines:
         if words[:1] == ["element"] and len(words) == 3:
+            if not words[2].isdecimal():
+                raise ValueError(f"expected a number of elements, got {words[2][:40]!r}: it is invalid")
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and elements:
             elements[-1][2].append(words[1:])

@@ -45,7 +45,7 @@ class DecodedCloud:
         points: (N, 3) float64, metres, in the LiDAR frame.
         time_field: name of the field the times come from; None without per-point time.
         times: (N,) as stored, None without per-point time.
-        rings: (N,) integers, None when the points do not carry the number of their laser.
+        rings: (N,) as stored, None when the points do not carry the number of their laser.
         fields: all fields of the message.
     """
 
@@ -77,7 +77,7 @@ def decode_point_cloud2(message: PointCloud2Message, time_field: str | None = No
         coordinates(cloud),
         time_field,
         None if time_field is None else _column(cloud[time_field]),
-        None if ring_field is None else _whole_numbers(_column(cloud[ring_field])),
+        None if ring_field is None else _column(cloud[ring_field]),
         tuple(PointField(field.name, _type_name(field)) for field in message.fields),
     )
 
@@ -124,11 +124,6 @@ def _view(message: PointCloud2Message, wanted: Sequence[PointFieldMessage]) -> N
 def _column(values: NDArray[np.generic]) -> NDArray[np.generic]:
     """A flat copy in the machine's own byte order."""
     return values.astype(values.dtype.newbyteorder("=")).reshape(-1)
-
-
-def _whole_numbers(rings: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Some converters store rings as floats, with NaN for missing returns."""
-    return np.nan_to_num(rings, posinf=0.0, neginf=0.0).astype(np.int32) if rings.dtype.kind == "f" else rings
 
 
 def _type_name(field: PointFieldMessage) -> str:

@@ -132,9 +132,9 @@ class PointTimeModel:
             difference = (values.astype(np.uint64) - wrapped).astype(np.int64)
             return np.asarray(difference / per_second + float((nearest - zero) / per_second))
         rounded = float(zero)
-        return np.asarray(
-            (values.astype(np.float64) - rounded) / per_second + float((Fraction(rounded) - zero) / per_second)
-        )
+        with np.errstate(invalid="ignore", over="ignore"):  # damaged bytes may be any number
+            seconds = (values.astype(np.float64) - rounded) / per_second
+        return np.asarray(seconds + float((Fraction(rounded) - zero) / per_second))
 
 
 def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str]) -> str | None:

@@ -1,13 +1,14 @@
 """What the readers hand out: a sequence of scans that can also describe itself."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import ScanSequence
+from lidarslam.core.scan import Scan, ScanSequence
+from lidarslam.datasets.faults import Faults
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,21 @@ class Recording(ScanSequence, Protocol):
     @property
     def T_cam_lidar(self) -> FloatArray | None:
         """Extrinsic calibration of a KITTI recording, whose pose files are in the camera frame; None elsewhere."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with the recording as a whole, and what was mended; one sentence each, with counts."""
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`.
+
+        Those that cannot be read are left out and counted in `faults`; without it the first of them is an error.
+
+        Raises:
+            InputError: the range makes no sense, a scan cannot be read, or nothing more can be.
+        """
 
     def describe(self) -> RecordingInfo:
         """Look at the recording, its first scan included, and say what it holds."""

@@ -10,6 +10,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import Recording
 
+# Of rosbag2; a recorder that was killed leaves such a file without the metadata.yaml beside it.
+_BAG_SUFFIXES = (".db3", ".mcap")
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 
 
@@ -29,7 +31,7 @@ class Reader:
 
 
 def _is_kitti_odometry(source: Path) -> bool:
-    return (source / "sequences").is_dir() or ((source / "velodyne").is_dir() and (source / "calib.txt").is_file())
+    return (source / "sequences").is_dir() or (source / "velodyne").is_dir()
 
 
 def _is_kitti_raw(source: Path) -> bool:
@@ -38,8 +40,9 @@ def _is_kitti_raw(source: Path) -> bool:
 
 def _is_rosbag(source: Path) -> bool:
     if source.is_dir():
-        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file()
-    return source.suffix in (".bag", ".db3", ".mcap")
+        files = (entry for entry in source.iterdir() if entry.suffix in _BAG_SUFFIXES and entry.is_file())
+        return (source / "metadata.yaml").is_file() or _bag_of_folder(source).is_file() or any(files)
+    return source.suffix in (".bag", *_BAG_SUFFIXES) or source.name.endswith(".bag.active")
 
 
 def _bag_of_folder(folder: Path) -> Path:
@@ -73,7 +76,13 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     Raises:
         InputError: no such source, no such reader, or no reader recognises the source.
     """
-    if not source.exists():
+    try:
+        exists = source.exists()
+        if exists and source.is_dir():
+            next(source.iterdir(), None)
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror}); check its permissions") from error
+    if not exists:
         raise InputError(f"{source}: no such file or folder")
     if name is not None:
         if name not in READERS:
@@ -82,6 +91,10 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     for candidate, reader in READERS.items():
         if reader.recognises(source):
             return candidate
+    if source.is_dir() and not any(source.iterdir()):
+        raise InputError(f"{source}: the folder is empty; name the one with the recording")
+    if source.suffix.lower() in SCAN_SUFFIXES:
+        raise InputError(f"{source}: is a single scan; give the folder it lies in")
     layouts = "; ".join(reader.reads for reader in READERS.values())
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
 

@@ -1,6 +1,7 @@
 """Point clouds of a rosbag: rosbag1, rosbag2 (SQLite or MCAP), as PointCloud2 or Livox CustomMsg."""
 
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import islice
@@ -19,10 +20,12 @@ from lidarslam.datasets.bag_file import BagFile, BagMessage
 from lidarslam.datasets.bag_stamps import StampSource, find_stamp_source
 from lidarslam.datasets.bag_topics import choose_topic
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
 from lidarslam.datasets.point_cloud2 import DecodedCloud
 from lidarslam.datasets.point_time import CLOCK_LIMIT_S, PointTimeModel, infer_point_time
 from lidarslam.datasets.recording import PointTime, Recording, RecordingInfo
 from lidarslam.datasets.scan_files import scan_indices
+from lidarslam.datasets.stamp_order import in_stamp_order
 from lidarslam.datasets.truth_files import find_truth_file
 
 logger = logging.getLogger(__name__)
@@ -30,6 +33,10 @@ logger = logging.getLogger(__name__)
 # How many messages are looked at to learn what the points' times mean, and how many of them may not tell.
 _CLOUDS_LOOKED_AT = 30
 _CLOUDS_WITHOUT_TIME = 3
+_FRAMES_LOOKED_AT = 10
+
+_MISSING = "scans are missing that the index lists"
+_NEVER_SET = "scans were left out: their stamps were never set"
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -78,33 +85,53 @@ class BagRecording:
     def __len__(self) -> int:
         return self._topic.messages
 
-    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """That its index is gone, or its headers have no stamps."""
+        damage = () if self._bag.damage is None else (self._bag.damage,)
+        if self._stamps.from_header:
+            return damage
+        return (*damage, "The message headers have no stamps, so the times of recording are used.")
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`; only they are decoded.
 
-        A message whose stamp is not after those before it keeps its index but makes no scan; such messages are
-        counted in a warning.
+        A message of another sensor, or one whose stamp is not after those before it, keeps its index but makes no
+        scan; such messages are counted, in a warning where nobody counts.
 
         Raises:
             InputError: the range makes no sense, or the bag is damaged.
         """
-        return self._scans(scan_indices(len(self), start, stop, step))
+        return self._scans(scan_indices(len(self), start, stop, step), faults)
 
-    def _scans(self, wanted: range) -> Iterator[Scan]:
-        latest, skipped = self._stamps.before_first, 0
+    def _scans(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
+        counted = Faults() if faults is None else faults
         try:
-            for index, message in enumerate(islice(self._messages(), max(0, wanted.stop))):
-                stamp = self._stamps.stamp(message)
-                if stamp <= latest:
-                    skipped += 1
-                    continue
-                latest = stamp
-                if index in wanted:
-                    yield self._scan(message, stamp)
+            messages = in_stamp_order(self._wanted(wanted, counted), self._stamps.stamp, counted)
+            yield from readable_scans(messages, lambda message: self._scan(message, counted), faults)
         finally:
-            if skipped:
-                logger.warning("%s: %d scans skipped, their stamps are not after those before", self._source, skipped)
+            if faults is None:
+                for warning in counted.warnings():
+                    logger.warning("%s: %s", self._source, warning)
 
-    def _messages(self) -> Iterator[BagMessage]:
+    def _wanted(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
+        for index, message in enumerate(islice(self._messages(faults), max(0, wanted.stop))):
+            if index not in wanted:
+                continue
+            if message.frame_id != self._frame_id:
+                kind = (
+                    f"scans were left out: they come from another sensor than {self._frame_id!r};"
+                    " for that one set reader.frame_id"
+                )
+                faults.leave_out(kind, repr(message.frame_id))
+            elif (stamp := self._stamps.stamp(message)) <= self._stamps.before_first:
+                faults.leave_out(_NEVER_SET, f"{stamp:.9f}")
+            else:
+                yield message
+
+    def _messages(self, faults: Faults) -> Iterator[BagMessage]:
         count = 0
         for message in self._bag.messages(self._topic):
             count += 1
@@ -115,17 +142,34 @@ class BagRecording:
                 " reindex it, or give one of its .db3 or .mcap files instead of the folder"
             )
         if count < len(self):
-            logger.warning("%s: its index lists %d scans, it holds %d", self._source, len(self), count)
+            faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", len(self) - count)
+
+    @cached_property
+    def _frame_id(self) -> str:
+        """The sensor that most of the first messages come from, unless another is asked for."""
+        frames = Counter(m.frame_id for m in islice(self._bag.messages(self._topic), _FRAMES_LOOKED_AT))
+        if self._config.frame_id is None:
+            return frames.most_common(1)[0][0] if frames else ""
+        if self._config.frame_id not in frames:
+            found = ", ".join(repr(frame) for frame in frames)
+            raise InputError(
+                f"{self._source}: reader.frame_id is {self._config.frame_id!r}, but {self._topic.name} begins with"
+                f" {found}"
+            )
+        return self._config.frame_id
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         return self._bag.decode(message, self._config.time_field)
 
-    def _scan(self, message: BagMessage, stamp: float) -> Scan:
-        cloud, model = self._decode(message), self._point_time
+    def _scan(self, message: BagMessage, faults: Faults) -> Scan:
+        cloud, model, stamp = self._decode(message), self._point_time, self._stamps.stamp(message)
         offsets = None
         if model is not None and cloud.times is not None and cloud.time_field == model.field:
             offsets = model.offsets(cloud.times, stamp)
-        return Scan.from_raw(cloud.points, stamp, offsets, cloud.rings)
+        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings)
+        if model is not None and scan.time_offsets is None and len(scan):
+            faults.note(NO_POINT_TIME, f"{stamp:.9f}")
+        return scan
 
     @cached_property
     def _stamps(self) -> StampSource:
@@ -149,7 +193,11 @@ class BagRecording:
             stamp = self._stamps.stamp(message)
             if period_s is None and self._last_stamp is not None and len(self) > 1:
                 period_s = (self._last_stamp - stamp) / (len(self) - 1)
-            found = self._infer(self._decode(message), stamp, period_s)
+            try:
+                cloud = self._decode(message)
+            except InputError:
+                continue  # counted when it is its turn
+            found = self._infer(cloud, stamp, period_s)
             model = found or model
             failures += found is None
             if (found is not None and stamp > 2 * CLOCK_LIMIT_S) or failures == _CLOUDS_WITHOUT_TIME:
@@ -171,10 +219,9 @@ class BagRecording:
         Raises:
             InputError: the bag is damaged, or none of its messages makes a scan.
         """
-        first = next(self.scans(), None)
-        message = next(self._messages(), None)
-        if first is None or message is None:
-            raise InputError(f"{self._source}: no message of {self._topic.name} makes a scan")
+        faults = Faults()
+        messages = in_stamp_order(self._wanted(range(len(self)), faults), self._stamps.stamp, faults)
+        message, first, unreadable = first_readable(self._source, messages, lambda message: self._scan(message, faults))
         cloud = self._decode(message)
         duration_s = max(0.0, (self._last_stamp or first.stamp) - first.stamp)
         return RecordingInfo(
@@ -191,7 +238,7 @@ class BagRecording:
             topic=self._topic.name,
             topics=self._bag.topics,
             fields=cloud.fields,
-            notes=tuple(self._notes(cloud, self._stamps.stamp(message))),
+            notes=(*self.warnings, *unreadable.warnings(), *self._notes(cloud, first.stamp)),
         )
 
     def _describe_point_time(self, scan: Scan) -> PointTime | None:
@@ -201,8 +248,6 @@ class BagRecording:
         return PointTime(model.field, model.unit, model.reference, float(offsets.min()), float(offsets.max()))
 
     def _notes(self, cloud: DecodedCloud, stamp: float) -> Iterator[str]:
-        if not self._stamps.from_header:
-            yield "The message headers have no stamps, so the times of recording are used."
         if cloud.time_field is None or cloud.times is None:
             return
         if self._point_time is None:

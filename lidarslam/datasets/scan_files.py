@@ -1,12 +1,18 @@
 """Files that hold one scan each: their order, their numbers, and the `.bin` format."""
 
 import re
+import stat
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
+
+# No sweep is larger; reading on would fill the memory.
+_LARGEST_BYTES = 1 << 31
+# More scans than this nobody records; what is beyond is a name that is no number of a scan, such as a time.
+_MOST_SCANS = 10**9
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 
@@ -45,6 +51,8 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
     for path in files:
         if not (path.stem.isascii() and path.stem.isdecimal()):
             raise InputError(f"{path}: expected a name that is the scan's number, such as 000004{suffix}; rename it")
+        if int(path.stem) >= _MOST_SCANS:
+            raise InputError(f"{path}: the number of a scan is at most {_MOST_SCANS - 1:,}; rename it or move it away")
     numbers = np.array([int(path.stem) for path in files], dtype=np.intp)
     twice = np.flatnonzero(np.diff(numbers) == 0)
     if len(twice):
@@ -60,6 +68,11 @@ def read_bytes(path: Path) -> bytes:
         InputError: it cannot be read.
     """
     try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(f"{path}: expected a file with a scan, it is none; move it away")
+        if found.st_size > _LARGEST_BYTES:
+            raise InputError(f"{path}: {found.st_size:,} bytes are no single scan; split it or move it away")
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error})") from error

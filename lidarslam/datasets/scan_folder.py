@@ -13,6 +13,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
 from lidarslam.datasets.point_table import coordinates, scalar_fields
 from lidarslam.datasets.point_time import (
     CLOCK_LIMIT_S,
@@ -74,13 +75,17 @@ class ScanFolderRecording:
     def __len__(self) -> int:
         return len(self._layout.files)
 
-    def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`.
 
         Raises:
-            InputError: the range makes no sense, or a scan file is damaged.
+            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
         """
-        return (self._read(index) for index in scan_indices(len(self), start, stop, step))
+        counted = Faults() if faults is None else faults
+        indices = scan_indices(len(self), start, stop, step)
+        return readable_scans(indices, lambda index: self._read(index, counted), faults)
 
     def _table(self, index: int) -> tuple[NDArray[np.void], FloatArray]:
         path = self._layout.files[index]
@@ -90,21 +95,26 @@ class ScanFolderRecording:
         except ValueError as error:
             raise InputError(f"{path}: {error}") from None
 
-    def _read(self, index: int) -> Scan:
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """How the stamps were mended."""
+        return self._layout.warnings
+
+    def _read(self, index: int, faults: Faults) -> Scan:
         table, points = self._table(index)
         stamp, offsets = self._stamp_and_offsets(index, table, points)
         ring_field = find_ring_field(scalar_fields(table))
-        return Scan.from_raw(points, stamp, offsets, None if ring_field is None else table[ring_field])
+        scan = Scan.from_raw(points, stamp, offsets, None if ring_field is None else table[ring_field])
+        if self._point_time is not None and scan.time_offsets is None and len(scan):
+            faults.note(NO_POINT_TIME, str(self._layout.files[index]))
+        return scan
 
     def _stamp_and_offsets(
         self, index: int, table: NDArray[np.void], points: FloatArray
     ) -> tuple[float, FloatArray | None]:
         stamp, model = float(self._layout.stamps[index]), self._point_time
-        if model is None or not len(table):
+        if model is None or not len(table) or model.field not in scalar_fields(table):
             return stamp, None
-        if model.field not in scalar_fields(table):
-            path = self._layout.files[index]
-            raise InputError(f"{path}: expected the point field {model.field}, as other scans have it, found none")
         values = table[model.field]
         if model.reference == "absolute" and not self._layout.from_clock:
             # The points know the time better than an assumed rate: the sweep's first one gives the stamp.
@@ -122,7 +132,10 @@ class ScanFolderRecording:
             return None
         rate = scan_rate(self._layout.stamps) if self._layout.from_clock else None
         for index in self._scans_to_infer_from():
-            table, points = self._table(index)
+            try:
+                table, points = self._table(index)
+            except InputError:
+                continue  # counted when it is its turn
             field = find_time_field(scalar_fields(table), config.time_field)
             if field is None:
                 return None
@@ -145,11 +158,12 @@ class ScanFolderRecording:
         """What `lidarslam info` prints.
 
         Raises:
-            InputError: the first or the last scan is damaged.
+            InputError: no scan can be read.
         """
-        table, _ = self._table(0)
-        first = self._read(0)
-        first_stamp, last_stamp = first.stamp, next(self.scans(len(self) - 1)).stamp
+        faults = Faults()
+        index, first, unreadable = first_readable(self._folder, range(len(self)), lambda i: self._read(i, faults))
+        table, _ = self._table(index)
+        first_stamp, last_stamp = first.stamp, self._last_stamp()
         duration_s = last_stamp - first_stamp
         return RecordingInfo(
             reader="scan-folder",
@@ -163,8 +177,15 @@ class ScanFolderRecording:
             ground_truth=self._layout.truth,
             point_time=self._describe_point_time(first),
             fields=tuple(PointField(n, str(table.dtype[n].base)) for n in table.dtype.names or ()),
-            notes=self._layout.notes,
+            notes=(*self._layout.notes, *self.warnings, *unreadable.warnings()),
         )
+
+    def _last_stamp(self) -> float:
+        """Of the last scan, which its points may tell better than the rate."""
+        try:
+            return next(self.scans(len(self) - 1)).stamp
+        except InputError:
+            return float(self._layout.stamps[-1])
 
     def _describe_point_time(self, scan: Scan) -> PointTime | None:
         model, offsets = self._point_time, scan.time_offsets

@@ -27,6 +27,7 @@ class FolderLayout:
         from_clock: whether the stamps were found; else they are made from the rate.
         truth: a TUM file, or None.
         notes: what the user should know.
+        warnings: what was mended.
     """
 
     files: tuple[Path, ...]
@@ -34,6 +35,7 @@ class FolderLayout:
     from_clock: bool
     truth: Path | None
     notes: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
@@ -42,33 +44,34 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
     Raises:
         InputError: there is no scan, or the stamp file does not go with the scans.
     """
-    files, notes = _find_scans(folder)
+    files, notes, warnings = _find_scans(folder)
     truth = find_truth_file((folder, folder.resolve().parent))
     stamp_file = _find_stamp_file(folder)
     if stamp_file is not None:
         stamps, replaced = _read_stamp_file(stamp_file, files)
         if replaced:
-            notes.append(f"{replaced} stamps of {stamp_file.name} repeat or run backwards and were interpolated.")
-        return FolderLayout(tuple(files), stamps, True, truth, tuple(notes))
+            warnings.append(
+                f"{replaced} stamps of {stamp_file.name} repeat, run backwards or far ahead and were interpolated."
+            )
+        return FolderLayout(tuple(files), stamps, True, truth, tuple(notes), tuple(warnings))
     named = stamps_from_names([path.stem for path in files])
     if named is not None:
         # The order of names is not that of time: 5.36 comes before 5.4.
         order = np.argsort(named, kind="stable")
         if (np.diff(named[order]) > 0.0).all():
             notes.append("The stamps are the file names.")
-            return FolderLayout(tuple(files[i] for i in order), named[order], True, truth, tuple(notes))
-        notes.append("The file names look like stamps, but some are equal.")
+            in_time = tuple(files[i] for i in order)
+            return FolderLayout(in_time, named[order], True, truth, tuple(notes), tuple(warnings))
+        warnings.append("The file names look like stamps, but some are equal.")
     notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
-    return FolderLayout(tuple(files), np.arange(len(files)) / rate_hz, False, truth, tuple(notes))
+    assumed = np.arange(len(files)) / rate_hz
+    return FolderLayout(tuple(files), assumed, False, truth, tuple(notes), tuple(warnings))
 
 
-def _find_scans(folder: Path) -> tuple[list[Path], list[str]]:
-    """The scan files in natural order: the most common suffix, and numbered names where there are such."""
-    candidates = [
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in SCAN_SUFFIXES and not path.name.startswith(".") and path.is_file()
-    ]
+def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
+    """The scan files in natural order, the most common suffix and numbered names where there are such; and words."""
+    named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
+    candidates = [path for path in named if path.is_file()]
     if not candidates:
         raise InputError(f"{folder}: expected scan files ({', '.join(SCAN_SUFFIXES)}), found none")
     counts = Counter(path.suffix.lower() for path in candidates)
@@ -81,7 +84,8 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str]]:
     if skipped:
         shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
         notes.append(f"{len(skipped)} other files were not taken for scans: {shown}.")
-    return files, notes
+    gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
+    return files, notes, [f"{len(gone)} scans are no files that can be opened, such as {gone[0]}."] if gone else []
 
 
 def _find_stamp_file(folder: Path) -> Path | None:

@@ -1,7 +1,10 @@
 """Which function reads a scan file into a table of points."""
 
+import math
 from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +13,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.pcd import read_pcd
 from lidarslam.datasets.ply import read_ply
 from lidarslam.datasets.point_table import as_table
-from lidarslam.datasets.scan_files import KITTI_FIELDS, read_bin
+from lidarslam.datasets.scan_files import KITTI_FIELDS, read_bin, read_bytes
 
 TableReader = Callable[[Path], NDArray[np.void]]
 
@@ -39,7 +42,7 @@ def _bin_columns(files: Sequence[Path]) -> int:
     The file says nothing about it. Four fit almost always where they are right; five, as nuScenes has them, show
     by a fifth number that is a small integer in every point.
     """
-    sizes = np.array([path.stat().st_size for path in files])
+    sizes = np.array([_size(path) for path in files])
     fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in (4, 5, 3)}
     most = max(fits.values())
     likely = [columns for columns, count in fits.items() if count == most]
@@ -58,6 +61,13 @@ def _bin_columns(files: Sequence[Path]) -> int:
     return 5 if 5 in likely else likely[0]
 
 
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:  # gone meanwhile, which is told when it is its turn
+        return 0
+
+
 def _fifth_is_ring(path: Path) -> bool:
     fifth = read_bin(path, 5)[:, 4]
     return bool(len(fifth) and ((fifth >= 0) & (fifth < _MOST_RINGS) & (fifth == np.floor(fifth))).all())
@@ -71,12 +81,14 @@ def read_npy(path: Path) -> NDArray[np.void]:
     Raises:
         InputError: the file is damaged or holds another array.
     """
+    data = read_bytes(path)
     try:
-        array = np.asarray(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: cannot be read as .npy ({error}); copy it again or remove it") from None
+        array = _parse_npy(data)
+    except Exception as error:  # NumPy parses the header as Python, which fails in many ways
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: cannot be read as .npy ({reason}); copy it again or remove it") from None
     if array.dtype.names:
-        return array.reshape(-1)
+        return cast("NDArray[np.void]", array.reshape(-1))
     if array.ndim < 2 or not 3 <= array.shape[-1] <= _WIDEST_ARRAY or array.dtype.kind not in "fiu":
         raise InputError(
             f"{path}: expected an array (N, 3) or wider of numbers that begin with x, y, z, or a structured array,"
@@ -84,3 +96,18 @@ def read_npy(path: Path) -> NDArray[np.void]:
         )
     names = tuple("xyz") + tuple(f"column_{column}" for column in range(3, array.shape[-1]))
     return as_table(array.reshape(-1, array.shape[-1]), names)
+
+
+def _parse_npy(data: bytes) -> NDArray[np.generic]:
+    """The array of a .npy file. NumPy's own loader makes room for whatever the header promises before it reads."""
+    stream = BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, by_column, dtype = read_header(stream)
+    if dtype.hasobject:
+        raise ValueError("it holds pickled objects, which could run any program; save numbers")
+    count, body = math.prod(shape), data[stream.tell() :]
+    if min(shape, default=0) < 0 or dtype.itemsize == 0 or len(body) < count * dtype.itemsize:
+        raise ValueError(f"expected {shape} of {dtype}, got {len(body)} bytes: it is truncated")
+    array = np.frombuffer(body, dtype, count=count)
+    return array.reshape(shape[::-1]).T if by_column else array.reshape(shape)

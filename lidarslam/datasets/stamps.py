@@ -12,7 +12,9 @@ from lidarslam.core.geometry import FloatArray
 
 # Clock readings count from 1970; what lies outside these years is a number of another kind.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
-_DATE = re.compile(r"\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
+# Thousands of years are no time in seconds, and nanoseconds would be lost on them.
+_LATEST_S = 1e11
+_DATE = re.compile(r"(\d{4}-\d{2}-\d{2})[ T](\d{2}:\d{2}:\d{2}(?:\.\d*)?)Z?", re.ASCII)
 _SECONDS_NAME = re.compile(r"\d+\.\d+")
 _INTEGER_NAME = re.compile(r"\d{12,19}")
 _SECONDS_NANOSECONDS_NAME = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})")
@@ -38,17 +40,20 @@ def read_stamps(path: Path) -> FloatArray:
             try:
                 stamps[row] = _parse_stamp(line)
             except ValueError:
-                raise InputError(f"{path}: expected one stamp a line, got {line[:60]!r} at line {row + 1}") from None
+                raise InputError(
+                    f"{path}: expected one stamp a line, got {line[:60]!r} at line {row + 1}; mend it, or move the file"
+                    " away to use the rate"
+                ) from None
     return stamps
 
 
 def _parse_stamp(text: str) -> float:
-    if _DATE.match(text):
-        return float(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64)) * 1e-9
+    if match := _DATE.fullmatch(text):
+        return float(np.datetime64(f"{match[1]}T{match[2]}", "ns").astype(np.int64)) * 1e-9
     seconds = _clock_seconds(int(text)) if text.isdecimal() else None
     if seconds is None:
         seconds = float(text)
-    if not np.isfinite(seconds):
+    if not abs(seconds) < _LATEST_S:
         raise ValueError(f"{text} is no stamp")
     return seconds
 
@@ -75,7 +80,7 @@ def stamps_from_names(stems: Sequence[str]) -> FloatArray | None:
 
 def _stamp_from_name(stem: str) -> float | None:
     if _SECONDS_NAME.fullmatch(stem):
-        return float(stem)
+        return seconds if (seconds := float(stem)) < _LATEST_S else None
     if _INTEGER_NAME.fullmatch(stem):
         return _clock_seconds(int(stem))
     match = _SECONDS_NANOSECONDS_NAME.fullmatch(stem)

@@ -24,9 +24,21 @@ def test_invalid_points_are_dropped_with_their_times_and_rings(invalid, dtype):
 
 
 def test_points_without_a_finite_time_are_dropped():
-    scan = Scan.from_raw(np.ones((3, 3)), 0.0, time_offsets=[0.0, np.nan, np.inf], rings=[4, 5, 6])
-    assert scan.rings.tolist() == [4]
+    scan = Scan.from_raw(np.ones((4, 3)), 0.0, time_offsets=[0.0, np.nan, np.inf, 0.1], rings=[4, 5, 6, 7])
+    assert scan.rings.tolist() == [4, 7]
     assert scan.dropped == 2
+
+
+def test_times_of_which_most_are_worth_nothing_are_left_out_instead_of_the_points():
+    points = np.vstack([np.ones((3, 3)), np.zeros((6, 3))])  # no returns, whose times do not count
+    scan = Scan.from_raw(points, 0.0, time_offsets=[0.0, np.nan, np.inf, *np.zeros(6)])
+    assert scan.time_offsets is None
+    assert (len(scan), scan.dropped) == (3, 6)
+
+
+@pytest.mark.parametrize("ring", [-1, 4096, 2**31, np.nan, 1e30, -np.inf])
+def test_rings_that_are_no_lasers_are_left_out(ring):
+    assert Scan.from_raw(np.ones((3, 3)), 0.0, rings=np.array([0, ring, 4095])).rings is None
 
 
 def test_rings_of_invalid_points_may_be_missing():

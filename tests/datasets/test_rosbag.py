@@ -15,6 +15,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.bag_file import BagFile
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import PointField, PointTime, Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.truth_files import find_truth_file
@@ -315,9 +316,13 @@ def test_stamps_that_do_not_increase_are_skipped_and_counted(bag_kit, make_sweep
     with caplog.at_level(logging.WARNING):
         stamps = [scan.stamp for scan in recording.scans()]
     assert stamps == [(STAMP_NS + step * PERIOD_NS) / 10**9 for step in (0, 1, 3, 4)]
-    assert "2 scans skipped" in caplog.text
-    # Indices are those of the messages, so a range selects the same scans wherever it begins.
-    assert [scan.stamp for scan in recording.scans(2, 5)] == [(STAMP_NS + 3 * PERIOD_NS) / 10**9]
+    assert "2 scans were left out: their stamps are not after" in caplog.text
+    # Indices are those of the messages; only those asked for count, so that what follows a clock set back can be run.
+    faults = Faults()
+    assert [scan.stamp for scan in recording.scans(4, faults=faults)] == [
+        (STAMP_NS + step * PERIOD_NS) / 10**9 for step in (2, 4)
+    ]
+    assert faults.left_out == 0
 
 
 def test_a_stamp_that_was_never_set_is_skipped(bag_kit, make_sweep):
@@ -417,10 +422,17 @@ def test_truncated_bags(drive, bag_kit, part):
     path = bag_kit.storage_file(drive[0])
     whole = path.read_bytes()
     path.write_bytes(whole[: int(part * len(whole))])
-    with pytest.raises(InputError) as caught:
-        read_all(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    scans, message = [], ""
+    try:
+        scans = read_all(path)
+    except InputError as error:
+        message = str(error)
+    assert not message or (str(path) in message and "\n" not in message)
+    if bag_kit.kind != "db3":  # whose pages may be missed anywhere
+        assert bool(message) == (part < 0.3)
+        assert bool(message) or part * 6 - 2 < len(scans) <= 6
+    for i, (scan, sweep) in enumerate(zip(scans, drive[1], strict=False)):
+        assert_scan(scan, sweep, stamps_ns(6)[i])
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -435,31 +447,12 @@ def test_damaged_bags_raise_nothing_but_input_errors(drive, bag_kit, seed):
         assert len(read_all(path)) <= 6
 
 
-def test_bag_without_index_asks_for_reindexing(make_bag_kit, make_sweep):
-    kit = make_bag_kit("bag")
-    path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])})
-    data = bytearray(path.read_bytes())
-    place = data.index(b"index_pos=") + len(b"index_pos=")
-    data[place : place + 8] = bytes(8)
-    path.write_bytes(data)
-    with pytest.raises(InputError, match=r"not indexed.*rosbag reindex"):
-        open_recording(path)
-
-
 def test_folder_whose_files_are_gone(make_bag_kit, make_sweep):
     kit = make_bag_kit("mcap")
     path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])})
     kit.storage_file(path).unlink()
     with pytest.raises(InputError, match=r"missing.*ros2 bag reindex"):
         open_recording(path)
-
-
-def test_folder_without_metadata(make_bag_kit, make_sweep):
-    kit = make_bag_kit("mcap")
-    path = kit.write({"/points": recorded(kit, [make_sweep("velodyne", STAMP_NS)])})
-    (path / "metadata.yaml").unlink()
-    with pytest.raises(InputError, match=r"metadata.*ros2 bag reindex"):
-        open_recording(path, ReaderConfig(name="rosbag"))
 
 
 def test_index_that_promises_more_messages(make_bag_kit, make_sweep, caplog):
@@ -477,3 +470,75 @@ def test_index_that_promises_more_messages(make_bag_kit, make_sweep, caplog):
         database.execute("DELETE FROM messages")
     with pytest.raises(InputError, match="lists 3 messages of /points, it holds none"):
         list(recording.scans())
+
+
+@pytest.fixture
+def two_sensors(bag_kit, make_sweep):
+    """A topic that a front and a rear LiDAR send to in turn."""
+    messages = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(8)])
+    for i, (_, cloud) in enumerate(messages):
+        cloud.header.frame_id = "rear" if i % 2 else "front"
+    return bag_kit.write({"/points": messages})
+
+
+def test_two_sensors_on_one_topic_are_told_apart(two_sensors):
+    def stamps(faults, **options):
+        return [scan.stamp for scan in open_recording(two_sensors, ReaderConfig(**options)).scans(faults=faults)]
+
+    faults = Faults()
+    assert stamps(faults) == [ns / 10**9 for ns in stamps_ns(8)[::2]]
+    assert faults.warnings() == (
+        "4 scans were left out: they come from another sensor than 'front'; for that one set reader.frame_id;"
+        " the first: 'rear'",
+    )
+    assert stamps(Faults(), frame_id="rear") == [ns / 10**9 for ns in stamps_ns(8)[1::2]]
+    with pytest.raises(InputError, match=r"reader\.frame_id is 'left', but /points begins with 'front', 'rear'"):
+        stamps(Faults(), frame_id="left")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"point_step": 4}, "beyond the 4 bytes"),
+        ({"point_step": 0}, "beyond the 0 bytes"),
+        ({"width": 10**6}, "needs 88000000 bytes"),
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "bytes, the message holds 4400"),
+        ({"height": 2, "row_step": 2**32 - 1}, "bytes, the message holds 4400"),
+        ({"data": np.zeros(9, np.uint8)}, "the message holds 9"),
+        ({"fields": []}, "need the fields x, y and z"),
+    ],
+)
+def test_a_damaged_message_costs_no_other(bag_kit, make_sweep, changes, reason):
+    messages = recorded(bag_kit, [make_sweep("velodyne", ns) for ns in stamps_ns(5)])
+    sweep = make_sweep("velodyne", STAMP_NS)
+    for place in (0, 3):
+        messages[place] = (messages[place][0], bag_kit.cloud(sweep.records, stamps_ns(5)[place], **changes))
+    recording, faults = open_recording(bag_kit.write({"/points": messages})), Faults()
+    scans = list(recording.scans(faults=faults))
+    assert [scan.stamp for scan in scans] == [stamps_ns(5)[i] / 10**9 for i in (1, 2, 4)]
+    assert all(scan.time_offsets is not None for scan in scans)
+    (warning,) = faults.warnings()
+    assert warning.startswith("2 scans were left out: they could not be read")
+    assert reason in warning
+    assert any("could not be read" in note for note in recording.describe().notes)
+    with pytest.raises(InputError, match=r"message holds|bytes of a point|x, y and z"):
+        list(recording.scans())
+
+
+def test_stamps_that_are_all_alike_give_way_to_the_times_of_recording(bag_kit, make_sweep):
+    sweep = make_sweep("velodyne", STAMP_NS)
+    clouds = [(ns, bag_kit.cloud(sweep.records, STAMP_NS)) for ns in stamps_ns(5)]
+    recording = open_recording(bag_kit.write({"/points": clouds}))
+    assert [scan.stamp for scan in recording.scans()] == [ns / 10**9 for ns in stamps_ns(5)]
+    assert recording.warnings == ("The message headers have no stamps, so the times of recording are used.",)
+
+
+@pytest.mark.parametrize("spoil", [np.nan, -1e30, 1e5])
+def test_a_scan_whose_times_are_worth_nothing_keeps_its_points(bag_kit, make_sweep, spoil):
+    sweeps = [make_sweep("velodyne", ns) for ns in stamps_ns(4)]
+    sweeps[2].records["time"] *= spoil
+    recording, faults = open_recording(bag_kit.write({"/points": recorded(bag_kit, sweeps)})), Faults()
+    scans = list(recording.scans(faults=faults))
+    assert [scan.time_offsets is None for scan in scans] == [False, False, True, False]
+    assert [len(scan) for scan in scans] == [200] * 4
+    assert faults.warnings()[0].startswith("1 scans have no usable times of their points")

@@ -216,17 +216,17 @@ def test_an_earlier_merge_is_replaced_only_when_asked(rooms: list[Path], tmp_pat
     assert not list(out.rglob(".partial*"))
 
 
-def test_a_damaged_recording_ends_there_and_the_next_goes_on(rooms: list[Path], tmp_path: Path) -> None:
+def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: list[Path], tmp_path: Path) -> None:
     (rooms[0] / "000003.npy").write_bytes(b"not an array")
     for scan in rooms[1].glob("*.npy"):
         scan.write_bytes(b"not an array")
     outcome = merge(request(tmp_path / "out", *rooms, settings=FAST), quiet)
-    assert [recording.scans for recording in outcome.summary.recordings] == [3, 0, 5]
+    assert [recording.scans for recording in outcome.summary.recordings] == [4, 0, 5]
     assert [recording.directory for recording in outcome.summary.recordings] == ["01_in_room_0", None, "03_in_room_2"]
     assert not (tmp_path / "out" / "02_in_room_1").exists()
-    assert len(outcome.stopped) == 2
-    assert "stopped after 3 scans" in outcome.stopped[0]
-    assert "no scan could be used" in outcome.stopped[1]
+    (stopped,) = outcome.stopped
+    assert "no scan could be used: 5 scans were left out: they could not be read" in stopped
+    assert any("1 scans were left out: they could not be read" in warning for warning in outcome.summary.warnings)
     assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
 
 

@@ -1,0 +1,50 @@
+"""The door between a recording and whoever works on its scans: each scan is looked at here, once."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lidarslam.core.scan import Scan
+from lidarslam.core.thinning import one_per_cell
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stamp_order import in_stamp_order
+
+# No LiDAR measures more points in a sweep; the cells are finer than any method's.
+_MOST_POINTS = 1 << 20
+_CELL_M = 0.02
+# Half of a sweep's points lie nearer than this, out of doors too; in millimetres a small room's lie farther.
+_FAR_M = 400.0
+_FEW_POINTS = 50
+_SAMPLE = 4096
+
+_THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most so many, one in a cell of 2 cm"
+_MILLIMETRES = "scans look like millimetres, where metres are expected: convert the points"
+_ONE_PLACE = "scans have all their points at one place and say nothing"
+
+
+def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Scan]:
+    """The chosen scans of a recording, in the order of time, of a size that can be worked on.
+
+    What is left out and what looks wrong is counted in `faults`.
+
+    Raises:
+        InputError: the recording is damaged where no scan can be left out, or its clock was set back.
+    """
+    scans = recording.scans(chosen.start, chosen.stop, chosen.step, faults)
+    return in_stamp_order((look_at(scan, faults) for scan in scans), lambda scan: scan.stamp, faults)
+
+
+def look_at(scan: Scan, faults: Faults) -> Scan:
+    """The scan, thinned if it is too large; what looks wrong with it is counted."""
+    if len(scan) > _MOST_POINTS:
+        faults.note(_THINNED, f"{len(scan):,} points at {scan.stamp:.9f}")
+        scan = scan.select(one_per_cell(scan.points, _CELL_M))
+    if len(scan) > _FEW_POINTS:
+        sample = scan.points[:: max(1, len(scan) // _SAMPLE)]
+        median_m = float(np.median(np.linalg.norm(sample, axis=1)))
+        if median_m > _FAR_M:
+            faults.note(_MILLIMETRES, f"half of the points are farther away than {median_m:.0f} at {scan.stamp:.9f}")
+        elif not np.ptp(scan.points, axis=0).any():
+            faults.note(_ONE_PLACE, f"{len(scan)} points at {scan.stamp:.9f}")
+    return scan

@@ -1,0 +1,322 @@
+"""Files with bytes cut off, bytes changed or headers that lie: scans that make sense come out, or one line of error.
+
+Nothing else may come out of any reader: no other exception, no warning of NumPy's, no scan with numbers that are none.
+"""
+
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
+from lidarslam.datasets.registry import open_recording
+
+POINTS = 120
+SCANS = 4
+STAMP_NS = 1_700_000_000_250_000_000
+HEADER_WORDS = (
+    "", "0", "-1", "1", "3", "119", "121", "4294967295", "1000000000000", "9" * 30, "nan", "x y z", "x", "_", "F", "8",
+    "ascii", "binary", "binary_compressed", "binary_big_endian", "vertex", "list", "float", "double", "\u00e9", "('x',",
+)  # fmt: skip
+
+fuzzed = settings(
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+def check(source: Path) -> int:
+    """Describe a recording and read it all; how many scans make sense, -1 if it ended in one line of error."""
+    faults, scans, error = Faults(), [], ""
+    try:
+        recording = open_recording(source)
+        recording.describe()
+        asked = len(recording)
+        for scan in take_in(recording, range(asked), faults):
+            scans.append(scan)
+            assert np.isfinite(scan.points).all()
+            assert np.abs(scan.points).max(initial=0.0) < 10_000.0
+            assert scan.time_offsets is None or np.isfinite(scan.time_offsets).all()
+            assert scan.rings is None or ((scan.rings >= 0) & (scan.rings < 4096)).all()
+    except InputError as reason:
+        error = str(reason)
+    assert "\n" not in error
+    stamps = [scan.stamp for scan in scans]
+    assert np.isfinite(stamps).all()
+    assert (np.diff(stamps) > 0.0).all()
+    assert all("\n" not in line for line in faults.warnings())
+    if error:
+        return -1
+    assert len(scans) + faults.left_out == asked
+    return len(scans)
+
+
+@st.composite
+def damages(draw):
+    """A function that damages bytes: cuts them off, changes some, or puts other words in the header."""
+    how = draw(st.sampled_from(["cut", "flip", "flip in the header", "word", "insert"]))
+    part = draw(st.floats(0.0, 1.0))
+    values = draw(st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), min_size=1, max_size=12))
+    word = draw(st.sampled_from(HEADER_WORDS)).encode()
+
+    def damage(data: bytes, header: int) -> bytes:
+        if how == "cut":
+            return data[: int(part * len(data))]
+        changed = bytearray(data)
+        if how == "insert":
+            place = int(part * len(data))
+            return bytes(changed[:place]) + word + bytes(changed[place:])
+        if how == "word":
+            words = changed[:header].split(b" ")
+            words[int(part * (len(words) - 1))] = word + b"\n" * (b"\n" in words[int(part * (len(words) - 1))])
+            return b" ".join(bytes(each) for each in words) + bytes(changed[header:])
+        extent = header if how == "flip in the header" else len(changed)
+        for where, value in values:
+            if extent:
+                changed[int(where * (extent - 1))] = value
+        return bytes(changed)
+
+    return damage
+
+
+@pytest.fixture(scope="module")
+def table() -> np.ndarray:
+    rng = np.random.default_rng(3)
+    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2")]
+    points = np.zeros(POINTS, fields)
+    for axis in "xyz":
+        points[axis] = rng.uniform(-20.0, 20.0, POINTS)
+    points["t"] = np.linspace(0, 100_000_000, POINTS)
+    points["ring"] = np.arange(POINTS) % 16
+    return points
+
+
+def _as_bin(points: np.ndarray) -> bytes:
+    return np.stack([points[name] for name in ("x", "y", "z", "intensity")], axis=1).astype("<f4").tobytes()
+
+
+def _as_npy(points: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    np.save(out, points)
+    return out.getvalue()
+
+
+def _as_text(points: np.ndarray) -> bytes:
+    return "".join(" ".join(str(value) for value in row.item()) + "\n" for row in points).encode()
+
+
+def _as_pcd(points: np.ndarray, data: str) -> bytes:
+    count = len(points)
+    header = (
+        "VERSION 0.7\nFIELDS x y z intensity t ring\nSIZE 4 4 4 4 4 2\nTYPE F F F F U U\nCOUNT 1 1 1 1 1 1\n"
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
+    ).encode()
+    if data == "ascii":
+        return header + _as_text(points)
+    if data == "binary":
+        return header + points.tobytes()
+    raw = b"".join(np.ascontiguousarray(points[name]).tobytes() for name in points.dtype.names)
+    literal = b"".join(bytes([len(raw[i : i + 32]) - 1]) + raw[i : i + 32] for i in range(0, len(raw), 32))
+    return header + struct.pack("<II", len(literal), len(raw)) + literal
+
+
+def _as_ply(points: np.ndarray, data: str) -> bytes:
+    names = {"f4": "float", "u4": "uint", "u2": "ushort"}
+    fields = "".join(f"property {names[points.dtype[name].str[1:]]} {name}\n" for name in points.dtype.names)
+    header = f"ply\nformat {data} 1.0\nelement vertex {len(points)}\n{fields}end_header\n".encode()
+    if data == "ascii":
+        return header + _as_text(points)
+    if data == "binary_big_endian":
+        points = points.astype(points.dtype.newbyteorder(">"))
+    return header + points.tobytes()
+
+
+FORMATS = {
+    "plain.bin": _as_bin,
+    "structured.npy": _as_npy,
+    "ascii.pcd": lambda points: _as_pcd(points, "ascii"),
+    "binary.pcd": lambda points: _as_pcd(points, "binary"),
+    "compressed.pcd": lambda points: _as_pcd(points, "binary_compressed"),
+    "ascii.ply": lambda points: _as_ply(points, "ascii"),
+    "little.ply": lambda points: _as_ply(points, "binary_little_endian"),
+    "big.ply": lambda points: _as_ply(points, "binary_big_endian"),
+}
+
+
+@pytest.mark.parametrize("name", list(FORMATS))
+@fuzzed
+@given(damage=damages(), place=st.integers(0, SCANS - 1))
+def test_folder_of_damaged_scans(tmp_path, table, name, damage, place):
+    data = FORMATS[name](table)
+    header = len(data) - len(FORMATS[name](table[:0])) if name == "plain.bin" else len(FORMATS[name](table[:0]))
+    for index in range(SCANS):
+        damaged = damage(data, min(header, len(data)))
+        (tmp_path / f"{index}{Path(name).suffix}").write_bytes(damaged if index == place else data)
+    (tmp_path / "times.txt").write_text("".join(f"{100 + index / 10}\n" for index in range(SCANS)))
+    # A change may well make another valid scan; the other three are never lost.
+    assert check(tmp_path) >= SCANS - 1
+
+
+@pytest.mark.parametrize("name", ["times.txt", "calib.txt", "poses.txt", "velodyne/000002.bin"])
+@fuzzed
+@given(damage=damages())
+def test_damaged_kitti_sequence(tmp_path, table, name, damage):
+    velodyne = tmp_path / "velodyne"
+    velodyne.mkdir(exist_ok=True)
+    for index in range(SCANS):
+        (velodyne / f"{index:06d}.bin").write_bytes(_as_bin(table))
+    (tmp_path / "times.txt").write_text("".join(f"{index / 10:e}\n" for index in range(SCANS)))
+    rows = " ".join(f"{value:e}" for value in np.eye(4)[:3].ravel())
+    (tmp_path / "calib.txt").write_text(f"P0: {rows}\nTr: {rows}\n")
+    (tmp_path / "poses.txt").write_text(f"{rows}\n" * SCANS)
+    data = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(damage(data, len(data)))
+    count = check(tmp_path)
+    if name != "times.txt":
+        assert count >= SCANS - 1
+    _check_truth(tmp_path)
+
+
+def _check_truth(source: Path) -> None:
+    truth, error = None, ""
+    try:
+        truth = open_recording(source).ground_truth
+    except InputError as reason:
+        error = str(reason)
+    assert "\n" not in error
+    assert truth is None or np.isfinite(truth.T_world_lidar).all()
+
+
+RAW_FILES = (
+    "velodyne_points/timestamps.txt",
+    "velodyne_points/timestamps_start.txt",
+    "velodyne_points/data/0000000002.bin",
+    "oxts/data/0000000001.txt",
+    "oxts/timestamps.txt",
+    "../calib_imu_to_velo.txt",
+)
+
+
+@pytest.mark.parametrize("name", RAW_FILES)
+@fuzzed
+@given(damage=damages())
+def test_damaged_kitti_raw_drive(tmp_path, table, name, damage):
+    drive = tmp_path / "drive"
+    (drive / "velodyne_points" / "data").mkdir(parents=True, exist_ok=True)
+    (drive / "oxts" / "data").mkdir(parents=True, exist_ok=True)
+    for folder, shift in (("velodyne_points/timestamps", 0.0), ("oxts/timestamps", 0.013)):
+        lines = [f"2011-09-26 13:02:{25 + 0.1 * index + shift:012.9f}\n" for index in range(SCANS)]
+        (drive / f"{folder}.txt").write_text("".join(lines))
+    for which, shift in (("start", -0.05), ("end", 0.05)):
+        lines = [f"2011-09-26 13:02:{25 + 0.1 * index + shift:012.9f}\n" for index in range(SCANS)]
+        (drive / "velodyne_points" / f"timestamps_{which}.txt").write_text("".join(lines))
+    for index in range(SCANS):
+        (drive / "velodyne_points" / "data" / f"{index:010d}.bin").write_bytes(_as_bin(table))
+        numbers = [49.0 + 1e-6 * index, 8.4, 110.0, *np.zeros(27)]
+        (drive / "oxts" / "data" / f"{index:010d}.txt").write_text(" ".join(f"{n:.9f}" for n in numbers))
+    (tmp_path / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: 0.8 0.3 -0.8\n")
+    data = (drive / name).read_bytes()
+    (drive / name).write_bytes(damage(data, len(data)))
+    check(drive)
+    _check_truth(drive)
+
+
+@fuzzed
+@given(damage=damages(), what=st.sampled_from(["file", "metadata"]))
+def test_damaged_bags(bag_kit, make_sweep, damage, what):
+    kit, kept = bag_kit, bag_kit.folder / "kept"
+    path = kit.folder / ("drive.bag" if kit.kind == "bag" else "drive")
+    if not kept.exists():
+        sweeps = [make_sweep("velodyne", STAMP_NS + i * 10**8) for i in range(SCANS)]
+        stamps = [STAMP_NS + i * 10**8 for i in range(SCANS)]
+        clouds = [(ns, kit.cloud(sweep.records, ns)) for ns, sweep in zip(stamps, sweeps, strict=True)]
+        assert kit.write({"/points": clouds}) == path
+        kept.mkdir()
+        (kept / "file").write_bytes(kit.storage_file(path).read_bytes())
+        if path.is_dir():
+            (kept / "metadata").write_bytes((path / "metadata.yaml").read_bytes())
+    file = kit.storage_file(path)
+    file.write_bytes((kept / "file").read_bytes())
+    if path.is_dir():
+        (path / "metadata.yaml").write_bytes((kept / "metadata").read_bytes())
+    if what == "metadata" and path.is_dir():
+        data = (kept / "metadata").read_bytes()
+        (path / "metadata.yaml").write_bytes(damage(data, len(data)))
+        check(path)
+    else:
+        data = (kept / "file").read_bytes()
+        file.write_bytes(damage(data, min(len(data), 600)))
+        check(file)
+
+
+@fuzzed
+@given(
+    height=st.sampled_from([0, 1, 4, 2**32 - 1]),
+    width=st.sampled_from([0, 1, 50, 49, 51, 10**6, 2**32 - 1]),
+    point_step=st.sampled_from([0, 1, 12, 22, 21, 23, 2**32 - 1]),
+    row_step=st.sampled_from([0, 1, 1100, 1099, 2**32 - 1]),
+    big=st.booleans(),
+    size=st.sampled_from([0, 1, 4399, 4400, 5000]),
+    field=st.integers(0, 5),
+    name=st.sampled_from(["", "x", "w", "time", "ring"]),
+    offset=st.sampled_from([0, 4, 21, 2**32 - 1]),
+    datatype=st.integers(0, 255),
+    count=st.sampled_from([0, 1, 2**32 - 1]),
+)
+def test_clouds_that_say_what_is_not_so(
+    ros2_kit, make_sweep, height, width, point_step, row_step, big, size, field, name, offset, datatype, count
+):
+    """A message whose numbers lie: every field of PointCloud2 that says where the points are."""
+    sweep = make_sweep("velodyne", STAMP_NS)
+    good = ros2_kit.cloud(sweep.records, STAMP_NS)
+    fields = list(good.fields)
+    fields[field % len(fields)] = ros2_kit.new(
+        "sensor_msgs/PointField", name=name, offset=offset, datatype=datatype, count=count
+    )
+    data = np.resize(good.data, size)
+    lying = ros2_kit.cloud(
+        sweep.records, STAMP_NS + 10**8, height=height, width=width, point_step=point_step, row_step=row_step,
+        is_bigendian=big, data=data, fields=fields,
+    )  # fmt: skip
+    clouds = [(STAMP_NS, good), (STAMP_NS + 10**8, lying)]
+    folder = ros2_kit.folder / "drive"
+    if folder.exists():
+        for path in folder.iterdir():
+            path.unlink()
+        folder.rmdir()
+    assert check(ros2_kit.write({"/points": clouds})) >= 1
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "plain.bin"])
+def test_a_header_that_promises_more_than_there_is(tmp_path, table, name):
+    """One point more, and so many that making room for them would fill any memory."""
+    data = FORMATS[name](table)
+    for promised in ("121", "1000000000000"):
+        lie = data.replace(b"POINTS 120", f"POINTS {promised}".encode())
+        lie = lie.replace(b"element vertex 120", f"element vertex {promised}".encode())
+        if name.endswith(".npy"):  # whose header has a length of its own
+            length = len(f"({promised},), ") - len("(120,), ")
+            lie = data.replace(b"(120,), }" + b" " * length, f"({promised},), }}".encode())
+        assert lie != data
+        (tmp_path / name).write_bytes(lie)
+        with pytest.raises(InputError, match="truncated"):
+            next(open_recording(tmp_path).scans())
+
+
+def test_pickled_objects_are_never_unpickled(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (Path(tmp_path / "sprung").touch, ())
+
+    np.save(tmp_path / "0.npy", np.array([Trap()], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="it holds pickled objects, which could run any program"):
+        next(open_recording(tmp_path).scans())
+    assert not (tmp_path / "sprung").exists()

@@ -1,0 +1,462 @@
+"""Whole runs on recordings that are damaged: a result that says what was left out, or one line; never anything else."""
+
+import csv
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import is_rigid
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
+from lidarslam.datasets.ply import read_ply
+
+FAST = ("--odometry", "constant-velocity", "--no-pose-graph")
+FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")]
+STAMP_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 100_000_000
+YEAR_NS = 365 * 86400 * 10**9
+
+fuzzed = settings(
+    max_examples=50,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@pytest.fixture
+def tables(room_scans: list[Scan]) -> list[np.ndarray]:
+    """Eight sweeps of 1 500 points."""
+    tables = []
+    for scan in room_scans[:8]:
+        assert scan.time_offsets is not None
+        table = np.zeros(1500, FIELDS)
+        points = scan.points[::6]
+        table["x"], table["y"], table["z"] = points.T
+        table["time"] = scan.time_offsets[::6]
+        tables.append(table)
+    return tables
+
+
+def invoke(*arguments: object) -> Any:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exit_code in (0, 1, 3)
+    assert "Traceback" not in result.output
+    return result
+
+
+def run(source: Path, *options: str, asked: int | None = None) -> tuple[int, dict[str, Any], str]:
+    """Info and run; exit status, summary (empty without one) and what was said on standard error."""
+    assert invoke("info", source).exit_code in (0, 1)
+    out = source.parent / "run"
+    result = invoke("run", source, "--out", out, "--overwrite", *FAST, *options)
+    said = result.stderr.splitlines()
+    if result.exit_code == 1:
+        assert len(said) == 1
+        assert said[0].startswith("lidarslam: ")
+    summary = json.loads((out / "summary.json").read_text()) if (out / "summary.json").exists() else {}
+    if summary:
+        check(out, summary)
+        assert all(f"warning: {warning}" in result.stdout for warning in summary["warnings"])
+        if asked is not None and result.exit_code != 1:
+            assert summary["scans"] + left_out(summary) == asked
+    else:
+        assert result.exit_code == 1
+        assert not out.exists()
+    shutil.rmtree(out, ignore_errors=True)
+    return result.exit_code, summary, result.stderr
+
+
+def left_out(summary: dict[str, Any]) -> int:
+    """How many scans its warnings say were left out."""
+    return sum(int(found[1]) for w in summary["warnings"] if (found := re.match(r"(\d+) scans were left out", w)))
+
+
+def check(out: Path, summary: dict[str, Any]) -> None:
+    """Everything in a run directory is finite and of one mind."""
+    trajectory = read_tum(out / "trajectory.tum")  # refuses stamps that do not increase and what is no rotation
+    assert len(trajectory) == summary["scans"]
+    assert np.isfinite(trajectory.T_world_lidar).all()
+    assert is_rigid(trajectory.T_world_lidar)
+    assert (np.diff(trajectory.stamps) > 0.0).all()
+    assert len(read_kitti_poses(out / "trajectory.kitti")) == len(read_tum(out / "odometry.tum")) == summary["scans"]
+    rows = list(csv.DictReader((out / "scans.csv").open()))
+    assert [float(row["stamp"]) for row in rows] == pytest.approx(trajectory.stamps, abs=1e-6)
+    assert sum(row["status"] == "lost" for row in rows) == summary["lost_scans"]
+    assert sum(row["status"] == "degraded" for row in rows) == summary["degraded_scans"]
+    assert np.isfinite([summary["length_m"], summary["duration_s"]]).all()
+    assert (out / "map.ply").exists() == (summary["map_points"] > 0)
+    if summary["map_points"]:
+        cloud = read_ply(out / "map.ply")
+        assert len(cloud) == summary["map_points"]
+        assert all(np.isfinite(cloud[axis]).all() for axis in ("x", "y", "z", "nx", "ny", "nz"))
+
+
+def spoil(table: np.ndarray, how: str) -> np.ndarray:
+    """One scan with a fault in its numbers."""
+    table = table.copy()
+    if how == "empty":
+        return table[:0]
+    if how == "one point":
+        return table[:1]
+    for axis in "xyz":
+        if how == "not a number":
+            table[axis] = np.nan
+        elif how == "one place":
+            table[axis] = 2.0
+        elif how == "millimetres":
+            table[axis] *= 1000.0
+        elif how == "absurd":
+            table[axis][::3] = [1e30, np.inf, 1e7, -np.inf, np.nan] * 100
+    if how == "rings":
+        table["ring"][::2] = 65535
+    if how == "times of hours":
+        table["time"] *= 36_000.0
+    if how == "times not a number":
+        table["time"] = np.nan
+    if how == "times reversed":
+        table["time"] = table["time"][::-1]
+    if how == "times alike":
+        table["time"] = 0.0
+    return table
+
+
+SPOILT = (
+    "good", "empty", "one point", "not a number", "one place", "millimetres", "absurd", "rings", "times of hours",
+    "times not a number", "times reversed", "times alike",
+)  # fmt: skip
+UNREADABLE = ("cut", "noise", "pickled", "no x", "gone", "folder")
+
+
+@fuzzed
+@given(st.lists(st.sampled_from(SPOILT + UNREADABLE), min_size=1, max_size=8), st.integers(0, 2**32))
+def test_any_sequence_of_damaged_files(tmp_path, tables, faults, seed):
+    folder = tmp_path / "drive"
+    folder.mkdir(exist_ok=True)
+    for path in folder.iterdir():
+        path.rmdir() if path.is_dir() else path.unlink()
+    for index, how in enumerate(faults):
+        write_scan(folder / f"{index:03d}.npy", tables[index], how, seed)
+    asked = sum(how not in ("gone", "folder") for how in faults)
+    (folder / "times.txt").write_text("".join(f"{1000 + 0.1 * i:.3f}\n" for i in range(max(asked, 2))[:asked]))
+    code, summary, said = run(folder, asked=asked)
+    readable = [how for how in faults if how not in UNREADABLE]
+    if not any(how not in ("empty", "not a number") for how in readable):
+        assert code == 1
+    elif asked > 1:
+        assert code in (0, 3), said
+        assert summary["scans"] == len(readable)
+
+
+def write_scan(path: Path, table: np.ndarray, how: str, seed: int) -> None:
+    if how == "gone":
+        path.symlink_to(path.with_name("nowhere"))
+    elif how == "folder":
+        path.mkdir()
+    elif how == "noise":
+        path.write_bytes(np.random.default_rng(seed).bytes(5000))
+    elif how == "pickled":
+        np.save(path, np.array([{"x": 1.0}], dtype=object))
+    elif how == "no x":
+        np.save(path, table[["y", "z", "time"]])
+    else:
+        np.save(path, spoil(table, how))
+        if how == "cut":
+            data = path.read_bytes()
+            path.write_bytes(data[: seed % len(data)])
+
+
+def write_bag(folder: Path, scans: list[tuple[int, str, np.ndarray]]) -> Path:
+    """A bag of clouds: the stamp in ns, the sensor and the points of each."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    if folder.exists():
+        for path in folder.iterdir():
+            path.unlink()
+        folder.rmdir()
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=store)
+        for index, (stamp_ns, frame_id, table) in enumerate(scans):
+            stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+            codes = {"f4": 7, "u2": 4, "f8": 8}
+            fields = [
+                types["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=codes[kind.str[1:]], count=1)
+                for name, (kind, offset) in table.dtype.fields.items()
+            ]
+            message = types["sensor_msgs/msg/PointCloud2"](
+                header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id),
+                height=1,
+                width=len(table),
+                fields=fields,
+                is_bigendian=False,
+                point_step=table.dtype.itemsize,
+                row_step=table.nbytes,
+                data=np.frombuffer(table.tobytes(), np.uint8),
+                is_dense=True,
+            )
+            raw = store.serialize_cdr(message, message.__msgtype__)
+            writer.write(connection, STAMP_NS + index * PERIOD_NS, bytes(raw))
+    return folder
+
+
+SHIFTS_NS = (0, 0, 0, 0, 0, -PERIOD_NS, 30_000_000, -YEAR_NS, YEAR_NS, -STAMP_NS, 5 * 10**9 - STAMP_NS, 4 * 10**9)
+
+
+@fuzzed
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(SPOILT), st.sampled_from(SHIFTS_NS), st.sampled_from("aaaab")),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_any_sequence_of_odd_messages(tmp_path, tables, scans):
+    messages = [
+        (max(0, STAMP_NS + index * PERIOD_NS + shift_ns), frame, spoil(tables[index], how))
+        for index, (how, shift_ns, frame) in enumerate(scans)
+    ]
+    _, summary, _ = run(write_bag(tmp_path / "drive", messages), asked=len(scans))
+    stamps = {stamp for stamp, _, _ in messages}
+    if all(shift == 0 and frame == "a" for _, shift, frame in scans) and summary:
+        assert summary["scans"] == len(stamps)
+
+
+def messages_at(tables: list[np.ndarray], stamps_ns: Callable[[int], int]) -> list[tuple[int, str, np.ndarray]]:
+    return [(stamps_ns(index), "lidar", table) for index, table in enumerate(tables)]
+
+
+def usual_ns(index: int) -> int:
+    return STAMP_NS + index * PERIOD_NS
+
+
+@pytest.mark.parametrize("stray_ns", [0, 5 * 10**9, STAMP_NS + YEAR_NS, STAMP_NS - YEAR_NS])
+@pytest.mark.parametrize("place", [0, 3])
+def test_one_stray_stamp_costs_one_scan(tmp_path, tables, stray_ns, place):
+    bag = write_bag(tmp_path / "drive", messages_at(tables, lambda i: stray_ns if i == place else usual_ns(i)))
+    code, summary, _ = run(bag, asked=8)
+    assert (code, summary["scans"], left_out(summary)) == (0, 7, 1)
+    assert summary["duration_s"] == pytest.approx(0.7 if place else 0.6)
+
+
+def test_a_clock_that_jumps_a_year_ahead_for_good_is_followed_and_told(tmp_path, tables):
+    stamps = messages_at(tables, lambda i: usual_ns(i) + (YEAR_NS if i > 3 else 0))
+    code, summary, _ = run(write_bag(tmp_path / "drive", stamps), asked=8)
+    assert (code, summary["scans"]) == (0, 8)
+    assert any("1 gaps in the stamps" in w and "31536000.1 s after scan 3" in w for w in summary["warnings"])
+
+
+def test_a_clock_set_back_for_good_ends_the_run_with_a_line_and_what_there_is(tmp_path, tables):
+    stamps = messages_at([tables[i % 8] for i in range(20)], lambda i: usual_ns(i) - (YEAR_NS if i > 5 else 0))
+    bag = write_bag(tmp_path / "drive", stamps)
+    code, summary, said = run(bag)
+    assert (code, summary["scans"]) == (1, 6)
+    assert "the stamps run backwards from scan number 6 on" in said
+    code, summary, _ = run(bag, "--start", "6", asked=14)
+    assert summary["scans"] == 14
+
+
+def test_scans_that_were_dropped_are_told_as_gaps(tmp_path, tables):
+    stamps = messages_at(tables, lambda i: usual_ns(i) + (20 * PERIOD_NS if i > 5 else 0))
+    _, summary, _ = run(write_bag(tmp_path / "drive", stamps), asked=8)
+    assert summary["scans"] == 8
+    assert any("1 gaps in the stamps" in w and "2.1 s after scan 5" in w for w in summary["warnings"])
+
+
+def test_two_sensors_on_one_topic(tmp_path, tables):
+    scans = [(usual_ns(index), "front" if index % 2 else "rear", table) for index, table in enumerate(tables)]
+    bag = write_bag(tmp_path / "drive", scans)
+    _, summary, _ = run(bag, asked=8)
+    assert summary["scans"] == 4
+    assert any("another sensor than 'rear'; for that one set reader.frame_id" in w for w in summary["warnings"])
+    _, summary, _ = run(bag, "--set", "reader.frame_id=front", asked=8)
+    assert summary["scans"] == 4
+
+
+def write_folder(folder: Path, tables: list[np.ndarray]) -> Path:
+    folder.mkdir(exist_ok=True)
+    for index, table in enumerate(tables):
+        np.save(folder / f"{index:03d}.npy", table)
+    return folder
+
+
+def test_no_fault_no_warning(tmp_path, tables):
+    code, summary, said = run(write_folder(tmp_path / "drive", tables), asked=8)
+    assert (code, summary["warnings"], said) == (0, [], "")
+
+
+def test_millimetres_are_told(tmp_path, tables):
+    folder = write_folder(tmp_path / "drive", [spoil(table, "millimetres") for table in tables])
+    _, summary, _ = run(folder)
+    assert any(w.startswith("8 scans look like millimetres, where metres are expected") for w in summary["warnings"])
+
+
+def test_scans_that_vanish_while_it_runs_are_counted(tmp_path, tables, monkeypatch):
+    from lidarslam.datasets import scan_folder
+
+    folder = write_folder(tmp_path / "drive", tables)
+    table_reader = scan_folder.table_reader
+
+    def vanishing(files: Any) -> Any:
+        read = table_reader(files)
+
+        def reader(path: Path) -> Any:
+            if path.stem == "002":
+                for name in ("005.npy", "006.npy"):
+                    (folder / name).unlink(missing_ok=True)
+            return read(path)
+
+        return reader
+
+    monkeypatch.setattr(scan_folder, "table_reader", vanishing)
+    out = tmp_path / "run"
+    assert invoke("run", folder, "--out", out, *FAST).exit_code == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["scans"], left_out(summary)) == (6, 2)
+
+
+def test_links_that_lead_nowhere_or_in_a_circle_are_counted(tmp_path, tables):
+    folder = write_folder(tmp_path / "drive", tables)
+    for name, target in (("003.npy", "nowhere.npy"), ("005.npy", "005.npy")):
+        (folder / name).unlink()
+        (folder / name).symlink_to(folder / target)
+    _, summary, _ = run(folder)
+    assert summary["scans"] == 6
+    assert summary["warnings"] == ["2 scans are no files that can be opened, such as 003.npy."]
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    assert run(tmp_path / "circle")[0] == 1
+
+
+def test_pipes_are_not_waited_for(tmp_path, tables):
+    velodyne = tmp_path / "drive" / "velodyne"
+    velodyne.mkdir(parents=True)
+    for index, table in enumerate(tables):
+        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
+        points.astype("<f4").tofile(velodyne / f"{index:06d}.bin")
+    (velodyne / "000003.bin").unlink()
+    os.mkfifo(velodyne / "000003.bin")
+    (velodyne / "000004.bin").unlink()
+    (velodyne / "000004.bin").mkdir()
+    _, summary, _ = run(tmp_path / "drive", asked=8)
+    assert (summary["scans"], left_out(summary)) == (6, 2)
+
+
+@pytest.mark.parametrize("name", ["räder 点 a b", "two  spaces", "'quoted' \"names\"", "%2e?#&;", "\u00ff latin"])
+def test_names_that_are_odd(tmp_path, tables, name):
+    code, summary, _ = run(write_folder(tmp_path / name, tables[:3]), asked=3)
+    assert (code, summary["scans"]) == (0, 3)
+
+
+def test_a_name_that_no_terminal_can_show(tmp_path, tables):
+    try:
+        folder = write_folder(tmp_path / os.fsdecode(b"drive \xff"), tables[:3])
+    except OSError:
+        pytest.skip("this file system has no such names")
+    assert run(folder, asked=3)[0] == 0
+
+
+def test_what_is_no_recording_is_told_in_one_line(tmp_path, tables):
+    folder = write_folder(tmp_path / "drive", tables[:2])
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (tmp_path / "note.txt").write_text("hello")
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / "folders" / name).mkdir(parents=True)
+        (tmp_path / "files" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "files" / name).write_text("hello")
+    sources = [empty, folder / "000.npy", tmp_path / "note.txt", tmp_path / "missing"]
+    sources += [tmp_path / kind / name for kind in ("folders", "files") for name in ("a.bag", "a.mcap", "a.db3")]
+    for source in sources:
+        code, _, said = run(source)
+        assert code == 1
+        assert str(source) in said
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not bind the superuser")
+def test_what_may_not_be_read(tmp_path, tables):
+    folder = write_folder(tmp_path / "drive", tables)
+    (folder / "003.npy").chmod(0)
+    _, summary, _ = run(folder, asked=8)
+    assert (summary["scans"], left_out(summary)) == (7, 1)
+    folder.chmod(0)
+    try:
+        code, _, said = run(folder)
+    finally:
+        folder.chmod(0o700)
+    assert code == 1
+    assert "check its permissions" in said
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "poses.txt", "times.txt"])
+@pytest.mark.parametrize("content", [None, b"", b"hello\n", b"\xff\xfe\x00", b"1 2 3\n", b"0.0\n0.1\n"])
+def test_kitti_files_missing_short_or_garbage(tmp_path, tables, name, content):
+    folder = tmp_path / "drive"
+    (folder / "velodyne").mkdir(parents=True)
+    for index, table in enumerate(tables[:4]):
+        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
+        points.astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
+    row = "1 0 0 0 0 1 0 0 0 0 1 0"
+    (folder / "calib.txt").write_text(f"Tr: {row}\n")
+    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    (folder / "poses.txt").write_text(f"{row}\n" * 4)
+    assert run(folder, asked=4)[1]["warnings"] == []
+    if content is None:
+        (folder / name).unlink()
+    else:
+        (folder / name).write_bytes(content)
+    code, summary, said = run(folder, asked=4)
+    if name == "times.txt" and content is not None:
+        assert code == 1
+        assert str(folder / name) in said
+    elif name == "poses.txt" and content is None:
+        assert (code, summary["warnings"]) == (0, [])
+    else:
+        assert code == 0
+        assert any(name in warning or "metrics" in warning for warning in summary["warnings"])
+
+
+def test_poses_of_which_some_are_missing_are_counted(tmp_path, tables):
+    folder = tmp_path / "drive"
+    (folder / "velodyne").mkdir(parents=True)
+    for index, table in enumerate(tables[:4]):
+        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
+        points.astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
+    row = "1 0 0 0 0 1 0 0 0 0 1 0"
+    (folder / "calib.txt").write_text(f"Tr: {row}\n")
+    for lines in (2, 9):
+        (folder / "poses.txt").write_text(f"{row}\n" * lines)
+        (folder / "times.txt").write_text("".join(f"{i / 10}\n" for i in range(4 if lines == 2 else 7)))
+        _, summary, _ = run(folder, asked=4)
+        warnings = " ".join(summary["warnings"])
+        assert f"has {lines} poses for the scans up to number 3" in warnings
+        assert ("times.txt has 7 lines for the scans up to number 3" in warnings) == (lines == 9)
+
+
+@pytest.mark.parametrize("stamp", ["1e300", "-1e300", "1e12", "123456789012345", "inf", "nan"])
+def test_stamps_beyond_all_time_are_told(tmp_path, tables, stamp):
+    folder = write_folder(tmp_path / "drive", tables[:3])
+    (folder / "times.txt").write_text(f"0.0\n0.1\n{stamp}\n")
+    code, _, said = run(folder)
+    assert code == 1
+    assert f"expected one stamp a line, got '{stamp}' at line 3" in said
+
+
+@pytest.mark.parametrize("first", [-9e10, -1.0, 4.9e8, 2.5e9, 9e10])
+def test_stamps_of_any_clock_are_shown_and_run(tmp_path, tables, first):
+    folder = write_folder(tmp_path / "drive", tables[:3])
+    (folder / "times.txt").write_text("".join(f"{first + 0.1 * i:.3f}\n" for i in range(3)))
+    code, summary, _ = run(folder, asked=3)
+    assert (code, summary["scans"]) == (0, 3)
