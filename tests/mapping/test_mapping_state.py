@@ -16,7 +16,7 @@ from mapping.global_map import GlobalMap
 from mapping.graph_config import KeyframeConfig
 from mapping.keyframe import KeyframeSelector
 from mapping.mapper import MappedScan, Mapper
-from mapping.prediction import Prior
+from mapping.prediction import Carrier, Prior
 from mapping.rings import RingFinder, RingSource
 
 ThroughDisk = Callable[[State], Saved]
@@ -147,3 +147,31 @@ def test_a_state_of_another_shape_is_refused(through_disk: ThroughDisk) -> None:
     state["last"] = {**state["last"], "covariance": np.eye(6)}
     with pytest.raises(InputError, match=r"covariance should be float64 \(12, 12\), and is float64 \(6, 6\)"):
         Mapper(CONFIG).restore(through_disk(state))
+
+
+def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through_disk: ThroughDisk) -> None:
+    """Values unlike those at the beginning come back; an attribute that is new has to be saved as well."""
+    mapper, restored = Mapper(CONFIG), Mapper(CONFIG)
+    for scan in scans[:2]:
+        mapper.process(scan, Prior())
+    mapper._first = mapper._sampler.sample(scans[0])
+    mapper._carrier = Carrier(1.5, 7.0)
+    mapper._expected_error_m, mapper._lost_in_a_row = 0.125, 3
+    mapper._was_degraded, mapper._has_velocity = True, True
+    restored.restore(through_disk(mapper.state()))
+    assert set(vars(mapper)) == {
+        "_config", "_sampler", "_map", "_state", "_carrier", "_expected_error_m", "_lost_in_a_row", "_was_degraded",
+        "_first", "_has_velocity",
+    }  # fmt: skip
+    assert flat(restored.state()) == flat(mapper.state())
+
+
+def flat(state: State) -> list[object]:
+    """All values one after the other, arrays as their bytes."""
+    values: list[object] = []
+    for name, value in state.items():
+        parts = value if isinstance(value, list) else [value]
+        for part in parts:
+            inside = flat(part) if isinstance(part, dict) else [part]
+            values += [name, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in inside)]
+    return values
