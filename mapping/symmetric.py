@@ -1,8 +1,6 @@
-"""Eigenvalues and vectors of many symmetric 3x3 matrices at once, in closed form."""
+"""Eigenvalues and vectors of symmetric 3x3 matrices in closed form, compiled."""
 
 import math
-
-import numpy as np
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
@@ -13,43 +11,13 @@ SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TINY = 1e-30
 
 
-def eigenvalues(M: FloatArray) -> FloatArray:
-    """Eigenvalues (N, 3), ascending, of matrices given by their six distinct entries (N, 6).
+@compiled
+def write_eigenvalues(M: FloatArray, values: FloatArray) -> None:
+    """Write the eigenvalues (3,), ascending, of a matrix given by its six distinct entries (6,).
 
     The trigonometric solution of the characteristic polynomial: Smith, "Eigenvalues of a symmetric 3x3 matrix",
     Communications of the ACM 4 (1961). Accurate to about 1e-8 of the largest one.
     """
-    values = np.empty((len(M), 3))
-    _write_values(np.ascontiguousarray(M), values)
-    return values
-
-
-def eigenvectors(M: FloatArray, values: FloatArray) -> FloatArray:
-    """Unit eigenvectors (N, 3) to one simple eigenvalue (N,) of each of the matrices (N, 6).
-
-    The rows of M - value * I span the plane across the eigenvector: the longest of their cross products is along it.
-    Any unit vector where the eigenvalue is not simple.
-    """
-    vectors = np.empty((len(M), 3))
-    _write_vectors(np.ascontiguousarray(M), np.ascontiguousarray(values), vectors)
-    return vectors
-
-
-@compiled
-def _write_values(M: FloatArray, values: FloatArray) -> None:
-    for n in range(len(M)):
-        write_eigenvalues(M[n], values[n])
-
-
-@compiled
-def _write_vectors(M: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
-    for n in range(len(M)):
-        write_eigenvector(M[n], values[n], vectors[n])
-
-
-@compiled
-def write_eigenvalues(M: FloatArray, values: FloatArray) -> None:
-    """As `eigenvalues`, (3,) of one matrix (6,)."""
     xx, xy, xz, yy, yz, zz = M[0], M[1], M[2], M[3], M[4], M[5]
     mean = (xx + yy + zz) / 3.0
     a, b, c = xx - mean, yy - mean, zz - mean
@@ -64,7 +32,11 @@ def write_eigenvalues(M: FloatArray, values: FloatArray) -> None:
 
 @compiled
 def write_eigenvector(M: FloatArray, value: float, vector: FloatArray) -> None:
-    """As `eigenvectors`, (3,) of one matrix (6,)."""
+    """Write the unit eigenvector (3,) to a simple eigenvalue of a matrix (6,).
+
+    The rows of M - value * I span the plane across the eigenvector: the longest of their cross products is along it.
+    Any unit vector where the eigenvalue is not simple.
+    """
     xy, xz, yz = M[1], M[2], M[4]
     a, b, c = M[0] - value, M[3] - value, M[5] - value
     x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy

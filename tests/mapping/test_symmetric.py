@@ -4,7 +4,21 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from mapping.symmetric import SYMMETRIC, eigenvalues, eigenvectors
+from mapping.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
+
+
+def eigenvalues(M: FloatArray) -> FloatArray:
+    values = np.full((len(M), 3), np.nan)
+    for matrix, written in zip(M, values, strict=True):
+        write_eigenvalues(matrix, written)
+    return values
+
+
+def eigenvectors(M: FloatArray, values: FloatArray) -> FloatArray:
+    vectors = np.full((len(M), 3), np.nan)
+    for matrix, value, written in zip(M, values, vectors, strict=True):
+        write_eigenvector(matrix, value, written)
+    return vectors
 
 
 def entries(M: FloatArray) -> FloatArray:
