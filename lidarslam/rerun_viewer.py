@@ -1,10 +1,11 @@
 """Runs in Rerun; the only file that imports it."""
 
+import contextlib
 import logging
 import os
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -23,9 +24,19 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.finished_run import FinishedRun
 from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
+from lidarslam.run_directory import RunDirectory
 from mapping.global_map import GlobalMap
 
 _log = logging.getLogger(__name__)
+
+# Rerun reports its use to its makers, from the viewer at least; this it takes as the wish not to. Children inherit it.
+os.environ.setdefault("CI", "1")
+os.environ.pop("FORCE_RERUN_ANALYTICS", None)
+
+# How a complete .rrd file of this version ends, before the four bytes of its flags.
+_FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
+# A writer that died would otherwise be waited for without end.
+_FLUSH_S = 600.0
 
 _SCAN_TIMELINE = "scan"
 _TIME_TIMELINE = "time"
@@ -48,6 +59,24 @@ _PLOTS = (
     ("residual", "Residual [m]", ("median point to plane",)),
     ("inliers", "Inlier ratio", ("worst direction",)),
 )
+
+
+class IncompleteRecordingError(OutputError):
+    """A Rerun recording came out cut off."""
+
+
+def require_complete(path: Path) -> None:
+    """See that a recording was written to its end; Rerun's writer only logs that the disk is full.
+
+    Raises:
+        IncompleteRecordingError: it was not.
+    """
+    footer = b""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        file.seek(-len(_FOOTER) - _FLAG_BYTES, os.SEEK_END)
+        footer = file.read(len(_FOOTER))
+    if footer != _FOOTER:
+        raise IncompleteRecordingError("the Rerun recording could not be written to its end; is the disk full?")
 
 
 class RerunViewer:
@@ -119,7 +148,7 @@ class RerunViewer:
     def close(self) -> None:
         """Wait until everything is written; a window that went away does not fail the run."""
         try:
-            self._recording.flush()
+            self._recording.flush(timeout_sec=_FLUSH_S)
             self._recording.disconnect()
         except RuntimeError as error:
             _log.warning("Rerun: %s", str(error).strip().splitlines()[0])
@@ -202,12 +231,16 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
     """
     recording = rr.RecordingStream("lidarslam")
     try:
-        address = _connect(recording, save, web)
-        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for number, run in enumerate(runs):
-            _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
-        recording.flush()
-    except (RuntimeError, OSError) as error:
+        with _recording_file(save) as partial:
+            address = _connect(recording, partial, web)
+            recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            for number, run in enumerate(runs):
+                _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
+            recording.flush(timeout_sec=_FLUSH_S)
+            if partial is not None:
+                recording.disconnect()
+                require_complete(partial)
+    except (RuntimeError, OSError, IncompleteRecordingError) as error:
         reason = " ".join(str(error).split())
         if save is not None:
             message = f"{save}: cannot be written ({reason}); name a file in a folder that exists and can be written to"
@@ -217,6 +250,16 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
             message = f"the Rerun window cannot be reached ({reason}); write a file with --save FILE.rrd, or use --web"
         raise OutputError(message) from error
     return address
+
+
+@contextlib.contextmanager
+def _recording_file(save: Path | None) -> Iterator[Path | None]:
+    """Where a recording is written until it is whole."""
+    if save is None:
+        yield None
+        return
+    with RunDirectory(save.parent).replacing(save.name) as partial:
+        yield partial
 
 
 def _connect(recording: rr.RecordingStream, save: Path | None, web: bool) -> str | None:
@@ -290,9 +333,10 @@ def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | N
         text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {', '.join(f'{m:.0f}' for m in middle)}"
         recording.log("legend", rr.TextDocument(text), static=True)
         recording.send_blueprint(_errors_blueprint())
-        recording.flush()
+        recording.flush(timeout_sec=_FLUSH_S)
         recording.disconnect()
-    except (RuntimeError, OSError) as error:
+        require_complete(path)
+    except (RuntimeError, OSError, IncompleteRecordingError) as error:
         raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())})") from error
 
 
