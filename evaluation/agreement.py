@@ -25,8 +25,8 @@ def disagreement(metrics: TrajectoryMetrics) -> str | None:
         return None
     own_spread_m = _spread_m(metrics.association.estimate.positions)
     said = (
-        f"the trajectory does not follow its reference: {error_m:.3g} m off (RMSE), where the reference itself spreads over"
-        f" {spread_m:.3g} m"
+        f"the trajectory does not follow its reference: {error_m:.3g} m off (RMSE), where the reference itself spreads"
+        f" over {spread_m:.3g} m"
     )
     if min(spread_m, own_spread_m) > 0.0 and max(spread_m / own_spread_m, own_spread_m / spread_m) > _OTHER_UNIT:
         return f"{said} and the trajectory over {own_spread_m:.3g} m; are both in metres?"

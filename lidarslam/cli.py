@@ -14,7 +14,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from lidarslam.core.errors import LidarSlamError
+from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.core.plain_text import one_line, printable
 from lidarslam.interruption import ended_like_interrupted
 
@@ -41,8 +41,10 @@ class _Group(click.Group):
     command_class = _Command
 
     def invoke(self, ctx: click.Context) -> Any:
+        _hold_standard_streams()
         _speak_any_encoding()
         try:
+            _require_place()
             with ended_like_interrupted():
                 return super().invoke(ctx)
         except LidarSlamError as error:
@@ -71,6 +73,27 @@ def _drop_unwritable_output() -> None:
         sys.stdout.flush()
     except OSError:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
+
+
+def _hold_standard_streams() -> None:
+    """Where a standard stream is closed, a file opened next would take its number, and a library's words with it."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+    if sys.stdout is None:
+        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115
+
+
+def _require_place() -> None:
+    """Libraries fail in strange ways where the folder one stands in was removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise InputError("the folder you stand in is gone; change to another") from None
 
 
 def _speak_any_encoding() -> None:
@@ -598,12 +621,11 @@ def view(
         _say(f"written to {save}")
     elif web:
         _say(address)
-        _say("serving until you press Ctrl-C")
+        _say("serving until you press Ctrl-C; whoever reaches this machine's ports 9090 and 9876 can look")
         signal.pause()
 
 
 def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
-    from lidarslam.core.errors import InputError
     from lidarslam.finished_run import load_map
     from lidarslam.picture import draw, height_colours, save_picture
 

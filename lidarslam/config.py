@@ -148,12 +148,9 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
     faults = error.errors(include_url=False)
-    more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
-    return (
-        f"configuration ({origin}): "
-        + "; ".join(_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS])
-        + more
-    )
+    told = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
+    told += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    return f"configuration ({origin}): {'; '.join(told)}"
 
 
 def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:

@@ -1,4 +1,4 @@
-"""Requests to end, as `kill`, `timeout` and a closed terminal send them, taken as Ctrl-C: what there is gets written."""
+"""Requests to end, as `kill`, `timeout` and a closed terminal send them, are Ctrl-C: what there is gets written."""
 
 import contextlib
 import signal
