@@ -17,6 +17,7 @@ from click.shell_completion import CompletionItem
 from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.core.plain_text import one_line, printable
 from lidarslam.interruption import ended_like_interrupted
+from lidarslam.rerun_environment import keep_rerun_to_itself, leave_if_abandoned
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +44,7 @@ class _Group(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         _hold_standard_streams()
         _speak_any_encoding()
+        keep_rerun_to_itself()
         try:
             _require_place()
             with ended_like_interrupted():
@@ -706,5 +708,17 @@ def config(config_file: Path | None, settings: tuple[str, ...]) -> None:
     click.echo(printable(dump_yaml(load_config(config_file, settings))), nl=False)
 
 
+def entry_point() -> None:
+    """The program: what `lidarslam` starts."""
+    status = 0
+    try:
+        main()
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        raise
+    finally:
+        leave_if_abandoned(status)
+
+
 if __name__ == "__main__":
-    main()
+    entry_point()

@@ -5,6 +5,7 @@ import logging
 import os
 import socket
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from evaluation.error_colours import error_colours
 from evaluation.map_metrics import CloudErrors, MapComparison
+from lidarslam import rerun_environment
 from lidarslam.config import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
@@ -29,14 +31,12 @@ from mapping.global_map import GlobalMap
 
 _log = logging.getLogger(__name__)
 
-# Rerun reports its use to its makers, from the viewer at least; this it takes as the wish not to. Children inherit it.
-os.environ.setdefault("CI", "1")
-os.environ.pop("FORCE_RERUN_ANALYTICS", None)
-
 # How a complete .rrd file of this version ends, before the four bytes of its flags.
 _FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
 # A writer that died would otherwise be waited for without end.
-_FLUSH_S = 600.0
+_FLUSH_S = 20.0
+# What there is to write was flushed by then.
+_DISCONNECT_S = 10.0
 
 _SCAN_TIMELINE = "scan"
 _TIME_TIMELINE = "time"
@@ -149,9 +149,11 @@ class RerunViewer:
         """Wait until everything is written; a window that went away does not fail the run."""
         try:
             self._recording.flush(timeout_sec=_FLUSH_S)
-            self._recording.disconnect()
         except RuntimeError as error:
-            _log.warning("Rerun: %s", str(error).strip().splitlines()[0])
+            _log.info("Rerun: %s", str(error).strip().splitlines()[0])
+            rerun_environment.abandoned = True
+            return
+        _disconnect(self._recording)
 
     def _log_static(self) -> None:
         self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -166,6 +168,15 @@ class RerunViewer:
             )
             self._recording.log("world/trajectory", piece)
         self._last_position = position.copy()
+
+
+def _disconnect(recording: rr.RecordingStream) -> None:
+    """Let the file be closed; on a full disk that never ends, and is left to itself after a while."""
+    thread = threading.Thread(target=recording.disconnect, name="disconnect", daemon=True)
+    thread.start()
+    thread.join(_DISCONNECT_S)
+    if thread.is_alive():
+        rerun_environment.abandoned = True
 
 
 def _open_window(recording: rr.RecordingStream) -> None:
@@ -231,16 +242,17 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
     """
     recording = rr.RecordingStream("lidarslam")
     try:
-        with _recording_file(save) as partial:
-            address = _connect(recording, partial, web)
+        with _recording_file(save) as file:
+            address = _connect(recording, file, web)
             recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
             for number, run in enumerate(runs):
                 _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
             recording.flush(timeout_sec=_FLUSH_S)
-            if partial is not None:
-                recording.disconnect()
-                require_complete(partial)
+            if file is not None:
+                _disconnect(recording)
+                require_complete(file)
     except (RuntimeError, OSError, IncompleteRecordingError) as error:
+        rerun_environment.abandoned = True
         reason = " ".join(str(error).split())
         if save is not None:
             message = f"{save}: cannot be written ({reason}); name a file in a folder that exists and can be written to"
@@ -258,8 +270,8 @@ def _recording_file(save: Path | None) -> Iterator[Path | None]:
     if save is None:
         yield None
         return
-    with RunDirectory(save.parent).replacing(save.name) as partial:
-        yield partial
+    with RunDirectory(save.parent).replacing(save.name) as file:
+        yield file
 
 
 def _connect(recording: rr.RecordingStream, save: Path | None, web: bool) -> str | None:
@@ -334,9 +346,10 @@ def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | N
         recording.log("legend", rr.TextDocument(text), static=True)
         recording.send_blueprint(_errors_blueprint())
         recording.flush(timeout_sec=_FLUSH_S)
-        recording.disconnect()
+        _disconnect(recording)
         require_complete(path)
     except (RuntimeError, OSError, IncompleteRecordingError) as error:
+        rerun_environment.abandoned = True
         raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())})") from error
 
 
