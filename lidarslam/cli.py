@@ -622,7 +622,7 @@ def view(
     if save is not None:
         _say(f"written to {save}")
     elif web:
-        _say(address)
+        _say(str(address))
         _say("serving until you press Ctrl-C; whoever reaches this machine's ports 9090 and 9876 can look")
         signal.pause()
 
