@@ -26,6 +26,10 @@ _LEAST_INLIER_M = 0.2
 # ICP looks for partners this far away, coarse to fine.
 _ICP_STAGES_M = (2.0, 1.0, 0.5)
 _ICP_ITERATIONS = 40
+# Fewer lie on anything.
+_FEWEST_POINTS = 30
+# Extents that differ by this factor differ in unit: no recording sees a hundredth of its survey and fits nowhere.
+_OTHER_UNIT = 100.0
 # Of the map's points, while many poses are tried.
 _SEARCH_POINTS = 10_000
 
@@ -112,7 +116,7 @@ def align_map(
         tried.append(alignment)
     found = _search(clouds)
     if found is None or not found.is_trustworthy:
-        raise InputError(_explain([*tried, *([] if found is None else [found])]))
+        raise InputError(_explain([*tried, *([] if found is None else [found])]) + _other_unit(clouds))
     return found
 
 
@@ -161,6 +165,12 @@ class _Clouds:
         while max(len(mapped), len(reference)) > _MOST_POINTS:
             cell_m *= 1.3
             mapped, reference = thin(mapped, cell_m), thin(reference, cell_m)
+        for cloud, what in ((mapped, "the map"), (reference, "its reference")):
+            if len(cloud) < _FEWEST_POINTS:
+                raise InputError(
+                    f"{what} has points in {len(cloud)} places {cell_m:g} m apart; expected {_FEWEST_POINTS} or more"
+                    " to align by; name a whole map"
+                )
         middle_map, middle_reference = np.median(mapped, axis=0), np.median(reference, axis=0)
         mapped, reference = mapped - middle_map, reference - middle_reference
         inlier_m = max(_LEAST_INLIER_M, 2.0 * cell_m)
@@ -232,6 +242,17 @@ class _Clouds:
         distances, _ = self.tree.query(moved, distance_upper_bound=self.inlier_m, workers=-1)
         near = np.asarray(distances)[np.isfinite(distances)]
         return len(near) / len(moved), float(np.sqrt(np.mean(near**2))) if len(near) else None
+
+
+def _other_unit(clouds: _Clouds) -> str:
+    """A likely reason, where the clouds are of very different size."""
+    size, of_reference = (
+        float(np.abs(np.percentile(c, [10, 90], axis=0)).max()) for c in (clouds.mapped, clouds.reference)
+    )
+    factor = of_reference / max(size, 1e-9)
+    if 1.0 / _OTHER_UNIT < factor < _OTHER_UNIT:
+        return ""
+    return f". The reference is {factor:.3g} times as large: is it in metres?"
 
 
 def _explain(tried: list[MapAlignment]) -> str:

@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
 from evaluation.quantities import QUANTITIES
 from lidarslam.core.errors import ConfigError
+from lidarslam.yaml_text import YamlError, read_yaml
 
 
 class _Model(BaseModel):
@@ -119,11 +119,9 @@ def load_benchmark(path: Path) -> Benchmark:
         ConfigError: it cannot be read, is not YAML, or does not fit.
     """
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: the benchmark cannot be read ({error})") from error
-    except (yaml.YAMLError, ValueError, AttributeError) as error:
-        raise ConfigError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+        tree = read_yaml(path)
+    except YamlError as error:
+        raise ConfigError(f"{path}: {error}") from error
     try:
         return Benchmark.model_validate(tree)
     except ValidationError as error:

@@ -14,7 +14,10 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from lidarslam.core.errors import LidarSlamError
+from lidarslam.core.errors import InputError, LidarSlamError
+from lidarslam.core.plain_text import one_line, printable
+from lidarslam.interruption import ended_like_interrupted
+from lidarslam.rerun_environment import keep_rerun_to_itself, leave_if_abandoned
 
 logger = logging.getLogger(__name__)
 
@@ -39,17 +42,29 @@ class _Group(click.Group):
     command_class = _Command
 
     def invoke(self, ctx: click.Context) -> Any:
+        _hold_standard_streams()
+        _speak_any_encoding()
+        keep_rerun_to_itself()
         try:
-            return super().invoke(ctx)
+            _require_place()
+            with ended_like_interrupted():
+                return super().invoke(ctx)
         except LidarSlamError as error:
-            click.echo(f"lidarslam: {error}", err=True)
+            _tell(str(error))
+            ctx.exit(EXIT_MENDABLE)
+        except UnicodeEncodeError as error:
+            _tell(f"{error.object}: not a name that every program can read; rename it")
+            ctx.exit(EXIT_MENDABLE)
+        except MemoryError:
+            _tell("memory ran out; close other programs, or take fewer scans at a time with --start and --stop")
+            logger.info("where it came from", exc_info=True)
             ctx.exit(EXIT_MENDABLE)
         except OSError as error:
             if error.errno == errno.EPIPE:  # a reader that has had enough, such as head; click ends quietly
                 raise
             _drop_unwritable_output()
             place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-            click.echo(f"lidarslam: {place}{error.strerror or error}", err=True)
+            _tell(f"{place}{error.strerror or error}")
             logger.info("where it came from", exc_info=True)
             ctx.exit(EXIT_MENDABLE)
 
@@ -60,6 +75,40 @@ def _drop_unwritable_output() -> None:
         sys.stdout.flush()
     except OSError:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
+
+
+def _hold_standard_streams() -> None:
+    """Where a standard stream is closed, a file opened next would take its number, and a library's words with it."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+    if sys.stdout is None:
+        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115
+
+
+def _require_place() -> None:
+    """Libraries fail in strange ways where the folder one stands in was removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        raise InputError("the folder you stand in is gone; change to another") from None
+
+
+def _speak_any_encoding() -> None:
+    """What the terminal has no letter for is spelt out, instead of ending a run at its last line."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+class _PlainFormatter(logging.Formatter):
+    """Log lines may hold names out of recordings too."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 @click.group(
@@ -73,7 +122,9 @@ def main(verbose: bool) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     level = logging.INFO if verbose else logging.WARNING
-    logging.basicConfig(level=level, format="lidarslam: %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_PlainFormatter("lidarslam: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 class _Path(click.Path):
@@ -164,9 +215,9 @@ def _warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequen
 
     chosen = choose_reader(source, reader)
     if topic is not None and chosen != "rosbag":
-        click.echo(f"lidarslam: --topic {topic} is ignored; {source} is no bag ({chosen})", err=True)
+        _tell(f"--topic {topic} is ignored; {source} is no bag ({chosen})")
     if sequence is not None and chosen != "kitti-odometry":
-        click.echo(f"lidarslam: --sequence {sequence} is ignored; {source} is no KITTI odometry ({chosen})", err=True)
+        _tell(f"--sequence {sequence} is ignored; {source} is no KITTI odometry ({chosen})")
 
 
 @main.command(epilog="lidarslam demo --out demo")
@@ -176,7 +227,7 @@ def demo(out: Path, scans: int) -> None:
     """Record an indoor run in a simulated office, map it, and compare that with KISS-ICP and the truth."""
     from lidarslam.demo import format_demo, run_demo
 
-    click.echo(format_demo(run_demo(out, scans, tell=_tell)))
+    _say(format_demo(run_demo(out, scans, tell=_tell)))
 
 
 @main.command(epilog="lidarslam info recordings/2011_09_26_drive_0005_sync")
@@ -196,7 +247,7 @@ def info(
 
     config = _resolve(config_file, settings, name=reader, topic=topic, sequence=sequence)
     _warn_of_ignored(source, config.reader.name, topic, sequence)
-    click.echo(describe_source(source, config.reader))
+    _say(describe_source(source, config.reader))
 
 
 @main.command(
@@ -257,11 +308,11 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
     request = RunRequest(source, out, config, **options)
     if request.resume and (lost := lost_when_finished(request)) is not None:
-        click.echo(f"{out}: is finished, nothing is left to do")
+        _say(f"{out}: is finished, nothing is left to do")
         ctx.exit(EXIT_LOST if lost else 0)
     with show_progress(source.name) as progress:
         outcome = execute(request, progress)
-    click.echo(format_outcome(out, outcome))
+    _say(format_outcome(out, outcome))
     if outcome.stopped is not None:
         _tell(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; --resume goes on with it")
         ctx.exit(EXIT_MENDABLE)
@@ -298,7 +349,7 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
     for source in sources:
         _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
     outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
-    click.echo(format_merge(out, outcome))
+    _say(format_merge(out, outcome))
     for line in outcome.stopped:
         _tell(line)
     apart = [recording for recording in outcome.apart if recording.directory is not None]
@@ -406,7 +457,7 @@ def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: 
     request = RecordRequest(out, motion=motion, trajectory=trajectory, **options)
     with show_count(out.name) as progress:
         summary = record(request, progress)
-    click.echo(format_summary(request, summary))
+    _say(format_summary(request, summary))
 
 
 @main.command(
@@ -448,7 +499,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> N
     """
     from lidarslam.train_command import TrainOptions, run_train
 
-    if run_train(TrainOptions(sources, **options), click.echo).interrupted:
+    if run_train(TrainOptions(sources, **options), _say).interrupted:
         ctx.exit(EXIT_MENDABLE)
 
 
@@ -464,7 +515,7 @@ def export(weights: Path | None, out: Path) -> None:
     from odometry.export import export_onnx
 
     for path in export_onnx(load_checkpoint(weights or default_weights()), out):
-        click.echo(f"written to {path}")
+        _say(f"written to {path}")
 
 
 @main.command(
@@ -550,7 +601,7 @@ def evaluate(run: Path, **options: Any) -> None:
     named = {"map_alignment": "alignment", "refine": "refine", "spacing_m": "spacing_m", "max_range_m": "max_range_m"}
     map_options = MapOptions(**{named[name]: given.pop(name) for name in named if name in given})
     request = EvaluateRequest(run, needs_reference=not given.pop("no_reference"), map_options=map_options, **given)
-    click.echo(format_evaluation(evaluate(request)))
+    _say(format_evaluation(evaluate(request)))
 
 
 @main.command(
@@ -585,15 +636,14 @@ def view(
 
     address = show_runs(finished, config.viewer, save, web)
     if save is not None:
-        click.echo(f"written to {save}")
+        _say(f"written to {save}")
     elif web:
-        click.echo(address)
-        click.echo("serving until you press Ctrl-C")
+        _say(str(address))
+        _say("serving until you press Ctrl-C; whoever reaches this machine's ports 9090 and 9876 can look")
         signal.pause()
 
 
 def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
-    from lidarslam.core.errors import InputError
     from lidarslam.finished_run import load_map
     from lidarslam.picture import draw, height_colours, save_picture
 
@@ -603,7 +653,7 @@ def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
     if not len(cloud):
         raise InputError(f"{runs[0]}: holds no map to draw")
     save_picture(picture, draw(cloud.points, height_colours(cloud.points), cloud.normals))
-    click.echo(f"written to {picture}")
+    _say(f"written to {picture}")
 
 
 @main.command(
@@ -653,12 +703,16 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
         if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT and len(sources) != 1:
             flag = f"--{name.replace('_', '-')}"
             raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
-    if not run_compare(CompareOptions(sources, benchmark, **options), click.echo, _tell):
+    if not run_compare(CompareOptions(sources, benchmark, **options), _say, _tell):
         ctx.exit(EXIT_MENDABLE)
 
 
 def _tell(line: str) -> None:
-    click.echo(f"lidarslam: {line}", err=True)
+    click.echo(f"lidarslam: {one_line(line)}", err=True)
+
+
+def _say(text: str) -> None:
+    click.echo(printable(text))
 
 
 @main.command(epilog="lidarslam config --set odometry.kiss_icp.voxel_size_m=0.5")
@@ -667,8 +721,20 @@ def config(config_file: Path | None, settings: tuple[str, ...]) -> None:
     """Print the resolved configuration as YAML."""
     from lidarslam.config import dump_yaml, load_config
 
-    click.echo(dump_yaml(load_config(config_file, settings)), nl=False)
+    click.echo(printable(dump_yaml(load_config(config_file, settings))), nl=False)
+
+
+def entry_point() -> None:
+    """The program: what `lidarslam` starts."""
+    status = 0
+    try:
+        main()
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        raise
+    finally:
+        leave_if_abandoned(status)
 
 
 if __name__ == "__main__":
-    main()
+    entry_point()

@@ -11,6 +11,7 @@ from lidarslam.compare_plan import COMPARISON, REPORT_HTML, REPORT_MD, Plan, Pla
 from lidarslam.compare_request import CompareRequest
 from lidarslam.compare_text import format_result
 from lidarslam.core.errors import OutputError
+from lidarslam.directory_lock import only_writer
 from lidarslam.machine import machine, versions
 from lidarslam.method_run import COMMAND, MethodTask, collect, finished_before, run_method
 from lidarslam.run_directory import RunDirectory
@@ -68,13 +69,14 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
         raise OutputError(f"{request.out}: cannot be written ({error.strerror or error})") from error
     turns = _Turns(request, narrator, command)
     sequences = []
-    for planned in plan.recordings:
-        sequence = turns.measured(planned)
-        sequences.append(sequence)
-        if len(plan.recordings) > 1:
-            RunDirectory(request.out / planned.name).write_json(COMPARISON, sequence.to_json())
-    comparison = _assemble(request, plan, sequences, turns.interrupted)
-    write_comparison(comparison, RunDirectory(request.out))
+    with only_writer(request.out):
+        for planned in plan.recordings:
+            sequence = turns.measured(planned)
+            sequences.append(sequence)
+            if len(plan.recordings) > 1:
+                RunDirectory(request.out / planned.name).write_json(COMPARISON, sequence.to_json())
+        comparison = _assemble(request, plan, sequences, turns.interrupted)
+        write_comparison(comparison, RunDirectory(request.out))
     return CompareOutcome(comparison, turns.interrupted)
 
 

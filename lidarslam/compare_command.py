@@ -1,10 +1,8 @@
 """What stands between the options of `lidarslam compare` and the comparison."""
 
 import shlex
-import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from lidarslam.compare_request import CompareRequest, RecordingEntry
 from lidarslam.compare_text import format_comparison
 from lidarslam.config import reader_settings
 from lidarslam.core.errors import ConfigError
+from lidarslam.interruption import ended_like_interrupted
 from lidarslam.methods import parse_methods
 from lidarslam.progress import show_count
 from lidarslam.supervised import Limits
@@ -59,7 +58,7 @@ def run_compare(options: CompareOptions, say: Say, tell: Say) -> bool:
         tell: prints how it goes.
     """
     request = _request(options)
-    with _ended_like_interrupted():
+    with ended_like_interrupted():  # or the methods would outlive a request to end
         if options.benchmark is not None:
             benchmark = load_benchmark(options.benchmark)
             request = fill_request(request, benchmark, options.data)
@@ -99,13 +98,3 @@ def _entry(source: Path, options: CompareOptions) -> RecordingEntry:
         reference=options.reference,
         reference_map=options.reference_map,
     )
-
-
-@contextmanager
-def _ended_like_interrupted() -> Iterator[None]:
-    """A request to end, as `kill` and `timeout` send it, is taken as Ctrl-C, or the methods would outlive it."""
-    earlier = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, earlier)

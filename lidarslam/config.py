@@ -4,6 +4,7 @@ Defaults live in the code, beside what consumes them; a file or `--set` holds on
 """
 
 import difflib
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -17,14 +18,19 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run_directory import RUN_SECTION
 from lidarslam.training_directory import SOURCES_SECTION
+from lidarslam.yaml_text import YamlError, parse_yaml
+from lidarslam.yaml_text import read_yaml as read_yaml_file
 from mapping.config import GlobalMapConfig, MappingConfig
 from mapping.graph_config import SlamGraphConfig
 from odometry.config import OdometryConfig
 
-# PyYAML lets Python's own errors through for what has the form or the tag of a date or a number: 2021-13-45.
-_UNREADABLE_VALUE = (ValueError, AttributeError)
 # The sections of a run's or a training's config.yaml that are no configuration.
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
+
+_MOST_FAULTS = 5
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 80
+_SHORT.maxlong = 40
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -106,14 +112,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ConfigError: it is not readable YAML, or no keys and values.
     """
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: the configuration cannot be read ({error})") from error
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path}: not YAML: {reason}") from error
-    except _UNREADABLE_VALUE as error:
-        raise ConfigError(f"{path}: a value looks like a date or a number but is none: {error}") from error
+        tree = read_yaml_file(path)
+    except YamlError as error:
+        raise ConfigError(f"{path}: {error}") from error
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -126,17 +127,17 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
     dotted, separator, text = setting.partition("=")
     keys = dotted.strip().split(".")
     if not separator or not all(keys):
-        raise ConfigError(f"--set {setting!r}: expected key.path=value, such as {example}")
+        raise ConfigError(f"--set {_short(setting)}: expected key.path=value, such as {example}")
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
+        value = parse_yaml(text)
+    except YamlError as error:
+        if not error.is_syntax:
+            raise ConfigError(f"--set {_short(setting)}: {error}") from error
         value = text
-    except _UNREADABLE_VALUE as error:
-        raise ConfigError(f"--set {setting!r}: the value looks like a date or a number but is none: {error}") from error
     for key in keys[:-1]:
         branch = tree.setdefault(key, {})
         if not isinstance(branch, dict):
-            raise ConfigError(f"--set {setting!r}: {key} is a value, not a section")
+            raise ConfigError(f"--set {_short(setting)}: {key} is a value, not a section")
         tree = branch
     tree[keys[-1]] = value
 
@@ -148,7 +149,10 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
-    return f"configuration ({origin}): " + "; ".join(_explain_fault(fault, model) for fault in error.errors())
+    faults = error.errors(include_url=False)
+    told = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
+    told += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    return f"configuration ({origin}): {'; '.join(told)}"
 
 
 def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
@@ -157,11 +161,16 @@ def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     if fault["type"] == "extra_forbidden":
         return f"there is no {key}{_suggest(location, model)}"
     if fault["type"] == "model_type":
-        return f"{key}={fault['input']!r}: expected a section"
+        return f"{key}={_short(fault['input'])}: expected a section"
     if fault["type"] == "value_error":
         # Keys that contradict each other: the input would be their whole section, the validator names the two.
         return f"{key}: {fault['ctx']['error']}"
-    return f"{key}={fault['input']!r}: {fault['msg'].lower()}"
+    return f"{key}={_short(fault['input'])}: {fault['msg'].lower()}"
+
+
+def _short(value: object) -> str:
+    """A value as one would write it, its beginning if it is long: aliases of YAML can make it endless."""
+    return _SHORT.repr(value)
 
 
 def _suggest(location: Sequence[str], model: type[BaseModel]) -> str:

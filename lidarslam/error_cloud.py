@@ -40,7 +40,10 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray | 
     """
     with RunDirectory(path.parent).replacing(path.name) as partial:
         if path.suffix.lower() == ".ply":
-            write_ply(partial, _vertices(comparison.map_errors, clip_m))
+            try:
+                write_ply(partial, _vertices(comparison.map_errors, clip_m))
+            except OSError as error:
+                raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
             return
         from lidarslam.rerun_viewer import save_errors
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from evaluation.agreement import disagreement
 from evaluation.alignment import AlignmentMethod
 from evaluation.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S
 from evaluation.error_colours import DEFAULT_CLIP_M
@@ -78,6 +79,7 @@ class Evaluation:
             **metrics_json(self.metrics, None if self.map is None else self.map.json),
             "map_alignment": self.map and self.map.alignment.to_json(),
             "map_entropy": self.entropy and self.entropy.to_json(),
+            "notes": list(self.notes),
         }
 
 
@@ -96,6 +98,8 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     if reference is not None:
         pair_of_both = pair(estimate, reference)
         metrics = evaluate_trajectory(*pair_of_both, request.tolerance_s, request.max_gap_s, request.alignment)
+        unrelated = disagreement(metrics)
+        notes += [] if unrelated is None else [unrelated]
     compared = _evaluate_map(request, estimate, metrics, reference, notes)
     if request.errors and compared is None:
         raise InputError("--errors colours a map by its distance to a reference; name one with --reference-map MAP")

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from lidarslam import run_directory as files
 from lidarslam.config import Config, load_config
@@ -15,7 +14,9 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
+from lidarslam.finished_run import read_trajectory
 from lidarslam.unfinished import require_whole
+from lidarslam.yaml_text import YamlError, read_yaml
 
 # KITTI's LiDAR turned ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1
@@ -80,11 +81,9 @@ def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
     if not path.is_dir():
         return Estimate(read_poses(path), None, map_file, None, Config())
     require_whole(path)
-    if not (path / files.TRAJECTORY_TUM).is_file():
-        raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
+    poses = Poses.of(str(path), read_trajectory(path))
     own_map = path / files.MAP_PLY
     chosen_map = map_file or (own_map if own_map.is_file() else None)
-    poses = Poses.of(str(path), read_tum(path / files.TRAJECTORY_TUM))
     if not (path / files.CONFIG).is_file():
         return Estimate(poses, path, chosen_map, None, Config())
     return Estimate(poses, path, chosen_map, _source(path / files.CONFIG), load_config(path / files.CONFIG))
@@ -100,7 +99,7 @@ def read_reference(path: Path, config: ReaderConfig) -> Poses:
         raise InputError(f"{path}: no such trajectory, run directory or recording")
     require_whole(path)
     if (path / files.TRAJECTORY_TUM).is_file():
-        return Poses.of(f"the run {path}", read_tum(path / files.TRAJECTORY_TUM))
+        return Poses.of(f"the run {path}", read_trajectory(path))
     if path.is_dir() or any(reader.recognises(path) for reader in READERS.values()):
         return recording_truth(path, config)
     return read_poses(path)
@@ -173,7 +172,7 @@ def _columns(path: Path) -> int:
 def _source(config_file: Path) -> Path | None:
     """The recording that config.yaml names."""
     try:
-        tree: Any = yaml.safe_load(config_file.read_text(encoding="utf-8"))
+        tree: Any = read_yaml(config_file)
         return Path(tree[files.RUN_SECTION]["source"])
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, TypeError, KeyError):
+    except (YamlError, TypeError, KeyError):
         return None

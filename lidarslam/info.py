@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
+from lidarslam.core.plain_text import one_line
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.registry import open_recording
@@ -37,7 +38,7 @@ def format_info(source: Path, info: RecordingInfo) -> str:
 
 def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:<{width}}{text}" for name, text in rows]
+    return [f"{name:<{width}}{one_line(text)}" for name, text in rows]
 
 
 def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
@@ -78,8 +79,9 @@ def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:
     if not topics:
         return
     yield from ("", "topics")
-    width = max(len(topic.name) for topic in topics)
-    types = max(len(topic.message_type) for topic in topics)
-    for topic in topics:
+    shown = [(topic, one_line(topic.name), one_line(topic.message_type)) for topic in topics]
+    width = max(len(name) for _, name, _ in shown)
+    types = max(len(message_type) for _, _, message_type in shown)
+    for topic, name, message_type in shown:
         mark = "*" if topic.name == chosen else " "
-        yield f"  {mark} {topic.name:<{width}}  {topic.message_type:<{types}}  {topic.messages:>8,}"
+        yield f"  {mark} {name:<{width}}  {message_type:<{types}}  {topic.messages:>8,}"

@@ -37,6 +37,8 @@ from mapping.g2o import format_g2o
 if TYPE_CHECKING:
     from mapping.slam_graph import SlamGraph
 
+# The directories of recordings, see `_runs`; whatever else a summary names is not ours to remove.
+_PART = re.compile(r"\d{2,}_[\w.-]+")
 # Of a run; the merge says the same with a way out.
 _OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
 
@@ -181,7 +183,7 @@ def _earlier_parts(out: Path) -> set[str]:
         names = {entry["directory"] for entry in entries}
     except (OSError, ValueError, KeyError, TypeError):
         return set()
-    return {name for name in names if isinstance(name, str) and Path(name).name == name}
+    return {name for name in names if isinstance(name, str) and _PART.fullmatch(name)}
 
 
 def _track_all(parts: Sequence[_Part], graph: "SlamGraph", show: Show) -> _Way:

@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
-import yaml
-
 from evaluation.comparison import MethodResult, MethodStatus
 from lidarslam import run_directory as files
 from lidarslam.config import Config, dump_yaml
@@ -19,6 +17,7 @@ from lidarslam.method_process import encode
 from lidarslam.run import RunRequest
 from lidarslam.run_directory import RunDirectory
 from lidarslam.supervised import Limits, supervise
+from lidarslam.yaml_text import read_yaml
 
 # Beside a run's own files: how its process went, and what it wrote to standard error.
 PROCESS, LOG = "process.json", "process.log"
@@ -91,10 +90,10 @@ def finished_before(task: MethodTask) -> ProcessRecord | None:
     folder = task.run.out
     try:
         record = ProcessRecord(**json.loads((folder / PROCESS).read_text(encoding="utf-8")))
-        tree = yaml.safe_load((folder / files.CONFIG).read_text(encoding="utf-8"))
+        tree = read_yaml(folder / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         config = Config.model_validate(tree)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
     is_run = {
         "version": version("lidarslam"),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from evaluation.error_colours import viridis
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.run_directory import RunDirectory
 
 _BACKGROUND = (255, 255, 255)
 # How far away the camera stands, in diameters of the cloud: near enough for perspective.
@@ -18,6 +19,8 @@ _FRAMED_PERCENT = (0.2, 99.8)
 _FILLED = 0.92
 # Eye-dome lighting (Boucheny, 2009): how strongly a pixel behind its neighbours is darkened.
 _EDGE_STRENGTH = 12.0
+# The last chunk of a .png file with its checksum, the end marker of a .jpg file.
+_ENDINGS, _ENDING_BYTES = (b"IEND\xaeB`\x82", b"\xff\xd9"), 8
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -87,10 +90,16 @@ def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     if path.suffix.lower() not in _PICTURE_SUFFIXES:
         raise OutputError(f"{path}: the picture could not be written; it must end in .png or .jpg")
     image = o3d.geometry.Image(np.ascontiguousarray(picture).data)
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        written = o3d.io.write_image(path, image)
-    if not written:
-        raise OutputError(f"{path}: cannot be written; does the folder exist?")
+    with RunDirectory(path.parent).replacing(path.name) as partial:
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            written = o3d.io.write_image(partial, image)
+        if not (written and _is_whole(partial)):
+            raise OutputError(f"{path}: cannot be written; does the folder exist, and is there room on the disk?")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a picture ends as pictures do; Open3D 0.20 may say it was written when the disk is full."""
+    return path.read_bytes()[-_ENDING_BYTES:].endswith(_ENDINGS)
 
 
 def _to_camera(points: FloatArray, camera: Camera) -> FloatArray:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline import ScanResult
 from lidarslam.run import Progress as ProgressCallback
@@ -39,7 +40,7 @@ def _bar(*more: ProgressColumn) -> Progress:
 def show_progress(name: str) -> Iterator[ProgressCallback]:
     """A bar with scans a second and the state of tracking."""
     with _bar(TextColumn("{task.fields[state]}")) as bar:
-        task = bar.add_task(name, total=None, state="")
+        task = bar.add_task(one_line(name), total=None, state="")
         lost = 0
 
         def update(number: int, total: int, result: ScanResult) -> None:
@@ -55,5 +56,5 @@ def show_progress(name: str) -> Iterator[ProgressCallback]:
 def show_count(name: str) -> Iterator[Callable[[int, int], None]]:
     """A bar that is told the number of the scan just finished, from 1, and how many there are."""
     with _bar() as bar:
-        task = bar.add_task(name, total=None)
+        task = bar.add_task(one_line(name), total=None)
         yield lambda number, total: bar.update(task, completed=number, total=total)

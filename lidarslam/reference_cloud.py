@@ -12,6 +12,9 @@ from lidarslam.datasets.pcd import read_pcd
 from lidarslam.datasets.ply import read_ply
 from lidarslam.datasets.point_table import coordinates
 
+# Surveys end well within this; squares of much more overflow.
+_FARTHEST_M = 1e9
+
 
 def read_cloud(path: Path) -> FloatArray:
     """The finite points (N, 3), metres, of a .pcd, .ply, .las, .laz or .e57 file, in the file's own frame.
@@ -31,6 +34,9 @@ def read_cloud(path: Path) -> FloatArray:
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise InputError(f"{path}: holds no point; choose another file")
+    farthest = float(np.abs(points).max())
+    if farthest > _FARTHEST_M:
+        raise InputError(f"{path}: a point lies {farthest:.3g} m from the origin; expected metres on this planet")
     return points
 
 

@@ -1,10 +1,12 @@
 """Runs in Rerun; the only file that imports it."""
 
+import contextlib
 import logging
 import os
 import socket
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from evaluation.error_colours import error_colours
 from evaluation.map_metrics import CloudErrors, MapComparison
+from lidarslam import rerun_environment
 from lidarslam.config import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
@@ -23,9 +26,17 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.finished_run import FinishedRun
 from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
+from lidarslam.run_directory import RunDirectory
 from mapping.global_map import GlobalMap
 
 _log = logging.getLogger(__name__)
+
+# How a complete .rrd file of this version ends, before the four bytes of its flags.
+_FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
+# A writer that died would otherwise be waited for without end.
+_FLUSH_S = 20.0
+# What there is to write was flushed by then.
+_DISCONNECT_S = 10.0
 
 _SCAN_TIMELINE = "scan"
 _TIME_TIMELINE = "time"
@@ -48,6 +59,24 @@ _PLOTS = (
     ("residual", "Residual [m]", ("median point to plane",)),
     ("inliers", "Inlier ratio", ("worst direction",)),
 )
+
+
+class IncompleteRecordingError(OutputError):
+    """A Rerun recording came out cut off."""
+
+
+def require_complete(path: Path) -> None:
+    """See that a recording was written to its end; Rerun's writer only logs that the disk is full.
+
+    Raises:
+        IncompleteRecordingError: it was not.
+    """
+    footer = b""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        file.seek(-len(_FOOTER) - _FLAG_BYTES, os.SEEK_END)
+        footer = file.read(len(_FOOTER))
+    if footer != _FOOTER:
+        raise IncompleteRecordingError("the Rerun recording could not be written to its end; is the disk full?")
 
 
 class RerunViewer:
@@ -119,10 +148,12 @@ class RerunViewer:
     def close(self) -> None:
         """Wait until everything is written; a window that went away does not fail the run."""
         try:
-            self._recording.flush()
-            self._recording.disconnect()
+            self._recording.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
-            _log.warning("Rerun: %s", str(error).strip().splitlines()[0])
+            _log.info("Rerun: %s", str(error).strip().splitlines()[0])
+            rerun_environment.abandoned = True
+            return
+        _disconnect(self._recording)
 
     def _log_static(self) -> None:
         self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -137,6 +168,15 @@ class RerunViewer:
             )
             self._recording.log("world/trajectory", piece)
         self._last_position = position.copy()
+
+
+def _disconnect(recording: rr.RecordingStream) -> None:
+    """Let the file be closed; on a full disk that never ends, and is left to itself after a while."""
+    thread = threading.Thread(target=recording.disconnect, name="disconnect", daemon=True)
+    thread.start()
+    thread.join(_DISCONNECT_S)
+    if thread.is_alive():
+        rerun_environment.abandoned = True
 
 
 def _open_window(recording: rr.RecordingStream) -> None:
@@ -202,12 +242,17 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
     """
     recording = rr.RecordingStream("lidarslam")
     try:
-        address = _connect(recording, save, web)
-        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for number, run in enumerate(runs):
-            _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
-        recording.flush()
-    except (RuntimeError, OSError) as error:
+        with _recording_file(save) as file:
+            address = _connect(recording, file, web)
+            recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            for number, run in enumerate(runs):
+                _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
+            recording.flush(timeout_sec=_FLUSH_S)
+            if file is not None:
+                _disconnect(recording)
+                require_complete(file)
+    except (RuntimeError, OSError, IncompleteRecordingError) as error:
+        rerun_environment.abandoned = True
         reason = " ".join(str(error).split())
         if save is not None:
             message = f"{save}: cannot be written ({reason}); name a file in a folder that exists and can be written to"
@@ -217,6 +262,16 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
             message = f"the Rerun window cannot be reached ({reason}); write a file with --save FILE.rrd, or use --web"
         raise OutputError(message) from error
     return address
+
+
+@contextlib.contextmanager
+def _recording_file(save: Path | None) -> Iterator[Path | None]:
+    """Where a recording is written until it is whole."""
+    if save is None:
+        yield None
+        return
+    with RunDirectory(save.parent).replacing(save.name) as file:
+        yield file
 
 
 def _connect(recording: rr.RecordingStream, save: Path | None, web: bool) -> str | None:
@@ -290,9 +345,11 @@ def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | N
         text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {', '.join(f'{m:.0f}' for m in middle)}"
         recording.log("legend", rr.TextDocument(text), static=True)
         recording.send_blueprint(_errors_blueprint())
-        recording.flush()
-        recording.disconnect()
-    except (RuntimeError, OSError) as error:
+        recording.flush(timeout_sec=_FLUSH_S)
+        _disconnect(recording)
+        require_complete(path)
+    except (RuntimeError, OSError, IncompleteRecordingError) as error:
+        rerun_environment.abandoned = True
         raise OutputError(f"{path}: cannot be written ({' '.join(str(error).split())})") from error
 
 

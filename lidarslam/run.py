@@ -128,7 +128,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
         unfinished = _claim(request, recording, stack)
         log, graph = _log_and_graph(config, directory, unfinished, stack)
-        with _viewing(request, recording, directory) as viewer:
+        with _viewing(request, recording, directory, log) as viewer:
             tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
             closed = _close_loops(graph, tracked.global_map, log, viewer)
         outcome = write_results(directory, request, tracked, closed)
@@ -429,19 +429,23 @@ def make_localiser(config: Config) -> Localiser:
 
 
 @contextmanager
-def _viewing(request: RunRequest, recording: Recording, directory: RunDirectory) -> Iterator[Viewer]:
+def _viewing(request: RunRequest, recording: Recording, directory: RunDirectory, log: ScanLog) -> Iterator[Viewer]:
     """The viewer of the run; its recording takes its name in the run directory when all is shown."""
     if request.rerun == "off":
         yield NullViewer()
         return
-    from lidarslam.rerun_viewer import RerunViewer
+    from lidarslam.rerun_viewer import IncompleteRecordingError, RerunViewer, require_complete
 
-    with directory.replacing(files.RERUN) as path:
-        viewer = RerunViewer(recording.name, request.config.viewer, path, request.rerun == "spawn")
-        try:
-            yield viewer
-        finally:
-            viewer.close()
+    try:
+        with directory.replacing(files.RERUN) as path:
+            viewer = RerunViewer(recording.name, request.config.viewer, path, request.rerun == "spawn")
+            try:
+                yield viewer
+            finally:
+                viewer.close()
+            require_complete(path)
+    except IncompleteRecordingError as error:  # it costs the picture of the run, not the run
+        log.warn(f"no {files.RERUN}: {error}")
 
 
 def _describe(request: RunRequest) -> dict[str, Any]:

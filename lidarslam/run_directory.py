@@ -1,6 +1,7 @@
 """One run on disk: names every file of it and writes each so that it is whole or absent."""
 
 import contextlib
+import errno
 import json
 import os
 import tempfile
@@ -9,6 +10,10 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from lidarslam.core.errors import OutputError
+from lidarslam.directory_lock import only_writer
+
+# What a full or failing disk says.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 # The section of config.yaml that says what was run, not how; its first.
 RUN_SECTION = "run"
@@ -50,6 +55,7 @@ class RunDirectory:
     def __init__(self, path: Path, earlier: Iterable[str] = ()) -> None:
         self.path = path
         self._stale = set(earlier)
+        self._written: set[str] = set()
 
     @classmethod
     @contextlib.contextmanager
@@ -74,12 +80,24 @@ class RunDirectory:
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
         try:
-            yield directory
-            for name in directory._stale:
-                (path / name).unlink(missing_ok=True)
+            with only_writer(path):
+                try:
+                    yield directory
+                except BaseException:
+                    directory._discard_unless_run()
+                    raise
+                for name in directory._stale:
+                    (path / name).unlink(missing_ok=True)
+        except OSError as error:
+            if error.errno not in _NO_ROOM:
+                raise
+            raise OutputError(
+                f"{path}: cannot be written ({error.strerror}); make room, or name another directory"
+            ) from error
         finally:
-            if is_new and not any(path.iterdir()):
-                path.rmdir()
+            with contextlib.suppress(OSError):  # somebody may have put something there, or taken it away
+                if is_new and not any(path.iterdir()):
+                    path.rmdir()
 
     def __getitem__(self, name: str) -> Path:
         return self.path / name
@@ -88,7 +106,10 @@ class RunDirectory:
     def replacing(self, name: str) -> Iterator[Path]:
         """A path to write to; it takes the name when the block ends without an error, and is gone otherwise."""
         final = self.path / name
+        if final.exists() and not final.is_file():  # a device would be replaced by a file of its name
+            raise OutputError(f"{final}: is {'a folder' if final.is_dir() else 'no ordinary file'}; name another file")
         partial = final.with_name(f".partial-{os.getpid()}-{name}")
+        partial.unlink(missing_ok=True)  # whatever lies there, a link elsewhere too, is not written to
         try:
             yield partial
             try:
@@ -96,19 +117,36 @@ class RunDirectory:
             except OSError as error:
                 raise OutputError(f"{final}: cannot be written ({error.strerror or error})") from error
             self._stale.discard(name)
+            self._written.add(name)
         finally:
             partial.unlink(missing_ok=True)
+
+    def _discard_unless_run(self) -> None:
+        """Files without their run's description would be nobody's, and in the way of the next attempt."""
+        if not _is_run(self.path):
+            for name in self._written:
+                (self.path / name).unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def open_text(self, name: str) -> Iterator[TextIO]:
         """A text file to write to, whole or absent."""
-        with self.replacing(name) as partial, partial.open("w", encoding="utf-8", newline="") as out:
+        with (
+            self.replacing(name) as partial,
+            partial.open("w", encoding="utf-8", newline="", errors="backslashreplace") as out,
+        ):
             yield out
 
     def write_text(self, name: str, text: str) -> None:
-        """Write one text file."""
-        with self.open_text(name) as out:
-            out.write(text)
+        """Write one text file.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        try:
+            with self.open_text(name) as out:
+                out.write(text)
+        except OSError as error:
+            raise OutputError(f"{self.path / name}: cannot be written ({error.strerror or error})") from error
 
     def write_json(self, name: str, value: dict[str, Any]) -> None:
         """Write one JSON file; a number that is not finite is a mistake of ours and refused."""

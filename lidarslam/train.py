@@ -12,6 +12,7 @@ from torch import nn
 
 from lidarslam import training_directory as files
 from lidarslam.core.errors import ConfigError
+from lidarslam.directory_lock import only_writer
 from lidarslam.run_directory import RunDirectory
 from lidarslam.train_config import TrainConfig, dump_train_yaml
 from lidarslam.train_request import Interrupted, Material, TrainNarrator, TrainOutcome, TrainRequest
@@ -42,7 +43,8 @@ def execute(request: TrainRequest, narrator: TrainNarrator) -> TrainOutcome:
     devices = Devices(request.device, config.training.precision)
     files.make_directory(request.out)
     about = _about(request, stretches)
-    with _interruption() as interrupted:
+    alone = only_writer(request.out) if devices.is_first else contextlib.nullcontext()
+    with alone, _interruption() as interrupted:
         recordings = _recordings(request, config.training, stretches, devices, _Count(stretches, narrator, interrupted))
         if devices.is_first:
             files.remove_results(request.out, [] if request.resume else earlier)
@@ -174,7 +176,9 @@ def _interruption() -> Iterator[Interrupted]:
     if threading.current_thread() is not threading.main_thread():  # signals go to the main thread
         yield asked.is_set
         return
-    earlier = [(number, signal.signal(number, note)) for number in (signal.SIGINT, signal.SIGTERM)]
+    # A request that is ignored, as nohup asks, stays ignored.
+    asking = (n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN)
+    earlier = [(number, signal.signal(number, note)) for number in asking]
     try:
         yield asked.is_set
     finally:

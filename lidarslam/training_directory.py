@@ -60,7 +60,7 @@ def make_directory(path: Path) -> None:
 def remove_results(path: Path, names: Iterable[str]) -> None:
     """Make room for another training."""
     for name in names:
-        if (path / name).is_dir():
+        if (path / name).is_dir() and not (path / name).is_symlink():
             shutil.rmtree(path / name)
         else:
             (path / name).unlink()

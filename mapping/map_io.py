@@ -1,4 +1,7 @@
-"""Maps on disk."""
+"""Maps on disk.
+
+Written here rather than by Open3D 0.20, whose writer says nothing when the disk is full and leaves half a file.
+"""
 
 from pathlib import Path
 
@@ -6,6 +9,8 @@ import numpy as np
 
 from lidarslam.core.errors import OutputError
 from mapping.global_map import PointCloud
+
+_POINTS_AT_A_TIME = 1_000_000
 
 
 def write_cloud(path: Path, cloud: PointCloud) -> None:
@@ -16,13 +21,30 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
     """
     if not len(cloud):
         raise OutputError(f"{path.parent}: a map without points cannot be written")
-    import open3d as o3d
-
-    out = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(cloud.points.astype(np.float32)))
-    out.point.normals = o3d.core.Tensor.from_numpy(cloud.normals.astype(np.float32))
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        written = o3d.t.io.write_point_cloud(path, out, write_ascii=False)
-    if not written:
+    header = _HEADERS[path.suffix](len(cloud))
+    try:
+        with path.open("wb") as out:
+            out.write(header.encode("ascii"))
+            for first in range(0, len(cloud), _POINTS_AT_A_TIME):
+                rows = slice(first, first + _POINTS_AT_A_TIME)
+                out.write(np.hstack([cloud.points[rows], cloud.normals[rows]]).astype("<f4").tobytes())
+    except OSError as error:
         raise OutputError(
-            f"{path.parent}: the {path.suffix} map cannot be written there; is the disk full or the folder read-only?"
-        )
+            f"{path.parent}: the {path.suffix} map cannot be written there ({error.strerror or error})"
+        ) from error
+
+
+def _ply_header(points: int) -> str:
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {points}\n{properties}end_header\n"
+
+
+def _pcd_header(points: int) -> str:
+    return (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        "FIELDS x y z normal_x normal_y normal_z\nSIZE 4 4 4 4 4 4\nTYPE F F F F F F\nCOUNT 1 1 1 1 1 1\n"
+        f"WIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA binary\n"
+    )
+
+
+_HEADERS = {".ply": _ply_header, ".pcd": _pcd_header}

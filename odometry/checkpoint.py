@@ -108,14 +108,22 @@ def default_weights() -> Path:
 
 
 def _require_fitting(path: Path, config: NetworkConfig, weights: Mapping[str, Tensor]) -> None:
-    with torch.device("meta"):  # shapes alone
-        expected = make_network(config).state_dict()
+    try:
+        with torch.device("meta"):  # shapes alone
+            expected = make_network(config).state_dict()
+    except RuntimeError as error:  # sizes that no memory holds
+        raise InputError(f"{path}: its network cannot be made ({error}); the file is damaged, make it again") from error
     for name, value in expected.items():
         if name not in weights:
             raise InputError(f"{path}: {name} of network {config.name} is missing; the file is damaged, make it again")
         if weights[name].shape != value.shape:
             raise InputError(
                 f"{path}: {name} is {tuple(weights[name].shape)}, network {config.name} has {tuple(value.shape)};"
+                " the file is damaged, make it again"
+            )
+        if weights[name].is_floating_point() != value.is_floating_point() or weights[name].is_complex():
+            raise InputError(
+                f"{path}: {name} holds {weights[name].dtype}, network {config.name} has {value.dtype};"
                 " the file is damaged, make it again"
             )
         if not bool(weights[name].isfinite().all()):

@@ -1,6 +1,7 @@
 """A trained network for other programs: ONNX, in two graphs, because what is kept of a scan serves several pairs."""
 
 import logging
+import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -63,8 +64,12 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> tuple[Path, Path]:
     names = ["T_prev_curr", "log_sigma", "turn_scores"][:results]
     try:
         out.mkdir(parents=True, exist_ok=True)
-        _write(encoder, (points, normals), ["points", "normals"], ["features"], out / ENCODER)
-        _write(pair, (features, features.flip(0)), ["previous", "current"], names, out / PAIR)
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=out) as workplace:
+            folder = Path(workplace)
+            _write(encoder, (points, normals), ["points", "normals"], ["features"], folder / ENCODER)
+            _write(pair, (features, features.flip(0)), ["previous", "current"], names, folder / PAIR)
+            for name in (ENCODER, PAIR):
+                (folder / name).replace(out / name)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
     return out / ENCODER, out / PAIR

@@ -18,6 +18,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from odometry.alignment import Aligned
 from odometry.alignment_search import align_best
+from odometry.correlation import Estimate
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
@@ -116,7 +117,11 @@ class LearnedOdometry:
         interval_s = sweep.middle - last.middle
         if interval_s <= 0.0:
             return Motion(np.eye(4), 0, "the scan is not later than the one before")
-        aligned, information = self._align(last, sweep, interval_s)
+        guess = self._network(last.features, sweep.features)
+        if not _is_finite(guess):
+            self._way.forget()
+            return Motion(np.eye(4), 0, "the network's answer is not a motion; try other weights")
+        aligned, information = self._align(guess, last, sweep, interval_s)
         T_prev_curr = orthonormalize(aligned.T_prev_curr[0].double().numpy(force=True))
         matched, explained = int(aligned.matched), float(aligned.explained)
         if explained < self._config.least_explained or matched < self._config.least_points:
@@ -128,9 +133,8 @@ class LearnedOdometry:
         motion = self._way.between_stamps(T_prev_curr, bend, (last.middle, sweep.middle), stamps)
         return Motion(motion, matched, covariance=covariance)
 
-    def _align(self, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
+    def _align(self, guess: Estimate, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
         """From the network's guess, or going on as before, or further afield; and the information about it."""
-        guess = self._network(last.features, sweep.features)
         information = torch.diag_embed((-2.0 * guess.log_sigma).exp()) / self._config.caution**2
         guesses = guess.T_prev_curr
         interval, before = guesses.new_tensor([interval_s]), None
@@ -142,6 +146,12 @@ class LearnedOdometry:
         aligned, is_guessed = align_best(guesses, sweeps, self._config.alignment, information)
         seen = aligned.information * self._config.alignment.information_per_m2
         return aligned, (seen + information if is_guessed else seen)[0]
+
+
+def _is_finite(guess: Estimate) -> bool:
+    """Whether a motion follows from the guess; weights can be finite, and what they make of a scan is not."""
+    information = (-2.0 * guess.log_sigma).exp()
+    return bool(guess.T_prev_curr.isfinite().all() and information.isfinite().all() and (information > 0.0).all())
 
 
 def _misfit(matched: int, explained: float) -> str:

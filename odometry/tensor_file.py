@@ -88,8 +88,9 @@ def _refuse_other_formats(path: Path, kind: Kind) -> None:
             start = file.read(_LENGTH_BYTES + 1)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected {kind.name} that {_PROGRAM} wrote") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (OSError, ValueError) as error:  # a null character in a name is a ValueError
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InputError(f"{path}: cannot be read ({reason})") from error
     if start[_LENGTH_BYTES:] == b"{":
         return
     if start.startswith(_PICKLE_STARTS):
@@ -116,7 +117,7 @@ def _content(path: Path, kind: Kind, header: Mapping[str, str]) -> dict[str, Any
         )
     try:
         content = json.loads(header.get("content", ""))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its description is not JSON ({error}); make it again") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: its description is a {type(content).__name__}, not keys and values; make it again")

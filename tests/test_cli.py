@@ -262,4 +262,4 @@ def test_view_says_where_the_browser_is_served(
     monkeypatch.setattr("signal.pause", lambda: None)
     lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
     assert lines[0].startswith("http://localhost:9090")
-    assert lines[1] == "serving until you press Ctrl-C"
+    assert lines[1].startswith("serving until you press Ctrl-C; whoever reaches this machine")

@@ -55,7 +55,7 @@ def test_the_readers_options_stay_text(text: str) -> None:
         (["odometry.method=loam"], r"odometry\.method='loam': input should be 'learned'"),
         (["global_map"], r"expected key\.path=value"),
         (["global_map.voxel_size_m=2", "global_map.voxel_size_m.x=1"], "voxel_size_m is a value, not a section"),
-        (["a=2021-13-45"], r"^--set 'a=2021-13-45': the value looks like a date .*month must be in 1\.\.12$"),
+        (["a=2021-13-45"], r"^--set 'a=2021-13-45': a value looks like a date .*month must be in 1\.\.12$"),
         (["global_map.voxel_size_m=!!float abc"], "could not convert string to float"),
         (["odometry=1"], r"^configuration \(--set\): odometry=1: expected a section$"),
         (["odometry.kiss_icp=[3]"], r"odometry\.kiss_icp=\[3\]: expected a section$"),

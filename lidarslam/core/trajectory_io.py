@@ -14,6 +14,11 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
 from lidarslam.core.trajectory import Trajectory
 
+# Ten million poses and more.
+_LONGEST_BYTES = 1 << 30
+# Positions in metres end well within this, however far away a survey puts its origin; squares of more overflow.
+_FARTHEST_M = 1e9
+
 
 def parse_numbers(path: Path, columns: int) -> FloatArray:
     """The (N, columns) numbers of a text file; commas count as blanks.
@@ -22,7 +27,11 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
         InputError: the file is missing, is not text, or a line does not hold that many numbers.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with path.open("rb") as file:
+            content = file.read(_LONGEST_BYTES + 1)
+        if len(content) > _LONGEST_BYTES:
+            raise InputError(f"{path}: is longer than a gigabyte; expected {columns} numbers a line")
+        text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as text ({error})") from error
     rows = []
@@ -52,6 +61,7 @@ def read_tum(path: Path) -> Trajectory:
     norms = np.linalg.norm(table[:, 4:], axis=1)
     if not np.isfinite(table).all() or (np.abs(norms - 1.0) > 0.05).any():
         raise InputError(f"{path}: holds numbers that are no poses; expected `stamp tx ty tz qx qy qz qw`")
+    _require_near(path, table[:, 1:4])
     _, first = np.unique(table[:, 0], return_index=True)
     table = table[first]
     R = Rotation.from_quat(table[:, 4:]).as_matrix()
@@ -84,7 +94,14 @@ def read_kitti_poses(path: Path) -> FloatArray:
     T = make_transform(rows[:, :, :3], rows[:, :, 3])
     if not np.isfinite(T).all() or (np.abs(np.linalg.det(T[:, :3, :3]) - 1.0) > 1e-2).any():
         raise InputError(f"{path}: holds rows that are no poses; expected the first three rows of a rigid transform")
+    _require_near(path, T[:, :3, 3])
     return orthonormalize(T)
+
+
+def _require_near(path: Path, positions: FloatArray) -> None:
+    farthest = float(np.abs(positions).max())
+    if farthest > _FARTHEST_M:
+        raise InputError(f"{path}: a position lies {farthest:.3g} m from the origin; expected metres on this planet")
 
 
 def format_kitti(poses: FloatArray) -> str:

@@ -1,0 +1,35 @@
+"""Text of unknown origin, such as names in a recording, made fit for a terminal and for one line of it."""
+
+import re
+
+# Control characters steer terminals, bidirectional marks reorder what is read, lone surrogates cannot be encoded.
+_UNSEEN = (
+    "\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2060-\u206f\ud800-\udfff\ufff9-\ufffb\U000e0000-\U000e007f"
+)
+_STEERING = re.compile(f"[{_UNSEEN}]")
+_STEERING_BUT_LINES = re.compile(f"(?!\n)[{_UNSEEN}]")
+
+# Longer lines have something else in them than what they say.
+_LONGEST = 2_000
+_TAIL = 400
+
+
+def one_line(text: str, longest: int = _LONGEST) -> str:
+    """The text in one line that a terminal shows as it is: what it would act on is spelt out, as in `\\x1b`.
+
+    Of a text longer than `longest` characters the middle is left out.
+    """
+    spelt = _STEERING.sub(_spelt, text)
+    if len(spelt) <= longest:
+        return spelt
+    tail = min(_TAIL, longest // 2)
+    return f"{spelt[: longest - tail]} ... {spelt[-tail:]}"
+
+
+def printable(text: str) -> str:
+    """The same for a text of several lines, which stay lines; nothing is left out."""
+    return _STEERING_BUT_LINES.sub(_spelt, text)
+
+
+def _spelt(match: re.Match[str]) -> str:
+    return match.group().encode("unicode_escape").decode("ascii")

@@ -1,0 +1,47 @@
+"""What comes out of a file cannot steer a terminal."""
+
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarslam.core.plain_text import one_line, printable
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("lidar_top", "lidar_top"),
+        ("Größe 测试 ★", "Größe 测试 ★"),
+        ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
+        ("a\nb\r\tc", "a\\nb\\r\\tc"),
+        ("abc\u202egnp.exe", "abc\\u202egnp.exe"),
+        ("\x9b31m", "\\x9b31m"),
+        ("bad\udcff", "bad\\udcff"),
+        ("a\u2028b", "a\\u2028b"),
+    ],
+)
+def test_what_a_terminal_would_act_on_is_spelt_out(text: str, shown: str) -> None:
+    assert one_line(text) == shown
+
+
+@given(st.text())
+def test_no_text_holds_a_control_character_afterwards(text: str) -> None:
+    for shown in (one_line(text), printable(text).replace("\n", "")):
+        assert not [c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp")]
+        assert not [
+            c for c in shown if unicodedata.bidirectional(c) in ("LRE", "RLE", "LRO", "RLO", "LRI", "RLI", "FSI")
+        ]
+        shown.encode("utf-8")
+
+
+def test_lines_of_ours_stay_lines() -> None:
+    assert printable("source  a\ntopic  \x1b[2J\n") == "source  a\ntopic  \\x1b[2J\n"
+
+
+def test_the_middle_of_a_long_text_is_left_out() -> None:
+    shown = one_line("begin" + "x" * 100_000 + "end", longest=100)
+    assert shown.startswith("begin")
+    assert shown.endswith("xend")
+    assert len(shown) < 120

@@ -1,0 +1,277 @@
+"""Configurations, weights and trajectories that are not what they should be: one line, exit status 1, nothing run."""
+
+import json
+import os
+import pickle
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from lidarslam.cli import main
+from lidarslam.core.trajectory_io import format_kitti, read_tum
+from odometry.checkpoint import checkpoint_of, default_weights, save_checkpoint
+from odometry.image_config import ImageConfig
+from odometry.network_config import CorrelationConfig, NetworkConfig
+from odometry.networks import make_network
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def one_line_of(result: Result) -> str:
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith("lidarslam: ")
+    assert result.stderr.count("\n") == 1
+    assert len(result.stderr) < 2_200
+    assert result.stderr.strip().isprintable()
+    return result.stderr
+
+
+_PAIRS = zip("abcdefgh", "bcdefghi", strict=True)
+LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for b, c in _PAIRS)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "odometry: {kiss_icp: {voxel_size: 1}}",
+            "no odometry.kiss_icp.voxel_size; did you mean voxel_size_m?",
+        ),
+        ("mapping: {refinement: {max_iteratons: 3}}", "did you mean max_iterations?"),
+        (
+            "odometry: {kiss_icp: {voxel_size_m: [1]}}",
+            "voxel_size_m=[1]: input should be a valid number",
+        ),
+        ("odometry: {kiss_icp: {voxel_size_m: .nan}}", "input should be a finite number"),
+        ("odometry: 3", "odometry=3: expected a section"),
+        ("odometry: {method: kiss-icp}\nodometry: {method: learned}", "the key 'odometry' stands twice"),
+        ("- 1\n- 2", "expected keys and values, got a list"),
+        ("hello", "expected keys and values, got a str"),
+        ("{{{:\n]", "not YAML"),
+        (LAUGHS + "mapping: *i\n", "mapping=["),
+        (LAUGHS + "odometry: {method: *i}\n", "and 5 more"),
+        ("odometry: &a\n  kiss_icp: *a\n", "there is no odometry.kiss_icp.kiss_icp"),
+        ("x: " + "[" * 3_000, "nested too deeply"),
+        ("odometry: {kiss_icp: {voxel_size_m: '" + "x" * 100_000 + "'}}", "xxx...xxx"),
+        ('"odo\\e[31m\\nmetry": 1', "there is no odo\\x1b[31m\\nmetry"),
+        ("!!python/object/apply:os.system ['true']", "could not determine a constructor"),
+    ],
+    ids=range(16),
+)
+def test_a_bad_configuration_file(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "config.yaml").write_text(text)
+    said = one_line_of(lidarslam("config", "--config", tmp_path / "config.yaml"))
+    assert message in said
+    assert "config.yaml" in said
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("odometry.kiss_icp.voxel_size=1", "did you mean voxel_size_m?"),
+        ("odometry.kiss.voxel_size_m=1", "did you mean kiss_icp?"),
+        ("odometry.kiss_icp=null", "expected a section"),
+        ("odometry..x=1", "expected key.path=value"),
+        ("mapping.enabled=maybe", "mapping.enabled='maybe': input should be a valid boolean"),
+        ("viewer.map_points=" + "[" * 3_000, "nested too deeply"),
+        ("x\ny=1", "there is no x\\ny"),
+    ],
+    ids=range(7),
+)
+def test_a_bad_setting(setting: str, message: str) -> None:
+    assert message in one_line_of(lidarslam("config", "--set", setting))
+
+
+class Bomb:
+    """A pickle that makes a file where it is loaded."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, (f"touch '{self.file}'",)
+
+
+@pytest.mark.parametrize("name", ["weights.pt", "weights.pth", "weights.safetensors"])
+@pytest.mark.parametrize("form", ["torch", 0, 2, 4])
+def test_a_pickle_is_never_loaded(tmp_path: Path, small_recording: Path, name: str, form: object) -> None:
+    opened = tmp_path / "opened"
+    if form == "torch":
+        torch.save(Bomb(opened), tmp_path / name)
+    else:
+        (tmp_path / name).write_bytes(pickle.dumps(Bomb(opened), protocol=form))  # type: ignore[arg-type]
+    said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / name))
+    assert "is a pickle" in said or "is no safetensors file" in said
+    assert not opened.exists()
+    assert not (tmp_path / "run").exists()
+    pickle.loads(pickle.dumps(Bomb(opened)))
+    assert opened.exists(), "the bomb would have gone off"
+
+
+@pytest.fixture(scope="module")
+def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a network that learned nothing."""
+    path = tmp_path_factory.mktemp("weights") / "small.safetensors"
+    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), pair_width=8))
+    save_checkpoint(path, checkpoint_of(make_network(network), network, ImageConfig(columns=180)))
+    return path
+
+
+def _first(tensors: dict[str, torch.Tensor]) -> str:
+    return min(tensors)
+
+
+TENSORS: dict[str, tuple[Callable[[dict[str, torch.Tensor]], object], str]] = {
+    "missing": (lambda t: t.pop(_first(t)), "is missing"),
+    "extra": (lambda t: t.update({"m\x1bore": torch.zeros(1)}), "has no m\\x1bore"),
+    "shape": (lambda t: t.update({_first(t): torch.zeros(1, 2, 3)}), "is (1, 2, 3), network correlation has"),
+    "nan": (lambda t: t.update({_first(t): t[_first(t)] * np.nan}), "not finite"),
+    "integers": (lambda t: t.update({_first(t): t[_first(t)].to(torch.int32)}), "holds torch.int32"),
+    "complex": (lambda t: t.update({_first(t): t[_first(t)].to(torch.complex64)}), "holds torch.complex64"),
+}
+CONTENTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "another network": (lambda c: c["network"].update(name="delora"), "of network delora is missing"),
+    "no such network": (lambda c: c["network"].update(name="gpt"), "does not fit this program"),
+    "endless": (lambda c: c["network"]["correlation"].update(widths=[10**9] * 3), "cannot be made"),
+    "images": (lambda c: c["images"].update(rows=10**9), "does not fit this program (rows"),
+}
+
+
+@pytest.mark.parametrize("name", [*TENSORS, *CONTENTS])
+def test_weights_that_do_not_fit(tmp_path: Path, small_recording: Path, small_weights: Path, name: str) -> None:
+    with safe_open(small_weights, "pt") as file:
+        header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    content = json.loads(header["content"])
+    if name in TENSORS:
+        TENSORS[name][0](tensors)
+    else:
+        CONTENTS[name][0](content)
+    save_file(tensors, tmp_path / "w.safetensors", metadata=header | {"content": json.dumps(content)})
+    said = one_line_of(
+        lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
+    )
+    assert "w.safetensors: " in said
+    assert (TENSORS | CONTENTS)[name][1] in said  # type: ignore[operator]
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("start", "kept"), [(None, 0.5), (None, 0.001), (None, 0.0), (struct.pack("<Q", 2**62), 1.0), (b"\xff" * 8, 1.0)]
+)
+def test_weights_that_are_cut_off_or_lie_about_their_header(
+    tmp_path: Path, small_recording: Path, start: bytes | None, kept: float
+) -> None:
+    content = default_weights().read_bytes()
+    content = (start or content[:8]) + content[8:]
+    (tmp_path / "w.safetensors").write_bytes(content[: int(kept * len(content))])
+    one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors"))
+
+
+def test_a_header_that_is_nested_without_end(tmp_path: Path, small_recording: Path) -> None:
+    header = {"program": "lidarslam", "kind": "weights", "version": "1", "content": "[" * 100_000}
+    save_file({"a": torch.zeros(1)}, tmp_path / "w.safetensors", metadata=header)
+    said = one_line_of(
+        lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
+    )
+    assert "its description is not JSON" in said
+
+
+def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(
+    tmp_path: Path, small_recording: Path, small_weights: Path
+) -> None:
+    with safe_open(small_weights, "pt") as file:
+        header, tensors = file.metadata(), {key: file.get_tensor(key) * 1e30 for key in file.keys()}  # noqa: SIM118
+    save_file(tensors, tmp_path / "w.safetensors", metadata=header)
+    command = ("run", small_recording, "--weights", tmp_path / "w.safetensors")
+    result = lidarslam(*command, "--out", tmp_path / "run", "--no-mapping")
+    assert result.exit_code == 3
+    assert "not a motion; try other weights" in result.stdout
+
+
+def _edited(table: np.ndarray, name: str) -> str:
+    if name == "NaN":
+        table[2, 2] = np.nan
+    if name == "no rotation":
+        table[2, 4:] = 0.0
+    if name == "seven columns":
+        table = table[:, :7]
+    if name == "light years":
+        table[:, 1:4] *= 1e200
+    if name == "one pose":
+        table = table[:1]
+    if name == "one stamp":
+        table[:, 0] = 0.3
+    return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in table)
+
+
+BAD_TRAJECTORIES = {
+    "NaN": "holds numbers that are no poses",
+    "no rotation": "holds numbers that are no poses",
+    "seven columns": "expected 8 numbers, got 7",
+    "light years": "expected metres on this planet",
+    "one pose": "two poses or more|too short to be compared",
+    "one stamp": "two poses or more|too short to be compared",
+}
+
+
+@pytest.mark.parametrize("name", BAD_TRAJECTORIES)
+@pytest.mark.parametrize("role", ["prior", "reference"])
+def test_a_trajectory_that_is_none(
+    tmp_path: Path, small_recording: Path, finished_run: Path, name: str, role: str
+) -> None:
+    bad = tmp_path / "bad.tum"
+    bad.write_text(_edited(np.loadtxt(small_recording / "ground_truth.tum"), name))
+    if role == "prior":
+        said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "new", "--prior", bad))
+        assert not (tmp_path / "new").exists()
+    else:
+        shutil.copy(finished_run / "metrics.json", tmp_path / "before.json")
+        said = one_line_of(lidarslam("evaluate", finished_run, "--reference", bad))
+        assert (finished_run / "metrics.json").read_text() == (tmp_path / "before.json").read_text()
+    assert any(message in said for message in BAD_TRAJECTORIES[name].split("|"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(b"", "holds no pose"), (b"a b c d e f g h", "expected 8 numbers"), (b"\xff\xfe", "text")]
+)
+@pytest.mark.parametrize("role", ["--prior", "--reference"])
+def test_a_file_that_is_no_trajectory(
+    tmp_path: Path, small_recording: Path, finished_run: Path, content: bytes, message: str, role: str
+) -> None:
+    (tmp_path / "bad.tum").write_bytes(content)
+    command = ["run", small_recording, "--out", tmp_path / "new"] if role == "--prior" else ["evaluate", finished_run]
+    assert message in one_line_of(lidarslam(*command, role, tmp_path / "bad.tum"))
+
+
+def test_a_prior_in_kittis_format_is_told_from_tum(tmp_path: Path, small_recording: Path) -> None:
+    poses = read_tum(small_recording / "ground_truth.tum").T_world_lidar
+    (tmp_path / "poses.txt").write_text(format_kitti(poses))
+    said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "new", "--prior", tmp_path / "poses.txt"))
+    assert "poses.txt:1: expected 8 numbers, got 12" in said
+
+
+@pytest.mark.parametrize(("offset_s", "covered"), [(1_000.0, 0), (0.25, 4)])
+def test_a_prior_of_another_time_is_a_run_that_lost_its_way(
+    tmp_path: Path, small_recording: Path, offset_s: float, covered: int
+) -> None:
+    table = np.loadtxt(small_recording / "ground_truth.tum")
+    table[:, 0] += offset_s
+    np.savetxt(tmp_path / "prior.tum", table, fmt="%.9f")
+    command = ("run", small_recording, "--out", tmp_path / "run", "--prior", tmp_path / "prior.tum", "--no-mapping")
+    result = lidarslam(*command)
+    assert result.exit_code == 3
+    assert "the prior does not cover this scan" in result.stdout
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["lost_scans"] == 6 - covered

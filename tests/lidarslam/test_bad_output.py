@@ -1,0 +1,358 @@
+"""Places that cannot be written, disks that fill up, two writers, requests to end: a line, and no half file."""
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.core.errors import OutputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.datasets.ply import read_ply
+from lidarslam.directory_lock import only_writer
+from lidarslam.rerun_viewer import IncompleteRecordingError, require_complete
+from lidarslam.run_directory import FILES, RunDirectory
+from mapping.global_map import PointCloud
+from mapping.map_io import write_cloud
+
+FAST = ("--odometry", "constant-velocity")
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def shell(*arguments: object, **options: object) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "lidarslam.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, **options)  # type: ignore[call-overload,no-any-return]
+
+
+def left_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) if folder.exists() else []
+
+
+@contextlib.contextmanager
+def files_no_longer_than(size: int) -> Iterator[None]:
+    """A disk that is full after so many bytes of a file, as far as this process sees."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.parametrize("size", [0, 300, 1_200, 4_000, 100_000])
+@pytest.mark.parametrize("more", [(), ("--pcd",), ("--pose-graph",)])
+def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, more: Sequence[str]) -> None:
+    """The map is 300 kB, the log of the scans 600 bytes, the configuration 3.6 kB."""
+    out = tmp_path / "run"
+    with files_no_longer_than(size):
+        result = lidarslam("run", small_recording, "--out", out, *FAST, *more)
+    assert result.exit_code == 1
+    said = [line for line in result.stderr.splitlines() if line.startswith("lidarslam: ") and "Rerun: " not in line]
+    assert len(said) == 1
+    assert str(out) in said[0]
+    assert "File too large" in said[0]
+    left = left_in(out)
+    assert not [name for name in left if name.startswith(".partial")]
+    assert "map.ply" not in left
+    assert "recording.rrd" not in left
+    assert "summary.json" not in left
+    assert not left or "config.yaml" in left, "what is left is a run's, and --overwrite replaces it"
+    if "trajectory.tum" in left:
+        assert len(read_tum(out / "trajectory.tum")) == 6
+    assert lidarslam("run", small_recording, "--out", out, *FAST, "--overwrite").exit_code == 0
+
+
+def test_a_map_is_whole_or_absent(tmp_path: Path) -> None:
+    cloud = PointCloud(np.ones((1_000, 3)), np.ones((1_000, 3)))
+    for suffix in ("ply", "pcd"):
+        with files_no_longer_than(20_000), pytest.raises(OutputError, match="cannot be written there"):
+            write_cloud(tmp_path / f"map.{suffix}", cloud)
+    write_cloud(tmp_path / "map.ply", cloud)
+    assert len(read_ply(tmp_path / "map.ply")) == 1_000
+
+
+def test_a_cut_recording_of_rerun_is_told_from_a_whole_one(tmp_path: Path, finished_run: Path) -> None:
+    assert lidarslam("view", finished_run, "--save", tmp_path / "whole.rrd").exit_code == 0
+    content = (tmp_path / "whole.rrd").read_bytes()
+    require_complete(tmp_path / "whole.rrd")
+    for kept in (0, 5, len(content) // 2, len(content) - 1):
+        (tmp_path / "cut.rrd").write_bytes(content[:kept])
+        with pytest.raises(IncompleteRecordingError):
+            require_complete(tmp_path / "cut.rrd")
+
+
+def _evaluate(run: Path, out: Path) -> Sequence[object]:
+    return ["evaluate", run, "--out", out / "metrics.json"]
+
+
+def _errors(run: Path, out: Path) -> Sequence[object]:
+    return ["evaluate", run, "--reference-map", run / "map.ply", "--out", out / "m.json", "--errors", out / "e.ply"]
+
+
+def _picture(run: Path, out: Path) -> Sequence[object]:
+    return ["view", run, "--picture", out / "run.png"]
+
+
+@pytest.mark.parametrize("command", [_evaluate, _errors, _picture])
+@pytest.mark.parametrize("size", [0, 3_000])
+def test_other_outputs_on_a_full_disk(
+    tmp_path: Path, finished_run: Path, command: Callable[[Path, Path], Sequence[object]], size: int
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with files_no_longer_than(min(size, 200) if command is _evaluate else size):
+        result = lidarslam(*command(finished_run, out))
+    assert result.exit_code == 1
+    assert result.stderr.count("lidarslam: ") == 1
+    assert str(out) in result.stderr
+    assert set(left_in(out)) <= {"m.json"}, "the figures of the map fit, and are whole"
+    if left_in(out):
+        json.loads((out / "m.json").read_text())
+
+
+@pytest.mark.parametrize("form", ["kitti", "ply", "rosbag1", "rosbag2", "mcap"])
+def test_a_simulation_on_a_full_disk(tmp_path: Path, form: str) -> None:
+    with files_no_longer_than(20_000):
+        result = lidarslam("simulate", "--out", tmp_path / "made", "--scans", 2, "--format", form)
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert left_in(tmp_path) == []
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("mount") is None, reason="needs a file system of its own")
+def test_a_disk_that_is_really_full(tmp_path: Path, small_recording: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(disk)], check=False)
+    if mounted.returncode:
+        pytest.skip("may not mount")
+    try:
+        result = lidarslam("run", small_recording, "--out", disk / "run", *FAST)
+        assert result.exit_code == 1
+        assert result.stderr.count("\n") == 1
+        assert "No space left on device" in result.stderr
+        assert "map.ply" not in left_in(disk / "run")
+        assert not [name for name in left_in(disk) if ".partial" in name]
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that not even root may write to")
+@pytest.mark.parametrize("command", ["run", "compare", "simulate", "train", "merge", "evaluate", "view", "picture"])
+def test_a_folder_that_cannot_be_written(small_recording: Path, finished_run: Path, command: str) -> None:
+    place = Path("/proc/self/task")
+    commands: dict[str, Sequence[object]] = {
+        "run": ["run", small_recording, *FAST, "--out", place / "run"],
+        "compare": ["compare", small_recording, "--methods", "constant-velocity+map", "--out", place / "c"],
+        "simulate": ["simulate", "--scans", 2, "--out", place / "s"],
+        "train": ["train", small_recording, "--out", place / "t", "--steps", 1],
+        "merge": ["merge", small_recording, finished_run.parent, "--reader", "scan-folder", "--out", place / "m"],
+        "evaluate": ["evaluate", finished_run, "--out", place / "metrics.json"],
+        "view": ["view", finished_run, "--save", place / "run.rrd"],
+        "picture": ["view", finished_run, "--picture", place / "run.png"],
+    }
+    if command == "merge":
+        shutil.copy(small_recording / "000000.npy", finished_run.parent)
+        shutil.copy(small_recording / "000001.npy", finished_run.parent)
+    result = lidarslam(*commands[command])
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert "/task" in result.stderr
+    assert "cannot be written" in result.stderr
+
+
+NAMES = [
+    "a b",
+    "Größe 测试",
+    "new\nline",
+    "-x",
+    'it\'s "q" $HOME `x`;rm',
+    "e\x1b[31mred",
+    os.fsdecode(b"bad\xff"),
+    "deep/" * 30,
+]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
+def test_names_of_every_kind(tmp_path: Path, small_recording: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = Path(shutil.copytree(small_recording, tmp_path / "in" / name))
+    result = lidarslam("run", source, f"--out={name}", *FAST)
+    assert result.exit_code == 0
+    assert result.stdout.replace("\n", "").isprintable()
+    assert {"summary.json", "map.ply", "config.yaml"} <= set(left_in(tmp_path / name))
+    assert json.loads((tmp_path / name / "summary.json").read_text())["scans"] == 6
+    assert lidarslam("evaluate", f"./{name}").exit_code == 0
+
+
+def test_a_name_that_is_too_long(tmp_path: Path, small_recording: Path) -> None:
+    result = lidarslam("run", small_recording, "--out", tmp_path / ("n" * 300), *FAST)
+    assert result.exit_code == 1
+    assert "File name too long" in result.stderr
+    assert left_in(tmp_path) == []
+
+
+def test_a_run_inside_its_recording_changes_nothing_of_it(tmp_path: Path, small_recording: Path) -> None:
+    source = Path(shutil.copytree(small_recording, tmp_path / "room"))
+    before = {path: path.read_bytes() for path in source.iterdir()}
+    assert lidarslam("run", source, "--out", source / "run", *FAST).exit_code == 0
+    assert {path: path.read_bytes() for path in source.iterdir() if path.is_file()} == before
+    assert "scans         6" in lidarslam("info", source).stdout
+
+
+def test_links_are_replaced_and_never_written_through(
+    tmp_path: Path, small_recording: Path, finished_run: Path
+) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    for name in FILES:
+        (outside / name).write_text("precious")
+        (finished_run / name).unlink(missing_ok=True)
+        if name != "config.yaml":
+            (finished_run / name).symlink_to(outside / name)
+    (finished_run / "config.yaml").write_text("run:\n")
+    for name in FILES:
+        (finished_run / f".partial-{os.getpid()}-{name}").symlink_to(outside / name)
+    command = ("run", small_recording, "--out", finished_run, *FAST, "--rerun", "save", "--pcd", "--overwrite")
+    assert lidarslam(*command).exit_code == 0
+    assert {(outside / name).read_text() for name in FILES} == {"precious"}
+    assert not [name for name in FILES if (finished_run / name).is_symlink()]
+    assert json.loads((finished_run / "summary.json").read_text())["scans"] == 6
+
+
+def test_a_device_is_not_replaced_by_a_file(tmp_path: Path, finished_run: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.rrd")
+    for command in (["view", finished_run, "--save"], ["evaluate", finished_run, "--out"]):
+        result = lidarslam(*command, tmp_path / "pipe.rrd")
+        assert result.exit_code == 1
+        assert "is no ordinary file" in result.stderr
+        assert (tmp_path / "pipe.rrd").is_fifo()
+
+
+def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
+    tmp_path: Path, small_recording: Path, whole_run: Path
+) -> None:
+    shutil.copytree(whole_run, tmp_path, dirs_exist_ok=True)
+    out = Path(shutil.copytree(whole_run, tmp_path / "merged"))
+    elsewhere = [{"directory": name} for name in ("..", ".", "", "/", "../run", 3, None)]
+    (out / "summary.json").write_text(json.dumps({"recordings": elsewhere}))
+    again = shutil.copytree(small_recording, tmp_path / "again")
+    command = ("merge", small_recording, again, "--out", out, *FAST, "--overwrite")
+    assert lidarslam(*command).exit_code in (0, 1)
+    assert (out / "01_room").is_dir()
+    assert {"config.yaml", "map.ply", "summary.json"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_second_writer_is_turned_away(tmp_path: Path, small_recording: Path, finished_run: Path) -> None:
+    before = {path.name: path.read_bytes() for path in finished_run.iterdir()}
+    with only_writer(finished_run):
+        result = lidarslam("run", small_recording, "--out", finished_run, *FAST, "--overwrite")
+        other = lidarslam("compare", small_recording, "--methods", "constant-velocity+map", "--out", finished_run)
+    for refused in (result, other):
+        assert refused.exit_code == 1
+        assert refused.stderr.count("\n") == 1
+        assert "another lidarslam is writing there" in refused.stderr
+    assert {path.name: path.read_bytes() for path in finished_run.iterdir()} == before
+    with RunDirectory.create(finished_run, overwrite=True):  # the lock is gone with its holder
+        pass
+
+
+@pytest.mark.slow  # a process of its own for each
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[object], sent: signal.Signals) -> None:
+    """The recording is a minute long; the request comes in its first seconds."""
+    source, out = tmp_path / "room", tmp_path / "run"
+    source.mkdir()
+    points: FloatArray = room_scans[0].points  # type: ignore[attr-defined]
+    np.save(source / "000000.npy", points)
+    for index in range(1, 3_000):
+        os.link(source / "000000.npy", source / f"{index:06d}.npy")
+    command = [sys.executable, "-m", "lidarslam.cli", "run", str(source), "--out", str(out), *FAST]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    begun = time.monotonic()
+    while not list(out.glob(".partial-*-scans.csv")) and time.monotonic() - begun < 30.0:
+        time.sleep(0.05)
+    time.sleep(1.5)
+    process.send_signal(sent)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert said.count("\n") == 1
+    assert "stopped after" in said
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
+    summary = json.loads((out / "summary.json").read_text())
+    assert 0 < summary["scans"] < 3_000
+    assert summary["warnings"][0].startswith(f"stopped after {summary['scans']} scans")
+    assert len(read_tum(out / "trajectory.tum")) == summary["scans"]
+
+
+@pytest.mark.slow  # a process of its own for each
+@pytest.mark.parametrize(
+    ("redirected", "status"),
+    [("| true", 0), (">&-", 0), ("2>&-", 0), ("<&- >&- 2>&-", 0), ("> /dev/full", 1), ("| head -n 1", 0)],
+)
+def test_standard_streams_that_are_closed_or_full(
+    tmp_path: Path, small_recording: Path, redirected: str, status: int
+) -> None:
+    command = f"'{sys.executable}' -m lidarslam.cli run '{small_recording}' --out run --odometry constant-velocity"
+    ended = subprocess.run(
+        ["bash", "-c", f"{command} {redirected}"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ended.returncode == status
+    assert "Traceback" not in ended.stderr
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["scans"] == 6
+    table = (tmp_path / "run" / "scans.csv").read_text().splitlines()
+    assert len(table) == 7, "nobody else wrote into it"
+
+
+@pytest.mark.slow  # a process of its own for each
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"HOME": None},
+        {"HOME": "/proc/self/task"},
+        {"TMPDIR": "/no/such/folder"},
+        {"TERM": "dumb", "COLUMNS": "1"},
+    ],
+    ids=" ".join,
+)
+def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, str | None]) -> None:
+    source = shutil.copytree(small_recording, tmp_path / "Größe")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | changed
+    env = {key: value for key, value in environment.items() if value is not None}
+    ended = shell("run", source, "--out", tmp_path / "läuft", *FAST, "--pose-graph", env=env)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "written to" in ended.stdout
+    assert json.loads((tmp_path / "läuft" / "summary.json").read_text())["scans"] == 6
+
+
+def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
+    script = f"cd gone && rmdir ../gone && '{sys.executable}' -m lidarslam.cli run '{small_recording}' --out /tmp/never"
+    (tmp_path / "gone").mkdir()
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr == "lidarslam: the folder you stand in is gone; change to another\n"
