@@ -317,7 +317,7 @@ def test_a_run_that_is_stopped_can_be_resumed_as_well(
 ) -> None:
     """Ctrl-C comes just as a state is written; what there is can be looked at meanwhile."""
     expected, out = whole("constant velocity"), tmp_path / "run"
-    ended = run(source, out, *expected.arguments, kill_at=expected.ended.events // 2, signal=signal.SIGINT)
+    ended = run(source, out, *expected.arguments, kill_at=expected.ended.events // 3, signal=signal.SIGINT)
     assert ended.status == 1
     assert "interrupted; --resume goes on with it" in ended.said
     scans = len(load_run(out).trajectory)
@@ -328,13 +328,25 @@ def test_a_run_that_is_stopped_can_be_resumed_as_well(
     assert_same(out, expected.out)
 
 
+def test_a_run_that_is_stopped_as_it_writes_its_results_can_be_resumed(
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path
+) -> None:
+    expected, out = whole("constant velocity"), tmp_path / "run"
+    ended = run(source, out, *expected.arguments, kill_at=round(0.55 * expected.ended.events), signal=signal.SIGINT)
+    assert ended.status == 1
+    with pytest.raises(InputError, match="did not finish; resume it"):
+        load_run(out)
+    assert run(source, out, *expected.arguments, "--resume").status == expected.ended.status
+    assert_same(out, expected.out)
+
+
 @pytest.fixture(scope="module")
 def killed_once(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """The directory of a run that was killed half way."""
     expected, out = whole("constant velocity"), tmp_path_factory.mktemp("killed") / "run"
-    assert run(source, out, *expected.arguments, kill_at=expected.ended.events // 2).status == KILLED
+    assert run(source, out, *expected.arguments, kill_at=expected.ended.events // 3).status == KILLED
     assert (out / "unfinished" / "state.npz").exists()
     return out
 
