@@ -135,7 +135,8 @@ class LearnedOdometry:
 
     def _align(self, guess: Estimate, last: _Sweep, sweep: _Sweep, interval_s: float) -> tuple[Aligned, Tensor]:
         """From the network's guess, or going on as before, or further afield; and the information about it."""
-        information = torch.diag_embed((-2.0 * guess.log_sigma).exp()) / self._config.caution**2
+        caution = guess.log_sigma.new_tensor([self._config.turn_caution] * 3 + [self._config.caution] * 3)
+        information = torch.diag_embed((caution * guess.log_sigma.exp()) ** -2)
         guesses = guess.T_prev_curr
         interval, before = guesses.new_tensor([interval_s]), None
         if self._way.last is not None:

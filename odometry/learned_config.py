@@ -20,10 +20,9 @@ class LearnedConfig(BaseModel):
     bfloat16: bool = Field(False, description="encode with half the digits, where the device is faster so")
     alignment: AlignmentConfig = AlignmentConfig(column_step=3)
     caution: float = Field(
-        3.0,
-        gt=0.0,
-        description="factor on the network's standard deviations, which are those of what it was trained on",
+        4.0, gt=0.0, description="factor on the network's standard deviations, so that alignment leads where it can"
     )
+    turn_caution: float = Field(8.0, gt=0.0, description="and on those of the rotation")
     least_explained: float = Field(
         0.3, ge=0.0, le=1.0, description="of what a scan says that must agree with the last one for it to be believed"
     )
