@@ -207,7 +207,9 @@ def _tell(results: list[ScanResult], distance: FloatArray, angle: FloatArray, re
         if result.status is not Status.OK or k % 20 == 0:
             mark = "*" if recorded.concerned[k] else " "
             inliers = "" if result.inlier_ratio is None else f"{result.inlier_ratio:.2f}"
-            print(f"  {k:3d}{mark} {result.status.value:8s} {distance[k]:7.3f} m {angle[k]:6.2f} deg {inliers} {result.message}")
+            print(
+                f"  {k:3d}{mark} {result.status.value:8s} {distance[k]:7.3f} m {angle[k]:6.2f} deg {inliers} {result.message}"
+            )
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:

@@ -24,7 +24,11 @@ def even_tunnel(begin_m: float, end_m: float, length_m: float, seed: int = 0) ->
     rng = np.random.default_rng([seed, 1])
     places = _places(rng, begin_m, end_m, length_m, 1.6)
     side = rng.choice([-1.0, 1.0], len(places))
-    depth, width, tall = rng.uniform(0.1, 0.35, len(places)), rng.uniform(0.2, 0.7, len(places)), rng.uniform(0.6, 2.2, len(places))
+    depth, width, tall = (
+        rng.uniform(0.1, 0.35, len(places)),
+        rng.uniform(0.2, 0.7, len(places)),
+        rng.uniform(0.6, 2.2, len(places)),
+    )
     fittings = np.stack([places, side * (_WIDE_M - depth), tall], axis=-1)
     boxes = Boxes(
         np.concatenate([centres, fittings]),
