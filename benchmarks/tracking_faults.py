@@ -203,13 +203,13 @@ def _counts(status: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> str:
 
 
 def _tell(results: list[ScanResult], distance: FloatArray, angle: FloatArray, recorded: Faulty) -> None:
+    previous = ""
     for k, result in enumerate(results):
-        if result.status is not Status.OK or k % 20 == 0:
-            mark = "*" if recorded.concerned[k] else " "
+        if result.message != previous or k % 20 == 0:
+            mark, off = "*" if recorded.concerned[k] else " ", f"{distance[k]:7.3f} m {angle[k]:6.2f} deg"
             inliers = "" if result.inlier_ratio is None else f"{result.inlier_ratio:.2f}"
-            print(
-                f"  {k:3d}{mark} {result.status.value:8s} {distance[k]:7.3f} m {angle[k]:6.2f} deg {inliers} {result.message}"
-            )
+            print(f"  {k:3d}{mark} {result.status.value:8s} {off} {inliers} {result.message}")
+        previous = result.message
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:

@@ -193,7 +193,7 @@ class Mapper:
         if not any(placed.is_beyond_doubt for placed in places) and self._doubt.looks_everywhere:
             there = search_everywhere(sampled, prediction, last, local_map, self._config)
             places += [there] if there else []
-        return max(places, key=lambda placed: placed.fit.inlier_share, default=None)
+        return max(places, key=lambda placed: placed.quality, default=None)
 
     def _accept(
         self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined, found: bool

@@ -52,17 +52,17 @@ def judge(
     if placed.status is not Status.OK:
         return placed.status, placed.fit.explain(config)
     assert placed.refined is not None
+    message = ""
     angle_deg, distance_m = np.rad2deg(np.linalg.norm(correction[:3])), np.linalg.norm(correction[3:])
     where = f"{angle_deg:.0f} deg and {distance_m:.2f} m from where it was expected"
     if now.found:
-        return Status.DEGRADED, f"found again in the map, {where}; the next scans must confirm it"
-    if jumped:
-        return Status.DEGRADED, where
-    if now.unconfirmed:
-        return Status.DEGRADED, "found again a moment ago, and not yet confirmed"
-    if now.adrift:
-        return Status.DEGRADED, "in a map begun anew; where it lies beside the one before is a guess"
-    degenerate = placed.refined.degeneracy.names
-    if degenerate:
-        return Status.DEGRADED, f"nothing to see along {', '.join(degenerate)}; the prior was kept"
-    return Status.OK, ""
+        message = f"found again in the map, {where}; the next scans must confirm it"
+    elif jumped:
+        message = where
+    elif now.unconfirmed:
+        message = "found again a moment ago, and not yet confirmed"
+    elif now.adrift:
+        message = "in a map begun anew; where it lies beside the one before is a guess"
+    elif names := placed.refined.degeneracy.names:
+        message = f"nothing to see along {', '.join(names)}; the prior was kept"
+    return (Status.DEGRADED if message else Status.OK), message

@@ -49,7 +49,7 @@ def open_plain(begin_m: float, end_m: float, length_m: float, seed: int = 0) -> 
     xy = np.stack([places, beside], axis=-1)
     sheds = np.arange(len(places)) % 4 == 0
     starts = np.column_stack([xy[~sheds], np.full((~sheds).sum(), -0.5)])
-    trunks = Cylinders(starts, starts + [0.0, 0.0, 6.0], rng.uniform(0.1, 0.4, len(starts)))
+    trunks = Cylinders(starts, starts + np.array([0.0, 0.0, 6.0]), rng.uniform(0.1, 0.4, len(starts)))
     halves = rng.uniform([0.5, 0.5, 1.5], [2.0, 2.0, 3.0], (sheds.sum(), 3))
     boxes = Boxes(np.column_stack([xy[sheds], halves[:, 2] - 0.1]), halves, np.tile(np.eye(3), (len(halves), 1, 1)))
     return World("open-plain", seed, _route(length_m), boxes, trunks, (ground,), map_spacing_m=0.1)
