@@ -141,9 +141,9 @@ def _still(place: str, seed: int, scans: int, crowded: bool) -> Case:
 
 def _featureless(kind: str, seed: int) -> Case:
     """From structure through nothing to structure."""
-    begin_m, end_m, length_m = 25.0, 105.0, 140.0
+    begin_m, end_m, length_m = 20.0, 95.0, 120.0
     world = (even_tunnel if kind == "tunnel" else open_plain)(begin_m, end_m, length_m, seed)
-    motion = motion_along(straight_drive(length_m, 8.0, 1.5), world, on_ground=False)
+    motion = motion_along(straight_drive(length_m, 5.0, 1.5), world, on_ground=False)
     sensor = find_sensor("vlp-16")
     reach_m = 25.0  # dust, or dark walls: no end in view
     sensor = replace(sensor, ranging=replace(sensor.ranging, max_range_m=reach_m))
@@ -153,7 +153,7 @@ def _featureless(kind: str, seed: int) -> Case:
     nothing = (x > begin_m + reach_m) & (x < end_m - reach_m)
     after = int(np.flatnonzero(x > end_m)[0])
     recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, nothing, after)
-    return Case("nothing to see for 30 m", f"{world.name}, vlp-16", recorded, simulation.distance_to_surfaces)
+    return Case("nothing to see for 25 m", f"{world.name}, vlp-16", recorded, simulation.distance_to_surfaces)
 
 
 def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:

@@ -176,7 +176,8 @@ class Mapper:
         if near.status is Status.LOST or (surprised and not near.is_beyond_doubt):
             return self._look_everywhere(near, sampled, prediction, last, local_map)
         if near.status is Status.DEGRADED and doubt.looks_around:
-            return search(sampled, prediction, last, local_map, config) or near
+            found = search(sampled, prediction, last, local_map, config)
+            return found if found is not None and found.quality > near.quality else near
         if near.status is Status.OK and not doubt.is_unconfirmed:
             back = self._earlier.look(sampled, prediction, last, config)
             if back is not None:

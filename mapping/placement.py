@@ -19,7 +19,8 @@ from mapping.sampling import SampledScan
 # A sweep compensated with a motion that turns out to be this different is compensated again.
 _SAME_ROTATION = np.deg2rad(0.1)
 _SAME_TRANSLATION_M = 0.01
-# A search may end anywhere, but most of what the scan sees must then lie on the map.
+# A search may end anywhere. After a scan was lost, most of what the next one sees must lie on the map for it to be
+# believed where it is expected.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
 _SHARE_TO_RETURN = 0.5
 # With the whole map to choose from, what meets the map must lie on it much better than that, and clearly better than at
@@ -94,7 +95,7 @@ def search(
     places = (prediction.T_world_lidar, last.T_world_lidar)
     starts = np.concatenate([start_poses(T_world_lidar, up, step_deg) for T_world_lidar in places])
     tried = _from_starts(best_starts(points, starts, local_map), sampled, prediction, last, local_map, config)
-    return max((placed for placed in tried if placed.is_certain), key=lambda placed: placed.quality, default=None)
+    return max((placed for placed in tried if placed.is_beyond_doubt), key=lambda placed: placed.quality, default=None)
 
 
 def search_everywhere(

@@ -59,7 +59,7 @@ def straight_drive(length_m: float, speed_mps: float, sensor_height_m: float) ->
     """Along the x axis, at first and in between at three quarters of the speed, so that no speed goes on for ever."""
     times = np.arange(0.0, 2.0 * length_m / speed_mps, 0.1)
     speed = speed_mps * (0.875 - 0.125 * np.cos(2.0 * np.pi * times / 8.0))
-    speed *= np.clip(times / 2.0, 0.0, 1.0)
+    speed *= np.clip(times / 4.0, 0.0, 1.0)
     along = np.concatenate([[0.0], np.cumsum(speed[:-1] * 0.1)])
     times = times[along <= length_m]
     poses = np.tile(np.eye(4), (len(times), 1, 1))
