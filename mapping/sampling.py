@@ -106,7 +106,8 @@ class Sampler:
 
     def _follow_scene(self, squared: FloatArray) -> float:
         """The cell size for the median range of the latest scans; it changes only when the scene has, clearly."""
-        if len(squared):
+        # A cover over the sensor, or a few stray points, are no other scene.
+        if np.count_nonzero(squared > self._config.min_range_m**2) >= self._config.refinement.min_matches:
             median_m = float(np.sqrt(np.median(squared[:: max(1, len(squared) // 5000)])))
             new = self._range_m == 0.0
             self._range_m = median_m if new else self._range_m + _SCENE_MEMORY * (median_m - self._range_m)
