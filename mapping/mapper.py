@@ -207,7 +207,9 @@ class Mapper:
         jumped = has_jumped(correction, prediction)
         added = placed.status is Status.OK and not jumped and not self._doubt.is_unconfirmed
         if jumped or found:
-            way = np.zeros(6)  # found again: where the last scan was is not known
+            # Found again: where the last scan was is not known. How it moved shows within the sweep, if anywhere.
+            seen = self._config.continuous_time and sampled.times is not None
+            way = refined.velocity if found and seen else np.zeros(6)
             if not found and interval_s > 0.0:  # one of the two sweeps was bent by a wrong velocity: go on with
                 way = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)  # the way between
             state = State.astray(sampled.stamp, refined.T_world_lidar, way)
