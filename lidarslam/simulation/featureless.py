@@ -18,8 +18,8 @@ def even_tunnel(begin_m: float, end_m: float, length_m: float, seed: int = 0) ->
     middle = 0.5 * length_m
     shell = [((middle, 0.0, -0.5 * _THICK_M), (half, 6.0, 0.5 * _THICK_M))]
     shell += [((middle, 0.0, _HIGH_M + 0.5 * _THICK_M), (half, 6.0, 0.5 * _THICK_M))]
-    for side in (-1.0, 1.0):
-        shell.append(((middle, side * (_WIDE_M + 0.5 * _THICK_M), 0.5 * _HIGH_M), (half, 0.5 * _THICK_M, 3.0)))
+    beside_m = _WIDE_M + 0.5 * _THICK_M
+    shell += [((middle, y, 0.5 * _HIGH_M), (half, 0.5 * _THICK_M, 3.0)) for y in (-beside_m, beside_m)]
     centres, halves = (np.array(rows) for rows in zip(*shell, strict=True))
     rng = np.random.default_rng([seed, 1])
     places = _places(rng, begin_m, end_m, length_m, 1.6)
