@@ -94,6 +94,7 @@ class Localised:
         residual_m, inlier_ratio: how the scan lies on what it was held against; None when that cannot be told.
         degenerate: names of the directions of motion that the scan says nothing about.
         stage_ms: wall time of the stages gone through.
+        way_known: whether the sensor was followed here from the scan before.
     """
 
     T_world_lidar: FloatArray
@@ -108,6 +109,7 @@ class Localised:
     inlier_ratio: float | None
     degenerate: tuple[str, ...]
     stage_ms: dict[str, float]
+    way_known: bool = True
 
 
 class Localiser(Protocol):
@@ -209,6 +211,7 @@ class ScanToMap:
             inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,
             degenerate=mapped.degenerate,
             stage_ms={"refine": 1e3 * (time.perf_counter() - started)},
+            way_known=mapped.way_known,
         )
 
 

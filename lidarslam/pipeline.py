@@ -340,14 +340,14 @@ def _result(scan: Scan, localised: Localised, points: FloatArray, stage_ms: dict
 
 
 def _graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:
-    measured = estimated.interval_s is not None
+    measured = estimated.interval_s is not None and (localised.way_known or localised.status is Status.LOST)
     return GraphScan(
         T_world_lidar=localised.T_world_lidar,
         points=points,
         covariance=localised.covariance,
         T_prev_curr=estimated.motion.T_prev_curr if measured else None,
         motion_covariance=estimated.motion.covariance if measured else None,
-        lost=localised.status is Status.LOST,
+        lost=localised.status is Status.LOST or not localised.way_known,
         belongs_in_map=localised.belongs_in_map,
     )
 

@@ -15,7 +15,7 @@ class GraphScan:
         covariance: (6, 6) of the pose when it was registered to a map, rotation first; None when it was not.
         T_prev_curr: (4, 4) the odometry's motion since the scan before; None when it measured nothing.
         motion_covariance: (6, 6) of that; None when the odometry does not say.
-        lost: whether the pose is a guess.
+        lost: whether the pose is a guess, or was found again with no way there from the scan before.
         belongs_in_map: whether it is good enough to draw with.
     """
 

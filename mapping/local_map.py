@@ -161,6 +161,10 @@ class LocalMap:
         length = float(np.linalg.norm(mean))
         return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
 
+    def surface(self) -> FloatArray:
+        """Points (M, 3) of the world on what is held, one in each of the cells of the middle size."""
+        return self._planes[1].means()
+
     def resized(self, cell_m: float) -> "LocalMap":
         """The same map in cells of another size, made of the surfaces in the finest of these."""
         other = LocalMap(cell_m, self._radius_m)

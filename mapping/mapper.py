@@ -14,22 +14,21 @@ from lidarslam.core.state import State as Tree
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
+from mapping.doubt import Doubt
+from mapping.earlier_maps import EarlierMaps
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
-from mapping.placement import Placed, place, search
+from mapping.placement import Placed, place, search, search_everywhere
 from mapping.prediction import Carrier, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
+from mapping.verdict import Circumstances, has_jumped, judge
 
 # Predictions that were off by less than this share of a cell need no coarser cells first; what they were off by is
 # forgotten by this factor a scan.
 _FINE_ENOUGH = 0.5
 _CAUTION = 0.8
 _UNKNOWN_M = 10.0
-# A pose so far from where it was expected, in standard deviations and at least in degrees and metres, is suspicious
-# however it fits.
-_MOST_SIGMAS = 5.0
-_LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
 # Nothing goes on as it did for ever: while lost, the velocity fades by this from scan to scan.
 _FADING = 0.7
 # How often the first sweep is drawn anew when the second has shown how it moved.
@@ -49,6 +48,7 @@ class MappedScan:
         degenerate: names of the directions along which the expected pose was kept.
         iterations: how many the registration took.
         added: whether the scan became part of the map.
+        way_known: whether it was followed here from the scan before; else it was found again, or is only expected here.
     """
 
     state: State
@@ -60,6 +60,7 @@ class MappedScan:
     degenerate: tuple[str, ...] = ()
     iterations: int = 0
     added: bool = False
+    way_known: bool = True
 
 
 class Mapper:
@@ -72,8 +73,9 @@ class Mapper:
         self._state: State | None = None
         self._carrier = Carrier()
         self._expected_error_m = _UNKNOWN_M
-        self._lost_in_a_row = 0
-        self._was_degraded = False  # a second scan that lies badly is reason to look around
+        self._doubt = Doubt()
+        self._earlier = EarlierMaps()
+        self._scans_in_map = 0
         self._first: SampledScan | None = None  # while the map is one sweep whose motion was made up
         self._has_velocity = False  # no change of velocity is seen from one that was made up
 
@@ -128,9 +130,9 @@ class Mapper:
     def _begin(self, sampled: SampledScan, prediction: Prediction, last: State) -> MappedScan:
         """The first scan makes the map."""
         T_world_lidar = prediction.T_world_lidar
-        if not len(sampled):
+        if self._is_blind(sampled):
             lost = State.astray(sampled.stamp, T_world_lidar, prediction.velocity)
-            return MappedScan(lost, T_world_lidar, False, Status.LOST, "there is no point within range")
+            return MappedScan(lost, T_world_lidar, False, Status.LOST, _little_to_see(sampled), way_known=False)
         self._map = LocalMap(sampled.cell_m, self._config.radius_m)
         self._add(sampled, T_world_lidar, prediction.velocity, self._map)
         first = State(sampled.stamp, T_world_lidar, prediction.velocity, last.covariance, sampled.seen_until_s)
@@ -178,45 +180,73 @@ class Mapper:
         """Register a scan to the map; when it fits nowhere near, search; when it fits nowhere, keep it out."""
         if sampled.cell_m != local_map.cell_m:
             local_map = self._map = local_map.resized(sampled.cell_m)
+        if self._is_blind(sampled):
+            return self._see_nothing(sampled, prediction)
         coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
-        placed = place(sampled, prediction, last, local_map, self._config, coarse_first)
-        doubtful = self._lost_in_a_row > 0 and not placed.is_certain
-        if doubtful or placed.status is Status.LOST:
-            found = search(sampled, prediction, last, local_map, self._config)
-            if found is None:
-                return self._miss(sampled, prediction, placed.fit)
-            placed = found
-        elif placed.status is Status.DEGRADED and self._was_degraded:
-            placed = search(sampled, prediction, last, local_map, self._config) or placed
-        self._was_degraded = placed.status is Status.DEGRADED
+        near = place(sampled, prediction, last, local_map, self._config, coarse_first)
+        placed = self._look(near, sampled, prediction, last, local_map)
+        if placed is None:
+            return self._miss(sampled, prediction, near.fit)
         assert placed.refined is not None
+        self._doubt.laid(placed.status, found=placed is not near)
         interval_s = sampled.stamp - last.stamp
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
         self._has_velocity = True
-        return self._accept(sampled, prediction, last, placed, placed.refined)
+        return self._accept(sampled, prediction, last, placed, placed.refined, found=placed is not near)
+
+    def _look(
+        self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap
+    ) -> Placed | None:
+        """A scan that was laid on the map near where it was expected, or where it fits better; None when nowhere."""
+        doubt, config = self._doubt, self._config
+        surprised = doubt.is_surprised(sampled.stamp - last.stamp)
+        if near.status is Status.LOST or (surprised and not near.is_beyond_doubt):
+            return self._look_everywhere(near, sampled, prediction, last, local_map)
+        if near.status is Status.DEGRADED and doubt.looks_around:
+            found = search(sampled, prediction, last, local_map, config)
+            return found if found is not None and found.quality > near.quality else near
+        if near.status is Status.OK and not doubt.is_unconfirmed:
+            back = self._earlier.look(sampled, prediction, last, config)
+            if back is not None:
+                self._map = back.local_map
+                return back.placed
+        return near
+
+    def _look_everywhere(
+        self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap
+    ) -> Placed | None:
+        """Turned on the spot, then all over the map; what fits best counts, if it fits well."""
+        places = [near] if near.status is not Status.LOST and near.is_certain else []
+        places += [found] if (found := search(sampled, prediction, last, local_map, self._config)) else []
+        if not any(placed.is_beyond_doubt for placed in places) and self._doubt.looks_everywhere:
+            there = search_everywhere(sampled, prediction, last, local_map, self._config)
+            places += [there] if there else []
+        return max(places, key=lambda placed: placed.quality, default=None)
 
     def _accept(
-        self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined
+        self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined, found: bool
     ) -> MappedScan:
         """A scan that lies on the map where it was expected becomes part of it."""
-        was_lost, self._lost_in_a_row = self._lost_in_a_row > 0, 0
         interval_s = sampled.stamp - last.stamp
         correction = log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
         self._expected_error_m = max(_CAUTION * self._expected_error_m, displacement_m(correction, sampled.range_m))
         state = State(sampled.stamp, refined.T_world_lidar, refined.velocity, refined.covariance, sampled.seen_until_s)
-        jumped = _has_jumped(correction, prediction)
-        added = placed.status is Status.OK and not jumped
-        if jumped:
-            way = np.zeros(6)  # found again: where the last scan was is not known
-            if not was_lost and interval_s > 0.0:  # one of the two sweeps was bent by a wrong velocity: go on with
+        jumped = has_jumped(correction, prediction)
+        added = placed.status is Status.OK and not jumped and not self._doubt.is_unconfirmed
+        if jumped or found:
+            # Found again: where the last scan was is not known. How it moved shows within the sweep, if anywhere.
+            seen = self._config.continuous_time and sampled.times is not None
+            way = refined.velocity if found and seen else np.zeros(6)
+            if not found and interval_s > 0.0:  # one of the two sweeps was bent by a wrong velocity: go on with
                 way = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)  # the way between
             state = State.astray(sampled.stamp, refined.T_world_lidar, way)
             self._has_velocity = False
         elif added:
             assert self._map is not None
             self._add(sampled, refined.T_world_lidar, refined.velocity, self._map)
-        status, message = self._judge(placed, refined, correction, jumped)
+        now = Circumstances(found, self._doubt.is_unconfirmed, len(self._earlier) > 0)
+        status, message = judge(placed, correction, jumped, now, self._config.tracking)
         return MappedScan(
             state=state,
             T_world_expected=prediction.T_world_lidar,
@@ -227,36 +257,39 @@ class Mapper:
             degenerate=refined.degeneracy.names,
             iterations=refined.iterations,
             added=added,
+            way_known=not found,
         )
+
+    def _is_blind(self, sampled: SampledScan) -> bool:
+        """Whether the sensor sees next to nothing: it is covered, or looks into the open."""
+        return len(sampled.keys) + len(sampled.edges) < self._config.refinement.min_matches
+
+    def _see_nothing(self, sampled: SampledScan, prediction: Prediction) -> MappedScan:
+        """What has nothing to see says nothing of where it is: it waits, and the map with it."""
+        self._doubt.saw_nothing()
+        return self._lose(sampled, prediction, None, _little_to_see(sampled))
 
     def _miss(self, sampled: SampledScan, prediction: Prediction, fit: Fit) -> MappedScan:
         """A scan that fits nowhere stays where it was expected, out of the map."""
-        T_world_lidar = prediction.T_world_lidar
-        message = fit.explain(self._config.tracking) if len(sampled) else "there is no point within range"
-        self._lost_in_a_row += 1
+        message = fit.explain(self._config.tracking) or "it may lie here, or elsewhere in the map"
+        self._doubt.missed()
+        if self._doubt.lost_in_a_row >= self._config.tracking.give_up_after:
+            assert self._map is not None
+            self._earlier.set_aside(self._map, self._scans_in_map)
+            self._map, self._scans_in_map = LocalMap(sampled.cell_m, self._config.radius_m), 0
+            self._add(sampled, prediction.T_world_lidar, prediction.velocity, self._map)
+            self._doubt.began_anew()
+            message += "; a new map is begun here"
+        return self._lose(sampled, prediction, fit, message)
+
+    def _lose(self, sampled: SampledScan, prediction: Prediction, fit: Fit | None, message: str) -> MappedScan:
         self._has_velocity = False
         self._expected_error_m = _UNKNOWN_M
-        if self._lost_in_a_row >= self._config.tracking.give_up_after and len(sampled):
-            self._map = LocalMap(sampled.cell_m, self._config.radius_m)
-            self._add(sampled, T_world_lidar, prediction.velocity, self._map)
-            self._lost_in_a_row = 0
-            message += "; a new map is begun here"
-        lost = State.astray(sampled.stamp, T_world_lidar, _FADING * prediction.velocity)
-        return MappedScan(lost, T_world_lidar, False, Status.LOST, message, fit)
+        lost = State.astray(sampled.stamp, prediction.T_world_lidar, _FADING * prediction.velocity)
+        return MappedScan(lost, prediction.T_world_lidar, False, Status.LOST, message, fit, way_known=False)
 
-    def _judge(self, placed: Placed, refined: Refined, correction: FloatArray, jumped: bool) -> tuple[Status, str]:
-        """The fit decides; one that fits far from where it was expected is degraded, and one that the prior holds."""
-        if placed.status is not Status.OK:
-            return placed.status, placed.fit.explain(self._config.tracking)
-        if jumped:
-            angle_deg, distance_m = np.rad2deg(np.linalg.norm(correction[:3])), np.linalg.norm(correction[3:])
-            return Status.DEGRADED, f"{angle_deg:.0f} deg and {distance_m:.2f} m from where it was expected"
-        if len(refined.degeneracy):
-            return Status.DEGRADED, f"nothing to see along {', '.join(refined.degeneracy.names)}; the prior was kept"
-        return Status.OK, ""
-
-    @staticmethod
-    def _add(sampled: SampledScan, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap) -> None:
+    def _add(self, sampled: SampledScan, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap) -> None:
+        self._scans_in_map += 1
         points = compensated(sampled.points, sampled.times, velocity)
         edges = compensated(sampled.edges, sampled.edge_times, velocity)
         local_map.add(
@@ -267,7 +300,7 @@ class Mapper:
         )
 
 
-def _has_jumped(correction: FloatArray, prediction: Prediction) -> bool:
-    """Whether a pose lies farther from where it was expected than any carrier explains."""
-    usual = np.maximum(_MOST_SIGMAS * np.sqrt(np.diag(prediction.pose_covariance)), _LEAST_JUMP)
-    return bool((np.abs(correction) > usual).any())
+def _little_to_see(sampled: SampledScan) -> str:
+    if not len(sampled):
+        return "there is no point within range"
+    return f"only {len(sampled)} points within range: too few to tell anything"

@@ -1,0 +1,249 @@
+"""What becomes of tracking when something goes wrong, beside KISS-ICP on the same scans.
+
+    python benchmarks/tracking_faults.py
+    python benchmarks/tracking_faults.py --faults carried traffic --places office
+
+Prints a Markdown table, a row for each fault, place and method. Every recording is simulated in memory, the fault in
+its midst, and goes through the pipeline of `lidarslam run` with its defaults. The world is that of the first scan, so
+that errors are those of the poses as they come, without any alignment:
+
+- concerned: of the scans that the fault shows in, how many are reported lost and degraded;
+- elsewhere: of all others, the same;
+- believed and wrong: scans with status ok whose position is off by more than `--wrong-m`;
+- worst, after: the largest error of the scans from ten after the end of the fault, whatever their status;
+- shape, after: RMS error of the same scans, after SE(3) alignment of them alone;
+- polluted: share of the points of the map farther than 0.2 m from every true surface, when the map is laid on the truth
+  by the true pose of the first scan.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mapping_accuracy import make_simulation, print_row
+
+from evaluation.trajectory_metrics import evaluate_trajectory
+from lidarslam.config import Config
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline import Pipeline, ScanResult
+from lidarslam.run import make_localiser
+from lidarslam.simulation.faults import (
+    Cover,
+    Faulty,
+    carried_off,
+    covered,
+    dropped,
+    index_back,
+    passing_by,
+    standing_still,
+)
+from lidarslam.simulation.featureless import even_tunnel, open_plain, straight_drive
+from lidarslam.simulation.given_motion import motion_along
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.worlds.registry import build_world
+from mapping.config import MappingConfig
+from odometry.config import OdometryConfig
+from odometry.registry import make_odometry
+
+_POLLUTED_M = 0.2
+# The first scans after a fault may still be on their way back.
+_BACK_AFTER = 10
+
+# World, sensor, carrier, scans; where the fault begins.
+_PLACES = {
+    "office": ("office", "vlp-16", "tracked", 150, 90),
+    "tunnel": ("tunnel", "vlp-16", "legged", 150, 90),
+    "street": ("street", "os1-64", "car", 150, 90),
+    "forest": ("forest", "vlp-16", "handheld", 150, 90),
+}
+_METHODS = {
+    "learned+map": Config(),
+    "constant-velocity+map": Config(odometry=OdometryConfig(method="constant-velocity")),
+    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(enabled=False)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A recording with a fault, and how far points are from the true surfaces of its world."""
+
+    fault: str
+    place: str
+    recorded: Faulty
+    distances: Callable[[FloatArray], FloatArray]
+
+
+def on_the_way(place: str, kind: str, seed: int) -> Iterator[Case]:
+    """Faults of a kind that befall a sensor on its way through a world."""
+    world, sensor, carrier, scans, at = _PLACES[place]
+    simulation = make_simulation(world, carrier, sensor, scans, seed)
+    name = f"{world}, {sensor}, {carrier}"
+    for fault, recorded in _FAULTS[kind](simulation, at):
+        yield Case(fault, name, recorded, simulation.distance_to_surfaces)
+
+
+def _covered(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
+    covers: tuple[Cover, ...] = ("empty", "near", "stray")
+    for cover in covers:
+        yield f"covered for 2 s: {cover}", covered(simulation, at, at + 20, cover)
+
+
+def _carried(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
+    back = index_back(simulation, at, 5.0)
+    for turned_deg in (0.0, 90.0):
+        yield f"carried 5 m back, turned {turned_deg:g} deg", carried_off(simulation, at, back, turned_deg)
+
+
+def _dropped(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
+    for count in (1, 3, 10):
+        yield f"{count} scans dropped", dropped(simulation, range(at, at + count))
+
+
+def _gap(simulation: Simulation, at: int) -> Iterator[tuple[str, Faulty]]:
+    longer = replace(simulation, scan_count=len(simulation) + 50)
+    yield "gap of 5 s", dropped(longer, range(at, at + 50))
+
+
+_FAULTS: dict[str, Callable[[Simulation, int], Iterator[tuple[str, Faulty]]]] = {
+    "covered": _covered,
+    "carried": _carried,
+    "dropped": _dropped,
+    "gap": _gap,
+}
+
+
+def _still(place: str, seed: int, scans: int, crowded: bool) -> Case:
+    """Standing where the carrier begins; crowded by vehicles outdoors and by people indoors."""
+    world_name, sensor, carrier, _, _ = _PLACES[place]
+    moving = make_simulation(world_name, carrier, sensor, 1, seed)
+    T_world_body = moving.motion.pose_at(np.zeros(1))[0]
+    yaw = float(np.arctan2(T_world_body[1, 0], T_world_body[0, 0]))
+    world = build_world(world_name, seed)
+    if crowded:
+        outdoors = world_name in ("street", "park")
+        size = np.array([9.0, 2.5, 3.4] if outdoors else [0.4, 0.6, 1.8])
+        beside = np.array([3.0, -3.0, 3.2, -3.2, 6.0]) if outdoors else np.array([0.8, -0.8, 0.9, -0.9, 1.0, -1.1, 1.2])
+        movers = passing_by(T_world_body[:3, 3], yaw, size, beside, *((6.0, 25.0) if outdoors else (1.2, 2.0)))
+        world = replace(world, movers=(*world.movers, *movers))
+    motion = standing_still(T_world_body[:3, 3], yaw, moving.motion.sensor_height_m)
+    mount = mount_pose("upright", motion.sensor_height_m)
+    simulation = Simulation(world, find_sensor(sensor), motion, mount, scans, seed)
+    shown = np.full(scans, crowded)
+    recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, shown, 0)
+    fault = f"standing still for {scans} scans" + (" amid traffic" if crowded else "")
+    return Case(fault, f"{world_name}, {sensor}", recorded, simulation.distance_to_surfaces)
+
+
+def _featureless(kind: str, seed: int) -> Case:
+    """From structure through nothing to structure."""
+    begin_m, end_m, length_m = 20.0, 95.0, 120.0
+    world = (even_tunnel if kind == "tunnel" else open_plain)(begin_m, end_m, length_m, seed)
+    motion = motion_along(straight_drive(length_m, 5.0, 1.5), world, on_ground=False)
+    sensor = find_sensor("vlp-16")
+    reach_m = 25.0  # dust, or dark walls: no end in view
+    sensor = replace(sensor, ranging=replace(sensor.ranging, max_range_m=reach_m))
+    scans = int((motion.duration_s - 0.2) * sensor.rate_hz)
+    simulation = Simulation(world, sensor, motion, mount_pose("upright", 0.0), scans, seed)
+    x = simulation.ground_truth.positions[:, 0]
+    nothing = (x > begin_m + reach_m) & (x < end_m - reach_m)
+    after = int(np.flatnonzero(x > end_m)[0])
+    recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, nothing, after)
+    return Case("nothing to see for 25 m", f"{world.name}, vlp-16", recorded, simulation.distance_to_surfaces)
+
+
+def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:
+    """A recording through the pipeline: the results, and the points (M, 3) of the map."""
+    odometry = make_odometry(config.odometry, None)
+    try:
+        pipeline = Pipeline(odometry, make_localiser(config), config.global_map)
+        results = list(pipeline.run(case.recorded.scans))
+    finally:
+        odometry.close()
+    return results, np.empty((0, 3)) if pipeline.global_map is None else pipeline.global_map.points()
+
+
+def row(case: Case, name: str, wrong_m: float, verbose: bool) -> list[str]:
+    """The cells of one method on one recording."""
+    results, points = run(case, _METHODS[name])
+    recorded, truth = case.recorded, case.recorded.truth.T_world_lidar
+    poses = np.array([result.T_world_lidar for result in results])
+    true = inverse(truth[0]) @ truth
+    off = inverse(true) @ poses
+    distance, angle = np.linalg.norm(off[:, :3, 3], axis=1), np.rad2deg(rotation_angle(off))
+    status = np.array([result.status.value for result in results])
+    if verbose:
+        _tell(results, distance, angle, recorded)
+    after = np.arange(len(results)) >= min(recorded.after + _BACK_AFTER, len(results) - 5)
+    estimate = Trajectory(truth_stamps := recorded.truth.stamps[after], poses[after])
+    shape = evaluate_trajectory(estimate, Trajectory(truth_stamps, truth[after])).errors.ate_rmse_m
+    polluted = case.distances(transform_points(truth[0], points)) > _POLLUTED_M
+    there, elsewhere = status[recorded.concerned], status[~recorded.concerned]
+    believed = (status == Status.OK.value) & (distance > wrong_m)
+    return [
+        case.fault,
+        case.place,
+        name,
+        _counts(there),
+        _counts(elsewhere),
+        str(int(believed.sum())),
+        f"{distance[after].max():.3f} m, {angle[after].max():.2f} deg",
+        f"{shape:.3f}",
+        f"{100.0 * polluted.mean():.2f}" if len(points) else "no map",
+    ]
+
+
+def _counts(status: np.ndarray[tuple[int, ...], np.dtype[np.str_]]) -> str:
+    lost, degraded = int((status == "lost").sum()), int((status == "degraded").sum())
+    return f"{lost} lost, {degraded} degraded of {len(status)}"
+
+
+def _tell(results: list[ScanResult], distance: FloatArray, angle: FloatArray, recorded: Faulty) -> None:
+    previous = ""
+    for k, result in enumerate(results):
+        if result.message != previous or k % 20 == 0:
+            mark, off = "*" if recorded.concerned[k] else " ", f"{distance[k]:7.3f} m {angle[k]:6.2f} deg"
+            inliers = "" if result.inlier_ratio is None else f"{result.inlier_ratio:.2f}"
+            print(f"  {k:3d}{mark} {result.status.value:8s} {off} {inliers} {result.message}")
+        previous = result.message
+
+
+def cases(arguments: argparse.Namespace) -> Iterator[Case]:
+    """What is asked for, one recording in memory at a time."""
+    for kind in arguments.faults:
+        if kind == "featureless":
+            yield from (_featureless(place, arguments.seed) for place in ("tunnel", "plain"))
+            continue
+        for place in arguments.places:
+            if kind in ("traffic", "still"):
+                yield _still(place, arguments.seed, 200, kind == "traffic")
+            else:
+                yield from on_the_way(place, kind, arguments.seed)
+
+
+def main() -> None:
+    """Parse the command line and print the table, row by row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    kinds = [*_FAULTS, "traffic", "still", "featureless"]
+    parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)
+    parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=["office", "tunnel", "street"])
+    parser.add_argument("--methods", nargs="+", choices=list(_METHODS), default=list(_METHODS))
+    parser.add_argument("--wrong-m", type=float, default=0.2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--verbose", action="store_true", help="every scan that is not ok")
+    arguments = parser.parse_args()
+    header = ["fault", "place", "method", "concerned", "elsewhere", "believed and wrong", "worst, after"]
+    header += ["shape, after, m", "polluted, %"]
+    print_row(header)
+    print_row(["---"] * len(header))
+    for case in cases(arguments):
+        for method in arguments.methods:
+            print_row(row(case, method, arguments.wrong_m, arguments.verbose))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""How far it is known where the sensor is: what makes tracking look around, and what makes it sure again."""
+
+from lidarslam.core.tracking import Status
+
+# After so long without a scan the sensor may be anywhere.
+_GAP_S = 1.0
+# A place found again is confirmed by so many scans that lie where it leads one to expect them.
+_CONFIRMED_BY = 3
+# Looking all over the map takes a second or two: it is done at these lost scans in a row, and at every so manieth.
+_LOOKS_AT = (1, 2, 4, 8, 13)
+_LOOKS_EVERY = 20
+
+
+class Doubt:
+    """What the latest scans say about that.
+
+    Attributes:
+        lost_in_a_row: scans that had something to see, and fitted nowhere.
+        is_astray: whether it is not known where the last scan was.
+    """
+
+    def __init__(self) -> None:
+        self.lost_in_a_row = 0
+        self.is_astray = False
+        self._was_degraded = False
+        self._to_confirm = 0
+
+    def is_surprised(self, interval_s: float) -> bool:
+        """Whether a scan, so long after the last one, need not be near where it is expected."""
+        return self.is_astray or interval_s > _GAP_S
+
+    @property
+    def looks_around(self) -> bool:
+        """Whether a scan that lies badly is reason to look around: the second one in a row is."""
+        return self._was_degraded
+
+    @property
+    def looks_everywhere(self) -> bool:
+        """Whether it is time to look all over the map, should the next scan fit nowhere nearby."""
+        number = self.lost_in_a_row + 1
+        return number in _LOOKS_AT or number % _LOOKS_EVERY == 0
+
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether the sensor was found again, and too few scans since then have confirmed it."""
+        return self._to_confirm > 0
+
+    def saw_nothing(self) -> None:
+        """A scan had next to nothing to see."""
+        self.is_astray, self._to_confirm = True, 0
+
+    def missed(self) -> None:
+        """A scan fitted nowhere."""
+        self.saw_nothing()
+        self.lost_in_a_row += 1
+
+    def began_anew(self) -> None:
+        """Scans are held against another map from now on."""
+        self.lost_in_a_row = 0
+
+    def laid(self, status: Status, found: bool) -> None:
+        """A scan lies on the map, where it was expected or where it was found."""
+        self.lost_in_a_row, self.is_astray = 0, False
+        self._was_degraded = status is Status.DEGRADED
+        if found:
+            self._to_confirm = _CONFIRMED_BY
+        elif self._to_confirm and status is Status.OK:
+            self._to_confirm -= 1

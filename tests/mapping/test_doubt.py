@@ -1,0 +1,61 @@
+"""What makes tracking look around, and what makes it sure again."""
+
+from lidarslam.core.tracking import Status
+from mapping.doubt import Doubt
+
+
+def test_it_is_not_surprised_by_the_next_scan_but_by_one_after_a_gap() -> None:
+    assert not Doubt().is_surprised(0.1)
+    assert Doubt().is_surprised(1.5)
+
+
+def test_after_a_lost_scan_it_is_surprised_until_one_is_laid() -> None:
+    doubt = Doubt()
+    doubt.missed()
+    assert doubt.is_surprised(0.1)
+    doubt.laid(Status.OK, found=False)
+    assert not doubt.is_surprised(0.1)
+
+
+def test_scans_that_saw_nothing_are_no_reason_to_give_the_map_up() -> None:
+    doubt = Doubt()
+    for _ in range(50):
+        doubt.saw_nothing()
+    assert doubt.lost_in_a_row == 0
+    assert doubt.is_surprised(0.1)
+
+
+def test_looking_everywhere_becomes_rare() -> None:
+    doubt = Doubt()
+    looks = []
+    for _ in range(100):
+        looks.append(doubt.looks_everywhere)
+        doubt.missed()
+    assert looks[0]
+    assert sum(looks[:20]) == 6
+    assert sum(looks[20:]) == 4
+
+
+def test_found_again_is_confirmed_by_three_scans() -> None:
+    doubt = Doubt()
+    doubt.laid(Status.OK, found=True)
+    unconfirmed = []
+    for _ in range(4):
+        unconfirmed.append(doubt.is_unconfirmed)
+        doubt.laid(Status.OK, found=False)
+    assert unconfirmed == [True, True, True, False]
+
+
+def test_scans_that_lie_badly_confirm_nothing() -> None:
+    doubt = Doubt()
+    doubt.laid(Status.OK, found=True)
+    for _ in range(10):
+        doubt.laid(Status.DEGRADED, found=False)
+    assert doubt.is_unconfirmed
+
+
+def test_the_second_degraded_scan_is_reason_to_look_around() -> None:
+    doubt = Doubt()
+    assert not doubt.looks_around
+    doubt.laid(Status.DEGRADED, found=False)
+    assert doubt.looks_around

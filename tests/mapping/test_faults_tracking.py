@@ -1,0 +1,267 @@
+"""What becomes of tracking when something goes wrong: covers, kidnapping, dropped scans, traffic, standing still.
+
+Offices and tunnels scanned by a simulated VLP-16 of few columns; poses, statuses and the map against the truth.
+"""
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.simulation.faults import (
+    Cover,
+    Faulty,
+    carried_off,
+    covered,
+    dropped,
+    index_back,
+    passing_by,
+    standing_still,
+)
+from lidarslam.simulation.featureless import even_tunnel, straight_drive
+from lidarslam.simulation.given_motion import motion_along
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.scan_patterns import Spinning
+from lidarslam.simulation.sensor import Sensor
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import World
+from lidarslam.simulation.worlds.registry import build_world
+from mapping.config import MappingConfig, TrackingConfig
+from mapping.mapper import MappedScan, Mapper
+from mapping.prediction import Prior
+from mapping.refinement import compensated
+
+AT = 70
+COUNT = 90
+NOTHING = Prior()
+Start = Callable[[], Mapper]
+
+
+def light(name: str = "vlp-16") -> Sensor:
+    """A sensor with a quarter of its columns, for speed."""
+    sensor = find_sensor(name)
+    assert isinstance(sensor.pattern, Spinning)
+    return replace(sensor, pattern=replace(sensor.pattern, columns=sensor.pattern.columns // 4))
+
+
+@pytest.fixture(scope="module")
+def office() -> World:
+    return build_world("office", 0)
+
+
+@pytest.fixture(scope="module")
+def drive_by(office: World) -> Simulation:
+    motion = motion_along_route("tracked", office, 0)
+    return Simulation(office, light(), motion, mount_pose("upright", motion.sensor_height_m), COUNT)
+
+
+@pytest.fixture(scope="module")
+def _followed(drive_by: Simulation) -> Mapper:
+    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=5)))
+    for scan in drive_by.scans(0, AT):
+        mapper.process(scan, NOTHING)
+    return mapper
+
+
+@pytest.fixture
+def mapper(_followed: Mapper) -> Mapper:
+    """One that has followed the drive up to scan `AT`."""
+    return deepcopy(_followed)
+
+
+def process(mapper: Mapper, recorded: Faulty, first: int = AT) -> list[MappedScan]:
+    return [mapper.process(scan, NOTHING) for scan in recorded.scans[first:]]
+
+
+def errors(results: list[MappedScan], recorded: Faulty, first: int = AT) -> tuple[FloatArray, FloatArray]:
+    """Metres (N,) and degrees (N,) off the truth, whose world is the first scan's frame."""
+    truth = recorded.truth.T_world_lidar
+    off = inverse(inverse(truth[0]) @ truth[first : first + len(results)]) @ np.array(
+        [result.state.T_world_lidar for result in results]
+    )
+    return np.linalg.norm(off[:, :3, 3], axis=1), np.rad2deg(rotation_angle(off))
+
+
+def assert_nothing_wrong_is_believed(results: list[MappedScan], recorded: Faulty) -> None:
+    """No pose that is ok is wrong, and nothing was drawn where it is not."""
+    metres, degrees = errors(results, recorded)
+    believed = np.array([result.status is Status.OK or result.added for result in results])
+    assert metres[believed].max(initial=0.0) < 0.06
+    assert degrees[believed].max(initial=0.0) < 1.5
+
+
+def assert_recovered(results: list[MappedScan], recorded: Faulty, last: int = 5) -> None:
+    assert [result.status for result in results[-last:]] == [Status.OK] * last
+    metres, degrees = errors(results, recorded)
+    assert metres[-last:].max() < 0.04
+    assert degrees[-last:].max() < 1.0
+
+
+def polluted_share(results: list[MappedScan], recorded: Faulty, simulation: Simulation, first: int = AT) -> float:
+    """Share of the points that scans drew farther than 0.2 m from everything that stands there."""
+    T_world = recorded.truth.T_world_lidar[0]
+    drawn = [
+        transform_points(
+            T_world @ result.state.T_world_lidar, compensated(scan.points, scan.time_offsets, result.state.velocity)
+        )
+        for result, scan in zip(results, recorded.scans[first : first + len(results)], strict=True)
+        if result.added
+    ]
+    return float((simulation.distance_to_surfaces(np.concatenate(drawn)) > 0.2).mean())
+
+
+@pytest.mark.parametrize("cover", ["empty", "near", "stray"])
+def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(
+    mapper: Mapper, drive_by: Simulation, cover: Cover
+) -> None:
+    """For one second, while it moves on; more scans than after which a map is given up."""
+    recorded = covered(drive_by, AT, AT + 10, cover)
+    held = len(mapper.local_map or ())
+    results = process(mapper, replace(recorded, scans=recorded.scans[: AT + 10]))
+    assert {result.status for result in results} == {Status.LOST}
+    assert {result.added for result in results} == {False}
+    assert all("within range" in result.message for result in results)
+    assert len(mapper.local_map or ()) == held
+    results += process(mapper, recorded, AT + 10)
+    assert_nothing_wrong_is_believed(results, recorded)
+    assert_recovered(results, recorded)
+    assert polluted_share(results, recorded, drive_by) < 0.02
+
+
+def test_a_first_scan_of_stray_points_begins_no_map(drive_by: Simulation) -> None:
+    recorded = covered(drive_by, 0, 3, "stray")
+    mapper = Mapper(MappingConfig())
+    results = [mapper.process(scan, NOTHING) for scan in recorded.scans[:3]]
+    assert [result.status for result in results] == [Status.LOST] * 3
+    assert mapper.local_map is None
+    assert "only 25 points" in results[0].message
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
+def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: Simulation, turned_deg: float) -> None:
+    back = index_back(drive_by, AT, 5.0)
+    recorded = carried_off(drive_by, AT, back, turned_deg)
+    moved = recorded.truth.positions[AT] - recorded.truth.positions[AT - 1]
+    assert np.linalg.norm(moved) > 3.0
+    results = process(mapper, replace(recorded, scans=recorded.scans[: AT + 10]))
+    assert results[0].status is not Status.OK
+    assert any("found again in the map" in result.message for result in results[:3])
+    assert not any(result.way_known for result in results if "found again in the map" in result.message)
+    assert not results[0].added
+    assert_nothing_wrong_is_believed(results, recorded)
+    assert_recovered(results, recorded, 3)
+    assert polluted_share(results, recorded, drive_by) < 0.02
+
+
+@pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
+def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper: Mapper, drive_by: Simulation) -> None:
+    """In a tunnel it begins a map that is told to be a guess; back in the office, it is in its first map again."""
+    tunnel = build_world("tunnel", 0)
+    motion = motion_along_route("tracked", tunnel, 0)
+    away = Simulation(tunnel, light(), motion, mount_pose("upright", motion.sensor_height_m), 20)
+    there = [replace(scan, stamp=0.1 * (AT + k)) for k, scan in enumerate(away.scans())]
+    results = [mapper.process(scan, NOTHING) for scan in there]
+    assert Status.OK not in {result.status for result in results}
+    assert "a new map is begun here" in results[4].message
+    assert "where it lies beside the one before is a guess" in results[-1].message
+    assert results[-1].added
+    again = [replace(scan, stamp=scan.stamp + 2.0) for scan in drive_by.scans(AT, COUNT)]
+    back = [mapper.process(scan, NOTHING) for scan in again]
+    recorded = Faulty((), drive_by.ground_truth, np.zeros(COUNT, dtype=np.bool_), AT)
+    assert Status.OK in {result.status for result in back}
+    assert_nothing_wrong_is_believed([r if r.status is Status.OK else replace(r, added=False) for r in back], recorded)
+    assert_recovered(back, recorded, 3)
+
+
+@pytest.mark.parametrize("count", [1, 3, 10])
+def test_dropped_scans_do_no_harm(mapper: Mapper, drive_by: Simulation, count: int) -> None:
+    recorded = dropped(drive_by, range(AT, AT + count))
+    results = process(mapper, recorded)
+    assert_nothing_wrong_is_believed(results, recorded)
+    assert_recovered(results, recorded)
+
+
+def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive_by: Simulation) -> None:
+    recorded = dropped(replace(drive_by, scan_count=AT + 65), range(AT, AT + 50))
+    results = process(mapper, recorded)
+    assert_nothing_wrong_is_believed(results, recorded)
+    assert_recovered(results, recorded, 3)
+
+
+def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> Faulty:
+    """Standing where the tracked carrier begins, people going up and down at the sides."""
+    motion = motion_along_route("tracked", world, 0)
+    T_world_body = motion.pose_at(np.zeros(1))[0]
+    place, yaw = T_world_body[:3, 3], float(np.arctan2(T_world_body[1, 0], T_world_body[0, 0]))
+    if mover_sides_m is not None:
+        people = passing_by(place, yaw, np.array([0.4, 0.6, 1.8]), mover_sides_m, 1.2, 2.0)
+        world = replace(world, movers=(*world.movers, *people))
+    still = standing_still(place, yaw, motion.sensor_height_m)
+    simulation = Simulation(world, light(), still, mount_pose("upright", motion.sensor_height_m), scans)
+    return Faulty(tuple(simulation.scans()), simulation.ground_truth, np.zeros(scans, dtype=np.bool_), 0)
+
+
+@pytest.mark.parametrize("name", ["office", pytest.param("forest", marks=pytest.mark.slow)])
+def test_nothing_drifts_while_the_sensor_stands_still(name: str) -> None:
+    """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 200 scans."""
+    recorded = stand(build_world(name, 0), 200)
+    mapper = Mapper(MappingConfig())
+    results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
+    assert {result.status for result in results} == {Status.OK}
+    poses = np.array([result.state.T_world_lidar for result in results])
+    drift = inverse(poses[10]) @ poses[190:]
+    assert np.linalg.norm(drift[:, :3, 3].mean(axis=0)) < 0.01
+    assert np.rad2deg(rotation_angle(drift)).mean() < 0.1
+
+
+@pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
+def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office: World) -> None:
+    recorded = stand(office, 80, np.array([0.8, -0.8, 0.9, -0.9, 1.0, -1.1, 1.2]))
+    mapper = Mapper(MappingConfig())
+    results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
+    metres, degrees = errors(results, recorded, 0)
+    assert {result.status for result in results} == {Status.OK}
+    assert metres.max() < 0.03
+    assert degrees[10:].max() < 0.4
+
+
+@pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
+def test_an_even_tunnel_is_told_to_say_nothing_along_it() -> None:
+    world = even_tunnel(12.0, 60.0, 65.0)
+    motion = motion_along(straight_drive(65.0, 4.0, 1.5), world, on_ground=False)
+    sensor = light()
+    sensor = replace(sensor, ranging=replace(sensor.ranging, max_range_m=20.0))
+    simulation = Simulation(world, sensor, motion, mount_pose("upright", 0.0), 140)
+    x = simulation.ground_truth.positions[:, 0]
+    nothing = (x > 33.0) & (x < 39.0)
+    assert nothing.sum() > 10
+    mapper = Mapper(MappingConfig())
+    results = [mapper.process(scan, NOTHING) for scan in simulation.scans(0, int(np.flatnonzero(nothing)[-1]) + 1)]
+    concerned = [result for result, here in zip(results, nothing[: len(results)], strict=True) if here]
+    assert {result.status for result in concerned} == {Status.DEGRADED}
+    assert all("x" in result.degenerate for result in concerned)
+    assert all("nothing to see along" in result.message for result in concerned)
+
+
+def test_a_scan_that_fits_two_places_alike_is_at_neither(rng: np.random.Generator) -> None:
+    """A plain room looks the same after half a turn."""
+    half = np.array([5.0, 3.0, 1.5])
+
+    def walls(count: int) -> FloatArray:
+        points = rng.uniform(-1.0, 1.0, (count, 3)) * half
+        axis = rng.integers(0, 3, count)
+        points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * half[axis]
+        return points
+
+    mapper = Mapper(MappingConfig())
+    for k in range(10):
+        mapper.process(Scan(walls(8_000), 0.1 * k), NOTHING)
+    carried = Scan(walls(8_000) - np.array([2.5, 1.0, 0.0]), 1.0)
+    assert mapper.process(carried, NOTHING).status is Status.LOST
