@@ -1,5 +1,6 @@
 """How far it is known where the sensor is: what makes tracking look around, and what makes it sure again."""
 
+from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 
 # After so long without a scan the sensor may be anywhere.
@@ -24,6 +25,22 @@ class Doubt:
         self.is_astray = False
         self._was_degraded = False
         self._to_confirm = 0
+
+    def state(self) -> State:
+        """All of it."""
+        return {
+            "lost_in_a_row": self.lost_in_a_row,
+            "is_astray": self.is_astray,
+            "was_degraded": self._was_degraded,
+            "to_confirm": self._to_confirm,
+        }
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self.lost_in_a_row = saved.integer("lost_in_a_row")
+        self.is_astray = saved.flag("is_astray")
+        self._was_degraded = saved.flag("was_degraded")
+        self._to_confirm = saved.integer("to_confirm")
 
     def is_surprised(self, interval_s: float) -> bool:
         """Whether a scan, so long after the last one, need not be near where it is expected."""

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from lidarslam.core.state import Saved
+from lidarslam.core.state import State as Tree
 from mapping.config import MappingConfig
 from mapping.local_map import LocalMap
 from mapping.placement import Placed, search_everywhere
@@ -34,6 +36,17 @@ class EarlierMaps:
 
     def __len__(self) -> int:
         return len(self._maps)
+
+    def state(self) -> Tree:
+        """The maps, and when they are looked at."""
+        maps = [local_map.state() for local_map in self._maps]
+        return {"maps": maps, "scans_until_look": self._scans_until_look, "wait": self._wait}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state."""
+        self._maps = [LocalMap.restored(part) for part in saved.parts("maps")]
+        self._scans_until_look = saved.integer("scans_until_look")
+        self._wait = saved.number("wait")
 
     def set_aside(self, local_map: LocalMap, scans: int) -> None:
         """Keep a map of so many scans that is given up; of several, the first and the last, to bound the memory."""

@@ -92,8 +92,9 @@ class Mapper:
             "last": None if self._state is None else dict(vars(self._state)),
             "carrier": dict(vars(self._carrier)),
             "expected_error_m": self._expected_error_m,
-            "lost_in_a_row": self._lost_in_a_row,
-            "was_degraded": self._was_degraded,
+            "doubt": self._doubt.state(),
+            "earlier": self._earlier.state(),
+            "scans_in_map": self._scans_in_map,
             "first": None if self._first is None else self._first.state(),
             "has_velocity": self._has_velocity,
         }
@@ -105,8 +106,9 @@ class Mapper:
         self._state = saved.optional("last", State.restored)
         self._carrier = Carrier.restored(saved.part("carrier"))
         self._expected_error_m = saved.number("expected_error_m")
-        self._lost_in_a_row = saved.integer("lost_in_a_row")
-        self._was_degraded = saved.flag("was_degraded")
+        self._doubt.restore(saved.part("doubt"))
+        self._earlier.restore(saved.part("earlier"))
+        self._scans_in_map = saved.integer("scans_in_map")
         self._first = saved.optional("first", SampledScan.restored)
         self._has_velocity = saved.flag("has_velocity")
 

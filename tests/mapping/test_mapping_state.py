@@ -38,7 +38,7 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
     for name, value in vars(expected.state).items():
         np.testing.assert_array_equal(getattr(found.state, name), value, err_msg=name)
     np.testing.assert_array_equal(found.T_world_expected, expected.T_world_expected)
-    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added"):
+    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "way_known"):
         assert getattr(found, name) == getattr(expected, name), name
 
 
@@ -156,13 +156,18 @@ def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through
         mapper.process(scan, Prior())
     mapper._first = mapper._sampler.sample(scans[0])
     mapper._carrier = Carrier(1.5, 7.0)
-    mapper._expected_error_m, mapper._lost_in_a_row = 0.125, 3
-    mapper._was_degraded, mapper._has_velocity = True, True
+    mapper._expected_error_m, mapper._scans_in_map, mapper._has_velocity = 0.125, 7, True
+    assert mapper._map is not None
+    mapper._earlier.set_aside(mapper._map, 9)
+    mapper._doubt.laid(Status.DEGRADED, found=True)
+    mapper._doubt.missed()
     restored.restore(through_disk(mapper.state()))
     assert set(vars(mapper)) == {
-        "_config", "_sampler", "_map", "_state", "_carrier", "_expected_error_m", "_lost_in_a_row", "_was_degraded",
-        "_first", "_has_velocity",
+        "_config", "_sampler", "_map", "_state", "_carrier", "_expected_error_m", "_doubt", "_earlier",
+        "_scans_in_map", "_first", "_has_velocity",
     }  # fmt: skip
+    assert set(vars(mapper._doubt)) == {"lost_in_a_row", "is_astray", "_was_degraded", "_to_confirm"}
+    assert set(vars(mapper._earlier)) == {"_maps", "_scans_until_look", "_wait"}
     assert flat(restored.state()) == flat(mapper.state())
 
 
