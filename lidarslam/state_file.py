@@ -30,7 +30,7 @@ def write_state(path: Path, state: State) -> None:
         OutputError: it cannot be written.
     """
     arrays: list[NDArray[Any]] = []
-    text = json.dumps(_encoded(state, arrays), ensure_ascii=False)
+    text = json.dumps(_encoded(state, arrays))
     members = {f"{_ARRAY}{number}": array for number, array in enumerate(arrays)}
     members[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
     with replacing_for_good(path) as out:

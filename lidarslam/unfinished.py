@@ -59,7 +59,7 @@ class About:
             OutputError: it cannot be written.
         """
         with replacing_for_good(run / ABOUT) as out:
-            out.write(json.dumps(vars(self), indent=2, ensure_ascii=False).encode())
+            out.write(json.dumps(vars(self), indent=2).encode())
 
 
 def require_whole(run: Path) -> None:

@@ -350,9 +350,11 @@ def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, 
 
 
 def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
-    script = f"cd gone && rmdir ../gone && '{sys.executable}' -m lidarslam.cli run '{small_recording}' --out /tmp/never"
+    run = f"'{sys.executable}' -m lidarslam.cli run '{small_recording}' --out '{tmp_path / 'never'}'"
+    script = f"cd gone && rmdir ../gone && {run}"
     (tmp_path / "gone").mkdir()
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    folders = [folder for folder in sys.path if Path(folder).is_absolute()]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
     ended = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stderr == "lidarslam: the folder you stand in is gone; change to another\n"

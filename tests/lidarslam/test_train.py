@@ -99,6 +99,7 @@ def same_weights(one: Path, other: Path) -> bool:
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder: Path, tmp_path: Path, ready: Path) -> None:
     whole, parts, other = tmp_path / "whole", tmp_path / "parts", tmp_path / "other"
     outcome = execute(request(room_folder, whole, ready), Listener())
