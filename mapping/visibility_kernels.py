@@ -1,0 +1,126 @@
+"""The loops over points and pixels behind `mapping.visibility`, compiled.
+
+An image is (rows, columns) of ranges in metres, 0 where nothing returned; row 0 is the lowest, centres of rows are at
+integers, and columns begin at integers, from azimuth 0 towards y. A grid is (2,): the elevation of the centre of row 0,
+radians, and rows a radian.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+
+Ranges = NDArray[np.float32]
+TWO_PI = 2.0 * math.pi
+
+# A view says nothing of directions farther than this from the centres of its rows, in rows: beams may pass beside.
+OFF_CENTRE = 0.35
+# Of the nine pixels around a point, so many must hold a return: where few do, the surface may have returned nothing.
+LEAST_RETURNS = 4
+# A return is at a point's range, within so much and a voxel: noise, errors of poses, and a surface seen at a slant.
+MARGIN_M = 0.3
+MARGIN_OF_RANGE = 0.03
+# A point is where something was while it passed when so many views see through it, and so many for each that does not.
+LEAST_THROUGH = 3
+THROUGH_PER_SUPPORT = 4
+
+_SILENT, _SUPPORTS, _THROUGH = 0, 1, 2
+
+
+@compiled
+def draw(points: FloatArray, grid: FloatArray, image: Ranges) -> None:
+    """Draw the points (N, 3) into an image, in the sensor's frame: the nearest of each pixel."""
+    image[:] = 0.0
+    rows, columns = image.shape
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if not (distance > 0.0 and distance < math.inf):
+            continue
+        row = math.floor((math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1] + 0.5)
+        if row < 0 or row >= rows:
+            continue
+        column = _column(x, y, columns)
+        if image[row, column] == 0.0 or distance < image[row, column]:
+            image[row, column] = distance
+
+
+@compiled
+def judge(
+    points: FloatArray,
+    T_lidar_world: FloatArray,
+    images: Ranges,
+    grids: FloatArray,
+    reach_m: float,
+    voxel_size_m: float,
+    moved: NDArray[np.bool_],
+) -> None:
+    """Write for each of the points (M, 3) whether what was there has moved.
+
+    Args:
+        points: in the world.
+        T_lidar_world: (V, 4, 4) of the views.
+        images, grids: (V, rows, columns) and (V, 2), the views.
+        reach_m: a view says nothing of points farther than this.
+        voxel_size_m: of the map that the points are of.
+        moved: (M,).
+    """
+    views = len(images)
+    for m in range(len(points)):
+        through, support = 0, 0
+        for v in range(views):
+            says = _testimony(points[m], T_lidar_world[v], images[v], grids[v], reach_m, voxel_size_m)
+            if says == _THROUGH:
+                through += 1
+            elif says == _SUPPORTS:
+                support += 1
+            # Most points are where they were: no need to hear all views once these cannot turn the balance.
+            if through + views - 1 - v < max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support):
+                break
+        moved[m] = through >= max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support)
+
+
+@compiled
+def _testimony(
+    point: FloatArray, T: FloatArray, image: Ranges, grid: FloatArray, reach_m: float, voxel_size_m: float
+) -> int:
+    """What one view says of one point."""
+    rows, columns = image.shape
+    x = T[0, 0] * point[0] + T[0, 1] * point[1] + T[0, 2] * point[2] + T[0, 3]
+    y = T[1, 0] * point[0] + T[1, 1] * point[1] + T[1, 2] * point[2] + T[1, 3]
+    z = T[2, 0] * point[0] + T[2, 1] * point[1] + T[2, 2] * point[2] + T[2, 3]
+    squared = x * x + y * y + z * z
+    if not (squared <= reach_m * reach_m):
+        return _SILENT
+    row = (math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1]
+    nearest = math.floor(row + 0.5)
+    if nearest < 0 or nearest >= rows or abs(row - nearest) > OFF_CENTRE:
+        return _SILENT
+    column = _column(x, y, columns)
+    distance = math.sqrt(squared)
+    margin = max(MARGIN_M, MARGIN_OF_RANGE * distance) + voxel_size_m
+    returns, is_hidden = 0, False
+    for i in range(max(nearest - 1, 0), min(nearest + 2, rows)):
+        for j in range(column - 1, column + 2):
+            seen = image[i, j % columns]
+            if seen == 0.0:
+                continue
+            returns += 1
+            if abs(seen - distance) <= margin:
+                return _SUPPORTS
+            if seen < distance:
+                is_hidden = True
+    return _THROUGH if returns >= LEAST_RETURNS and not is_hidden else _SILENT
+
+
+@compiled
+def _column(x: float, y: float, columns: int) -> int:
+    """The column of a direction."""
+    azimuth = math.atan2(y, x)
+    if azimuth < 0.0:
+        azimuth += TWO_PI
+    # Just below 0 may be rounded to 2 pi, which is 0 again.
+    return int(azimuth * columns / TWO_PI) % columns
