@@ -24,7 +24,7 @@ _LEAST_HEIGHT = math.radians(1.0)
 _EVERY = 10
 _MOST_VIEWS = 512
 # A view says nothing where a pixel is wider than so many voxels, but for what is near all the same.
-_PIXEL_OF_VOXEL = 1.5
+_PIXEL_OF_VOXEL = 3.0
 _LEAST_REACH_M = 5.0
 
 
@@ -56,10 +56,14 @@ class PlacedViews:
 
 
 class Views:
-    """Range images of every k-th scan in the map, at most 512 and 6 MB of them: k doubles when there would be more."""
+    """Range images of every k-th scan in the map, at most 512 and 6 MB of them: k doubles when there would be more.
 
-    def __init__(self) -> None:
-        self._every = _EVERY
+    Args:
+        every: k at first.
+    """
+
+    def __init__(self, every: int = _EVERY) -> None:
+        self._every = every
         self._offered = 0
         self._grid: FloatArray | None = None  # (2,), of the first scan with points
         self._numbers: list[int] = []
@@ -121,7 +125,7 @@ class Views:
 
 
 def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) -> NDArray[np.bool_]:
-    """Whether what was at the points has moved away: at least three views see through, four for each that does not.
+    """Whether what was at the points has moved away: at least three views see through, two for each that does not.
 
     Args:
         points: (M, 3) of a map, in the world.

@@ -16,16 +16,14 @@ from lidarslam.core.geometry import FloatArray
 Ranges = NDArray[np.float32]
 TWO_PI = 2.0 * math.pi
 
-# A view says nothing of directions farther than this from the centres of its rows, in rows: beams may pass beside.
-OFF_CENTRE = 0.35
-# Of the nine pixels around a point, so many must hold a return: where few do, the surface may have returned nothing.
-LEAST_RETURNS = 4
+# Of the nine pixels around a point, its own and so many in all must hold a return: glass and the sky prove nothing.
+LEAST_RETURNS = 6
 # A return is at a point's range, within so much and a voxel: noise, errors of poses, and a surface seen at a slant.
-MARGIN_M = 0.3
-MARGIN_OF_RANGE = 0.03
+MARGIN_M = 0.1
+MARGIN_OF_RANGE = 0.01
 # A point is where something was while it passed when so many views see through it, and so many for each that does not.
 LEAST_THROUGH = 3
-THROUGH_PER_SUPPORT = 4
+THROUGH_PER_SUPPORT = 2
 
 _SILENT, _SUPPORTS, _THROUGH = 0, 1, 2
 
@@ -95,15 +93,14 @@ def _testimony(
     squared = x * x + y * y + z * z
     if not (squared <= reach_m * reach_m):
         return _SILENT
-    row = (math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1]
-    nearest = math.floor(row + 0.5)
-    if nearest < 0 or nearest >= rows or abs(row - nearest) > OFF_CENTRE:
+    row = math.floor((math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1] + 0.5)
+    if row < 0 or row >= rows:
         return _SILENT
     column = _column(x, y, columns)
     distance = math.sqrt(squared)
-    margin = max(MARGIN_M, MARGIN_OF_RANGE * distance) + voxel_size_m
+    margin = MARGIN_M + MARGIN_OF_RANGE * distance + voxel_size_m
     returns, is_hidden = 0, False
-    for i in range(max(nearest - 1, 0), min(nearest + 2, rows)):
+    for i in range(max(row - 1, 0), min(row + 2, rows)):
         for j in range(column - 1, column + 2):
             seen = image[i, j % columns]
             if seen == 0.0:
@@ -113,7 +110,8 @@ def _testimony(
                 return _SUPPORTS
             if seen < distance:
                 is_hidden = True
-    return _THROUGH if returns >= LEAST_RETURNS and not is_hidden else _SILENT
+    is_seen_through = image[row, column] > 0.0 and returns >= LEAST_RETURNS and not is_hidden
+    return _THROUGH if is_seen_through else _SILENT
 
 
 @compiled
