@@ -21,6 +21,9 @@ _ROWS, _COLUMNS = 16, 360
 # Elevations of the first scan's points between these quantiles make the rows, so that strays do not stretch them.
 _STRAY_SHARE = 0.002
 _LEAST_HEIGHT = math.radians(1.0)
+# Whether there are beams all over a row is told by fourths of it: most hold points, with as many as a tenth of the mean.
+_FOURTHS, _FILLED_OF_MEAN, _MOST = 4, 0.1, 0.6
+_AT_CENTRE, _EVERYWHERE = 0.3, 0.5
 _EVERY = 10
 _MOST_VIEWS = 512
 # A view says nothing where a pixel is wider than so many voxels, but for what is near all the same.
@@ -34,7 +37,8 @@ class PlacedViews:
 
     Attributes:
         images: (V, rows, columns) float32, the nearest range in each pixel, 0 where there is none.
-        grids: (V, 2) the elevation of the centre of row 0, radians, and rows a radian.
+        grids: (V, 3) the elevation of the centre of row 0, radians; rows a radian; and how far from the centre of a
+            row beams pass for sure, in rows.
         T_world_lidar: (V, 4, 4).
     """
 
@@ -50,7 +54,7 @@ class PlacedViews:
         """All of them, of sensors that may differ, in one world."""
         return cls(
             np.concatenate([np.empty((0, _ROWS, _COLUMNS), dtype=np.float32), *(part.images for part in parts)]),
-            np.concatenate([np.empty((0, 2)), *(part.grids for part in parts)]),
+            np.concatenate([np.empty((0, 3)), *(part.grids for part in parts)]),
             np.concatenate([np.empty((0, 4, 4)), *(part.T_world_lidar for part in parts)]),
         )
 
@@ -65,7 +69,7 @@ class Views:
     def __init__(self, every: int = _EVERY) -> None:
         self._every = every
         self._offered = 0
-        self._grid: FloatArray | None = None  # (2,), of the first scan with points
+        self._grid: FloatArray | None = None  # (3,), of the first scan with points
         self._numbers: list[int] = []
         self._images: list[NDArray[np.float16]] = []
 
@@ -89,7 +93,7 @@ class Views:
         self._every, self._offered = saved.integer("every"), saved.integer("offered")
         if self._every < 1:
             raise saved.refuse("views are of every 0th scan")
-        self._grid = saved.optional_array("grid", (2,))
+        self._grid = saved.optional_array("grid", (3,))
         self._numbers, self._images = numbers.tolist(), [image.copy() for image in images]
 
     def add(self, points: FloatArray, number: int) -> None:
@@ -143,7 +147,11 @@ def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) ->
 
 
 def _grid_around(points: FloatArray) -> FloatArray:
-    """The grid (2,) whose rows span the elevations of a scan's points (N, 3)."""
+    """The grid (3,) whose rows span the elevations of a scan's points (N, 3)."""
     elevations = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
     low, high = np.quantile(elevations, [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
-    return np.array([low, (_ROWS - 1) / max(high - low, _LEAST_HEIGHT)])
+    per_radian = (_ROWS - 1) / max(high - low, _LEAST_HEIGHT)
+    fourths = (_FOURTHS * ((elevations - low) * per_radian + 0.5)).astype(np.intp)
+    points_each = np.bincount(np.clip(fourths, 0, _FOURTHS * _ROWS - 1), minlength=_FOURTHS * _ROWS)
+    filled = np.mean(points_each > _FILLED_OF_MEAN * points_each.mean())
+    return np.array([low, per_radian, _EVERYWHERE if filled > _MOST else _AT_CENTRE])

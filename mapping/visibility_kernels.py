@@ -1,8 +1,8 @@
 """The loops over points and pixels behind `mapping.visibility`, compiled.
 
 An image is (rows, columns) of ranges in metres, 0 where nothing returned; row 0 is the lowest, centres of rows are at
-integers, and columns begin at integers, from azimuth 0 towards y. A grid is (2,): the elevation of the centre of row 0,
-radians, and rows a radian.
+integers, and columns begin at integers, from azimuth 0 towards y. A grid is (3,): the elevation of the centre of row 0,
+radians, rows a radian, and how far from the centre of a row, in rows, beams pass for sure.
 """
 
 import math
@@ -61,7 +61,7 @@ def judge(
     Args:
         points: in the world.
         T_lidar_world: (V, 4, 4) of the views.
-        images, grids: (V, rows, columns) and (V, 2), the views.
+        images, grids: (V, rows, columns) and (V, 3), the views.
         reach_m: a view says nothing of points farther than this.
         voxel_size_m: of the map that the points are of.
         moved: (M,).
@@ -93,7 +93,8 @@ def _testimony(
     squared = x * x + y * y + z * z
     if not (squared <= reach_m * reach_m):
         return _SILENT
-    row = math.floor((math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1] + 0.5)
+    height = (math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1]
+    row = math.floor(height + 0.5)
     if row < 0 or row >= rows:
         return _SILENT
     column = _column(x, y, columns)
@@ -110,8 +111,9 @@ def _testimony(
                 return _SUPPORTS
             if seen < distance:
                 is_hidden = True
-    is_seen_through = image[row, column] > 0.0 and returns >= LEAST_RETURNS and not is_hidden
-    return _THROUGH if is_seen_through else _SILENT
+    # Between lasers that are far apart a board lies unseen: only where one passes does it prove anything.
+    is_looked_at = image[row, column] > 0.0 and abs(height - row) <= grid[2]
+    return _THROUGH if is_looked_at and returns >= LEAST_RETURNS and not is_hidden else _SILENT
 
 
 @compiled

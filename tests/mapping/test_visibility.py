@@ -17,7 +17,7 @@ from mapping.visibility import PlacedViews, Views, seen_through
 ThroughDisk = Callable[[State], Saved]
 VOXEL_M = 0.1
 ROWS, COLUMNS = 16, 360
-GRID = np.array([-math.radians(15.0), 15.0 / math.radians(30.0)])
+GRID = np.array([-math.radians(15.0), 15.0 / math.radians(30.0), 0.5])
 
 # Lowest and highest corners.
 PERSON = np.array([[1.0, 1.0, 0.1], [1.5, 1.5, 1.8]])
@@ -74,8 +74,8 @@ def removed(rng: np.random.Generator, person_until: int, count: int = 30, noise_
 
 
 def test_who_was_there_for_a_while_is_left_out_and_what_stands_is_kept(rng: np.random.Generator) -> None:
-    shares = removed(rng, person_until=6)
-    assert shares.pop("person") > 0.9
+    shares = removed(rng, person_until=4)
+    assert shares.pop("person") > 0.8
     assert shares.pop("room") < 0.001
     assert max(shares.values()) < 0.02, shares
 
@@ -116,6 +116,20 @@ def test_views_are_counted_in_whatever_order(azimuth_deg: float, through: int, s
     images = [wall(10.0)] * through + [wall(5.1)] * support
     for order in (images, images[::-1]):
         assert seen_through(at(azimuth_deg), placed(order), VOXEL_M).tolist() == [expected]
+
+
+def test_between_lasers_that_are_far_apart_nothing_is_seen() -> None:
+    """A board that lies there is met by one in a few scans only; where rows are full of beams there is no between."""
+    lasers, all_over = Views(every=1), Views(every=1)
+    elevations = {lasers: np.arange(-15.0, 15.1, 2.0), all_over: np.arange(-15.0, 15.1, 0.25)}
+    for number in range(3):
+        for views, found in elevations.items():
+            views.add(np.concatenate([at(a + 0.5, 9.0, e) for a in range(40) for e in found]), number)
+    for views, above_deg, expected in (
+        (lasers, 0.5, True), (lasers, 0.7, False), (lasers, -0.7, False), (all_over, 0.7, True), (all_over, -0.7, True),
+    ):  # fmt: skip
+        seen = views.placed(np.tile(np.eye(4), (3, 1, 1)))
+        assert seen_through(at(10.0, 5.0, 1.0 + above_deg), seen, VOXEL_M).tolist() == [expected]
 
 
 def test_only_what_is_farther_all_around_is_seen_through() -> None:
@@ -189,7 +203,7 @@ def _says(point: FloatArray, image: NDArray[np.float32]) -> int:
 
 
 def test_a_view_keeps_the_nearest_of_each_pixel() -> None:
-    points = np.concatenate([at(0.5 + np.arange(360.0)[:, None, None], 1.0, e).reshape(3, -1).T for e in (-15.0, 15.0)])
+    points = np.concatenate([at(a + 0.5, 1.0, e) for a in range(360) for e in (-15.0, 15.0)])
     views = Views(every=1)
     views.add(np.concatenate([points, at(45.3, 7.0), at(45.7, 6.0), at(45.4, 8.0), [[0.0, 0.0, 0.0]]]), 0)
     (image,) = views.placed(np.eye(4)[None]).images
@@ -246,6 +260,6 @@ def test_views_go_on(after: int, rng: np.random.Generator, through_disk: Through
 def test_a_damaged_state_is_refused(through_disk: ThroughDisk) -> None:
     views = Views(every=1)
     views.add(at(10.0), 0)
-    for name, value in (("images", np.zeros((2, ROWS, COLUMNS), np.float16)), ("every", 0), ("grid", np.zeros(3))):
+    for name, value in (("images", np.zeros((2, ROWS, COLUMNS), np.float16)), ("every", 0), ("grid", np.zeros(2))):
         with pytest.raises(InputError, match="is not what this program saves"):
             Views().restore(through_disk(views.state() | {name: value}))
