@@ -21,10 +21,10 @@ _ROWS, _COLUMNS = 16, 360
 # Elevations of the first scan's points between these quantiles make the rows, so that strays do not stretch them.
 _STRAY_SHARE = 0.002
 _LEAST_HEIGHT = math.radians(1.0)
-# Whether there are beams all over a row is told by fourths of it: most hold points, with as many as a tenth of the mean.
+# Whether there are beams all over a row is told by fourths of it: most hold a tenth of the mean number of points.
 _FOURTHS, _FILLED_OF_MEAN, _MOST = 4, 0.1, 0.6
 _AT_CENTRE, _EVERYWHERE = 0.3, 0.5
-_EVERY = 10
+_EVERY = 5
 _MOST_VIEWS = 512
 # A view says nothing where a pixel is wider than so many voxels, but for what is near all the same.
 _PIXEL_OF_VOXEL = 3.0
@@ -131,6 +131,8 @@ class Views:
 def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) -> NDArray[np.bool_]:
     """Whether what was at the points has moved away: at least three views see through, two for each that does not.
 
+    Where more than 64 have something to say of a point, as many are heard, from the whole time.
+
     Args:
         points: (M, 3) of a map, in the world.
         views: in the same.
@@ -141,8 +143,11 @@ def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) ->
     """
     moved = np.zeros(len(points), dtype=np.bool_)
     reach_m = max(_LEAST_REACH_M, _PIXEL_OF_VOXEL * voxel_size_m * _COLUMNS / TWO_PI)
-    T_lidar_world = np.ascontiguousarray(inverse(views.T_world_lidar))
-    judge(np.ascontiguousarray(points), T_lidar_world, views.images, views.grids, reach_m, voxel_size_m, moved)
+    # Not all views are heard where there are many: those that are should be from the whole time.
+    order = np.random.default_rng(0).permutation(len(views))
+    T_lidar_world = np.ascontiguousarray(inverse(views.T_world_lidar[order]))
+    images, grids = views.images[order], views.grids[order]
+    judge(np.ascontiguousarray(points), T_lidar_world, images, grids, reach_m, voxel_size_m, moved)
     return moved
 
 

@@ -24,6 +24,8 @@ MARGIN_OF_RANGE = 0.01
 # A point is where something was while it passed when so many views see through it, and so many for each that does not.
 LEAST_THROUGH = 3
 THROUGH_PER_SUPPORT = 2
+# So many views that say something are enough to judge a point by, where hundreds would.
+ENOUGH = 64
 
 _SILENT, _SUPPORTS, _THROUGH = 0, 1, 2
 
@@ -61,39 +63,49 @@ def judge(
     Args:
         points: in the world.
         T_lidar_world: (V, 4, 4) of the views.
-        images, grids: (V, rows, columns) and (V, 3), the views.
+        images, grids: (V, rows, columns) and (V, 3), the views, in an order that has nothing to do with time.
         reach_m: a view says nothing of points farther than this.
         voxel_size_m: of the map that the points are of.
         moved: (M,).
     """
     views = len(images)
     for m in range(len(points)):
+        a, b, c = points[m, 0], points[m, 1], points[m, 2]
         through, support = 0, 0
         for v in range(views):
-            says = _testimony(points[m], T_lidar_world[v], images[v], grids[v], reach_m, voxel_size_m)
+            says = _testimony(a, b, c, v, T_lidar_world, images, grids, reach_m, voxel_size_m)
             if says == _THROUGH:
                 through += 1
             elif says == _SUPPORTS:
                 support += 1
             # Most points are where they were: no need to hear all views once these cannot turn the balance.
-            if through + views - 1 - v < max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support):
+            outvoted = through + views - 1 - v < max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support)
+            if outvoted or through + support >= ENOUGH:
                 break
         moved[m] = through >= max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support)
 
 
 @compiled
 def _testimony(
-    point: FloatArray, T: FloatArray, image: Ranges, grid: FloatArray, reach_m: float, voxel_size_m: float
+    a: float,
+    b: float,
+    c: float,
+    v: int,
+    T: FloatArray,
+    images: Ranges,
+    grids: FloatArray,
+    reach_m: float,
+    voxel_size_m: float,
 ) -> int:
-    """What one view says of one point."""
-    rows, columns = image.shape
-    x = T[0, 0] * point[0] + T[0, 1] * point[1] + T[0, 2] * point[2] + T[0, 3]
-    y = T[1, 0] * point[0] + T[1, 1] * point[1] + T[1, 2] * point[2] + T[1, 3]
-    z = T[2, 0] * point[0] + T[2, 1] * point[1] + T[2, 2] * point[2] + T[2, 3]
+    """What view v says of the point (a, b, c); whole arrays, because to take a part of one costs more than all else."""
+    _, rows, columns = images.shape
+    x = T[v, 0, 0] * a + T[v, 0, 1] * b + T[v, 0, 2] * c + T[v, 0, 3]
+    y = T[v, 1, 0] * a + T[v, 1, 1] * b + T[v, 1, 2] * c + T[v, 1, 3]
+    z = T[v, 2, 0] * a + T[v, 2, 1] * b + T[v, 2, 2] * c + T[v, 2, 3]
     squared = x * x + y * y + z * z
     if not (squared <= reach_m * reach_m):
         return _SILENT
-    height = (math.atan2(z, math.hypot(x, y)) - grid[0]) * grid[1]
+    height = (math.atan2(z, math.hypot(x, y)) - grids[v, 0]) * grids[v, 1]
     row = math.floor(height + 0.5)
     if row < 0 or row >= rows:
         return _SILENT
@@ -103,7 +115,7 @@ def _testimony(
     returns, is_hidden = 0, False
     for i in range(max(row - 1, 0), min(row + 2, rows)):
         for j in range(column - 1, column + 2):
-            seen = image[i, j % columns]
+            seen = images[v, i, j % columns]
             if seen == 0.0:
                 continue
             returns += 1
@@ -112,7 +124,7 @@ def _testimony(
             if seen < distance:
                 is_hidden = True
     # Between lasers that are far apart a board lies unseen: only where one passes does it prove anything.
-    is_looked_at = image[row, column] > 0.0 and abs(height - row) <= grid[2]
+    is_looked_at = images[v, row, column] > 0.0 and abs(height - row) <= grids[v, 2]
     return _THROUGH if is_looked_at and returns >= LEAST_RETURNS and not is_hidden else _SILENT
 
 

@@ -34,7 +34,7 @@ def truth() -> Trajectory:
 def person(number: int) -> FloatArray:
     """The corners of somebody who walks along y during the first scans."""
     at = np.array([2.5, -2.0 + 0.2 * number, 0.0])
-    return at + [[-0.2, -0.25, -1.0], [0.2, 0.25, 0.7]]
+    return at + np.array([[-0.2, -0.25, -1.0], [0.2, 0.25, 0.7]])
 
 
 def sweep(T_world_lidar: FloatArray, number: int, rng: np.random.Generator) -> FloatArray:
@@ -93,7 +93,7 @@ def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
     run(source, tmp_path / "with", "--set", "global_map.leave_out_moved=false")
     all_points, points = written(tmp_path / "with"), written(tmp_path / "without")
     assert len(of_person(all_points)) > 300
-    assert len(of_person(points)) < 0.1 * len(of_person(all_points))
+    assert len(of_person(points)) < 0.2 * len(of_person(all_points))
     stands = len(all_points) - len(of_person(all_points))
     assert stands - (len(points) - len(of_person(points))) < 0.02 * stands
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("without", "with")]
@@ -114,7 +114,7 @@ def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
     results = list(pipeline.run(given))
     poses = np.array([result.T_world_lidar for result in results])
     numbers = pipeline.views.state()["numbers"]
-    assert numbers[:2].tolist() == [0, 10]
+    assert numbers[:2].tolist() == [0, 5]
     assert not set(numbers) & set(range(20, 25))
     placed = pipeline.views.placed(poses)
     np.testing.assert_array_equal(placed.T_world_lidar, poses[numbers])

@@ -183,7 +183,9 @@ def test_the_verdict_is_that_of_all_views(seed: int, count: int) -> None:
     points = rng.normal(size=(200, 3)) * [4.0, 4.0, 0.5]
     expected = np.zeros(200, dtype=bool)
     for number, point in enumerate(points):
-        says = [_says(transform_points(inverse(T), point[None])[0], image) for T, image in zip(poses, smooth, strict=True)]
+        says = [
+            _says(transform_points(inverse(T), point[None])[0], image) for T, image in zip(poses, smooth, strict=True)
+        ]
         expected[number] = says.count(1) >= max(3, 2 * says.count(-1))
     np.testing.assert_array_equal(seen_through(points, placed(smooth, poses), VOXEL_M), expected)
 
@@ -212,14 +214,14 @@ def test_a_view_keeps_the_nearest_of_each_pixel() -> None:
     assert np.count_nonzero(image) == 2 * COLUMNS + 1
 
 
-def test_views_are_of_every_tenth_scan_and_where_these_are_in_the_end() -> None:
-    views, poses = Views(), exp(np.arange(60.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-    for number in range(1, 60, 2):  # every second scan belongs in the map
+def test_views_are_of_every_fifth_scan_and_where_these_are_in_the_end() -> None:
+    views, poses = Views(), exp(np.arange(30.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    for number in range(1, 30, 2):  # every second scan belongs in the map
         views.add(at(10.0), number)
-    views.add(np.empty((0, 3)), 60)
-    np.testing.assert_array_equal(views.placed(poses).T_world_lidar[:, 0, 3], [1.0, 21.0, 41.0])
+    views.add(np.empty((0, 3)), 30)
+    np.testing.assert_array_equal(views.placed(poses).T_world_lidar[:, 0, 3], [1.0, 11.0, 21.0])
     # A run that was stopped may know poses of fewer scans than were drawn.
-    np.testing.assert_array_equal(views.placed(poses[:41]).T_world_lidar[:, 0, 3], [1.0, 21.0])
+    np.testing.assert_array_equal(views.placed(poses[:21]).T_world_lidar[:, 0, 3], [1.0, 11.0])
 
 
 def test_views_are_bounded_however_long_the_way() -> None:
@@ -230,6 +232,16 @@ def test_views_are_bounded_however_long_the_way() -> None:
     poses = exp(np.arange(2100.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
     np.testing.assert_allclose(views.placed(poses).T_world_lidar[:, 0, 3], np.arange(0.0, 2100.0, 8.0))
     assert views.state()["images"].nbytes < 6e6
+
+
+def test_of_many_views_those_that_are_heard_are_from_the_whole_time() -> None:
+    """Somebody stood there for a quarter of the time, at its beginning, in its midst or at its end; or for a half."""
+    for begin in (0, 120, 240):
+        images = [wall(10.0)] * 320
+        images[begin : begin + 80] = [wall(5.1)] * 80
+        assert seen_through(at(10.0), placed(images), VOXEL_M).all()
+        images[:160] = [wall(5.1)] * 160
+        assert not seen_through(at(10.0), placed(images), VOXEL_M).any()
 
 
 def test_views_of_several_recordings_are_joined(rng: np.random.Generator) -> None:
