@@ -13,7 +13,8 @@ that errors are those of the poses as they come, without any alignment:
 - worst, after: the largest error of the scans from ten after the end of the fault, whatever their status;
 - shape, after: RMS error of the same scans, after SE(3) alignment of them alone;
 - polluted: share of the points of the map farther than 0.2 m from every true surface, when the map is laid on the truth
-  by the true pose of the first scan.
+  by the true pose of the first scan. The map is without what was seen through, as `lidarslam run` writes it, unless
+  `--keep-moved` asks for all.
 """
 
 import argparse
@@ -46,7 +47,8 @@ from lidarslam.simulation.mounts import mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
-from mapping.config import MappingConfig
+from mapping.config import GlobalMapConfig, MappingConfig
+from mapping.visibility import seen_through
 from odometry.config import OdometryConfig
 from odometry.registry import make_odometry
 
@@ -164,12 +166,17 @@ def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:
         results = list(pipeline.run(case.recorded.scans))
     finally:
         odometry.close()
-    return results, np.empty((0, 3)) if pipeline.global_map is None else pipeline.global_map.points()
+    if pipeline.global_map is None:
+        return results, np.empty((0, 3))
+    points = pipeline.global_map.points()
+    views = pipeline.views.placed(np.array([result.T_world_lidar for result in results]))
+    return results, points[~seen_through(points, views, pipeline.global_map.voxel_size_m)]
 
 
-def row(case: Case, name: str, wrong_m: float, verbose: bool) -> list[str]:
+def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) -> list[str]:
     """The cells of one method on one recording."""
-    results, points = run(case, _METHODS[name])
+    kept = GlobalMapConfig(leave_out_moved=not keep_moved)
+    results, points = run(case, _METHODS[name].model_copy(update={"global_map": kept}))
     recorded, truth = case.recorded, case.recorded.truth.T_world_lidar
     poses = np.array([result.T_world_lidar for result in results])
     true = inverse(truth[0]) @ truth
@@ -234,6 +241,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=list(_METHODS), default=list(_METHODS))
     parser.add_argument("--wrong-m", type=float, default=0.2)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep-moved", action="store_true", help="what was seen through stays in the map")
     parser.add_argument("--verbose", action="store_true", help="every scan that is not ok")
     arguments = parser.parse_args()
     header = ["fault", "place", "method", "concerned", "elsewhere", "believed and wrong", "worst, after"]
@@ -242,7 +250,7 @@ def main() -> None:
     print_row(["---"] * len(header))
     for case in cases(arguments):
         for method in arguments.methods:
-            print_row(row(case, method, arguments.wrong_m, arguments.verbose))
+            print_row(row(case, method, arguments.wrong_m, arguments.keep_moved, arguments.verbose))
 
 
 if __name__ == "__main__":

@@ -30,9 +30,10 @@ from lidarslam.run import (
 )
 from lidarslam.run_directory import RunDirectory, remove_run
 from lidarslam.scan_log import ScanLog
-from lidarslam.summary import GraphSummary, MergedRecording, MergeSummary, peak_rss_mb
+from lidarslam.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
 from lidarslam.viewer import NullViewer
 from mapping.g2o import format_g2o
+from mapping.visibility import PlacedViews
 
 if TYPE_CHECKING:
     from mapping.slam_graph import SlamGraph
@@ -249,18 +250,18 @@ def _write(
     ]
     runs += [None] * (len(parts) - len(runs))
     common = None if finished is None else finished.common()
-    map_points = 0
+    written = WrittenMap(0, way.voxel_size_m, 0)
     if common is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(common.graph))
-        map_points = write_map(directory, common.global_map, request.config.global_map, request.pcd)
+        views = _all_views(way, scans, joined, common)
+        written = write_map(directory, common.global_map, views, request.config.global_map, request.pcd)
     recordings = [_entry(part, run, index in joined) for index, (part, run) in enumerate(zip(parts, runs, strict=True))]
     summary = MergeSummary(
         recordings=tuple(recordings),
         elapsed_s=time.perf_counter() - started,
         peak_rss_mb=peak_rss_mb(),
         graph=None if common is None else GraphSummary.of(common),
-        map_points=map_points,
-        map_voxel_size_m=way.voxel_size_m,
+        map=written,
         warnings=_warnings(recordings, runs, way.missing),
     )
     sources = [str(source.resolve()) for source in request.sources]
@@ -273,6 +274,17 @@ def _write(
         if run is not None and run.stopped is not None
     ]
     return MergeOutcome(summary, tuple(runs), (*stopped, *way.missing))
+
+
+def _all_views(way: _Way, scans: Sequence[int], joined: Sequence[int], common: GraphOutcome) -> PlacedViews:
+    """The views of all recordings of the common map: one sees through what another saw there."""
+    parts, begin = [], 0
+    for recording in joined:
+        tracked, end = way.tracked[recording], begin + scans[recording]
+        if tracked is not None:
+            parts.append(tracked.views.placed(common.T_world_lidar[begin:end]))
+        begin = end
+    return PlacedViews.join(parts)
 
 
 def _write_run(

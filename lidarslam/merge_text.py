@@ -19,7 +19,7 @@ def _lines(out: Path, outcome: MergeOutcome) -> Iterator[str]:
     for recording, run in zip(summary.recordings, outcome.runs, strict=True):
         yield _recording(recording, run)
     yield _joined(summary)
-    yield format_map(summary.map_points, summary.map_voxel_size_m)
+    yield format_map(summary.map)
     for warning in summary.warnings:
         yield f"warning: {warning}"
     if summary.lost_scans:

@@ -25,6 +25,7 @@ from lidarslam.localisation import Estimated, Localised, Localiser, SweepMotion
 from mapping.config import GlobalMapConfig
 from mapping.global_map import GlobalMap, voxel_size_for
 from mapping.graph_scan import GraphScan
+from mapping.visibility import Views
 from odometry.interface import Odometry
 
 # How many scans the second thread may lag behind: the map now and then takes as long as several scans to tidy up.
@@ -89,6 +90,7 @@ class _Timed:
 class _Compensated:
     """A scan that waits to be added to the map until the motion it was compensated with is checked."""
 
+    number: int
     thinned: Scan
     motion: SweepMotion
     points: FloatArray
@@ -101,7 +103,8 @@ class _Compensated:
     @classmethod
     def restored(cls, saved: Saved) -> "_Compensated":
         thinned, motion = Scan.restored(saved.part("thinned")), SweepMotion.restored(saved.part("motion"))
-        return cls(thinned, motion, saved.array("points", (len(thinned), 3)), saved.array("T_world_lidar", (4, 4)))
+        points, T_world_lidar = saved.array("points", (len(thinned), 3)), saved.array("T_world_lidar", (4, 4))
+        return cls(saved.integer("number"), thinned, motion, points, T_world_lidar)
 
 
 class Follower(Protocol):
@@ -151,7 +154,9 @@ class Pipeline:
         self._keeper = keeper
         self._held: _Timed | None = None  # whose successor is not known yet
         self._measured_stamp: float | None = None  # of the last scan, unless its motion was only predicted
+        self._followed = 0  # scans that are done but for the map
         self.global_map: GlobalMap | None = None
+        self.views = Views()  # none where the configuration does not ask for them
 
     @property
     def held(self) -> Scan | None:
@@ -170,7 +175,9 @@ class Pipeline:
             "waiting": None if self._waiting is None else self._waiting.state(),
             "held": None if self._held is None else self._held.state(),
             "measured_stamp": self._measured_stamp,
+            "followed": self._followed,
             "global_map": None if self.global_map is None else self.global_map.state(),
+            "views": self.views.state(),
         }
 
     def restore(self, saved: Saved) -> None:
@@ -180,7 +187,9 @@ class Pipeline:
         self._waiting = saved.optional("waiting", _Compensated.restored)
         self._held = saved.optional("held", _Timed.restored)
         self._measured_stamp = saved.optional_number("measured_stamp")
+        self._followed = saved.integer("followed")
         self.global_map = saved.optional("global_map", GlobalMap.restored)
+        self.views.restore(saved.part("views"))
 
     def run(self, scans: Iterable[Scan]) -> Generator[ScanResult, None, None]:
         """Process the scans in order; each result comes while later scans' odometry is at work.
@@ -262,7 +271,8 @@ class Pipeline:
         compensated = time.perf_counter()
         self._add_waiting(localised.status)
         if localised.belongs_in_map:  # a pose that is not believed must not draw walls
-            self._waiting = _Compensated(thinned, localised.motion, points, localised.T_world_lidar)
+            self._waiting = _Compensated(self._followed, thinned, localised.motion, points, localised.T_world_lidar)
+        self._followed += 1
         if self._graph is not None:
             self._graph.add(_graph_scan(timed.estimated, localised, points))
         followed_ms = {"deskew": _ms(found, compensated), "map": _ms(compensated, time.perf_counter())}
@@ -289,6 +299,8 @@ class Pipeline:
         if self.global_map is None:
             self.global_map = GlobalMap(self._voxel_size_m)
         self.global_map.add(points, scan.T_world_lidar)
+        if self._config.leave_out_moved:
+            self.views.add(points, scan.number)
         if self._graph is not None:
             self._graph.draw(points, scan.T_world_lidar, self._voxel_size_m)
 

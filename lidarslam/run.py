@@ -32,7 +32,7 @@ from lidarslam.prefetch import prefetch
 from lidarslam.resuming import describe_computed, lost_before, scans_left
 from lidarslam.run_directory import RunDirectory
 from lidarslam.scan_log import ScanLog
-from lidarslam.summary import RunSummary, summarise
+from lidarslam.summary import RunSummary, WrittenMap, summarise
 from lidarslam.unfinished import Unfinished
 from lidarslam.viewer import NullViewer, Viewer
 from mapping.config import GlobalMapConfig
@@ -40,6 +40,7 @@ from mapping.g2o import format_g2o
 from mapping.global_map import GlobalMap
 from mapping.map_io import write_cloud
 from mapping.mapper import Mapper
+from mapping.visibility import PlacedViews, Views, seen_through
 from odometry.consistency import ConsistencyCheck
 from odometry.interface import Odometry
 from odometry.registry import make_odometry
@@ -182,6 +183,7 @@ class Tracked:
         faults: what was left out of them, and what is wrong with them.
         total_ms: wall time of each scan.
         global_map: of the poses as they were found; None when no scan could be believed.
+        views: of some of its scans, for what moved.
         error: what ended it before its last scan, None when nothing did.
     """
 
@@ -192,6 +194,7 @@ class Tracked:
     faults: Faults
     total_ms: list[float]
     global_map: GlobalMap | None
+    views: Views
     error: InputError | KeyboardInterrupt | None
 
     @property
@@ -249,7 +252,9 @@ def track(
     if not log.points_read:
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", isinstance(error, KeyboardInterrupt))
-    return Tracked(recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, error)
+    return Tracked(
+        recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, pipeline.views, error
+    )
 
 
 def _why_none(log: ScanLog, faults: Faults, error: InputError | KeyboardInterrupt | None) -> Iterator[str]:
@@ -308,11 +313,11 @@ def write_results(
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
     metrics = _write_trajectories(directory, _camera(tracked.recording, log), tracked.truth, log)
-    map_points = write_map(directory, global_map, config.global_map, request.pcd)
-    voxel_size_m = None if global_map is None else global_map.voxel_size_m
+    views = tracked.views.placed(log.trajectory.T_world_lidar)
+    written = write_map(directory, global_map, views, config.global_map, request.pcd)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
-    summary = summarise(log, tracked.total_ms, map_points, voxel_size_m, skipped, closed)
+    summary = summarise(log, tracked.total_ms, written, skipped, closed)
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, tracked.stopped)
 
@@ -490,14 +495,18 @@ def _write_trajectories(
     return metrics
 
 
-def write_map(directory: RunDirectory, global_map: GlobalMap | None, config: GlobalMapConfig, pcd: bool) -> int:
-    """Write the map, unless it is empty; how many points it has."""
+def write_map(
+    directory: RunDirectory, global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig, pcd: bool
+) -> WrittenMap:
+    """Write the map without what the views see through, unless it is empty."""
     if global_map is None:
-        return 0
-    cloud = global_map.cloud(config.normal_neighbours, config.min_hits)
+        return WrittenMap(0, None, 0)
+    moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
+    cloud = global_map.cloud(config.normal_neighbours, config.min_hits, moved)
+    written = WrittenMap(len(cloud), global_map.voxel_size_m, int(moved.sum()))
     if not len(cloud):
-        return 0
+        return written
     for name in (files.MAP_PLY, files.MAP_PCD) if pcd else (files.MAP_PLY,):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
-    return len(cloud)
+    return written

@@ -89,6 +89,18 @@ class GraphSummary:
 
 
 @dataclass(frozen=True)
+class WrittenMap:
+    """A map as it was written: its points and the size of its voxels, None without a map; and what was left out.
+
+    `moved` counts the points where something was that had moved away.
+    """
+
+    points: int
+    voxel_size_m: float | None
+    moved: int
+
+
+@dataclass(frozen=True)
 class RunSummary:
     """What summary.json holds; the contract names the keys.
 
@@ -106,8 +118,7 @@ class RunSummary:
     lost: tuple[LostStretch, ...]
     degraded_scans: int
     graph: GraphSummary | None
-    map_points: int
-    map_voxel_size_m: float | None
+    map: WrittenMap
     warnings: tuple[str, ...]
 
     @property
@@ -166,8 +177,7 @@ class MergeSummary:
     elapsed_s: float
     peak_rss_mb: float
     graph: GraphSummary | None
-    map_points: int
-    map_voxel_size_m: float | None
+    map: WrittenMap
     warnings: tuple[str, ...]
 
     @property
@@ -196,8 +206,9 @@ def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
     return {
         "loop_closures": summary.loop_closures,
         "pose_graph": None if summary.graph is None else summary.graph.to_json(),
-        "map_points": summary.map_points,
-        "map_voxel_size_m": summary.map_voxel_size_m,
+        "map_points": summary.map.points,
+        "map_voxel_size_m": summary.map.voxel_size_m,
+        "map_points_moved": summary.map.moved,
         "warnings": list(summary.warnings),
     }
 
@@ -205,8 +216,7 @@ def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
 def summarise(
     log: ScanLog,
     total_ms: list[float],
-    map_points: int,
-    map_voxel_size_m: float | None,
+    written: WrittenMap,
     skipped: int,
     closed: GraphOutcome | None = None,
 ) -> RunSummary:
@@ -215,7 +225,7 @@ def summarise(
     Args:
         log: its scans.
         total_ms: wall time of each scan, from the one before finished to this one finished.
-        map_points, map_voxel_size_m: of the written map.
+        written: the map.
         skipped: scans that were asked for and did not come, for no reason that the log warns of.
         closed: what its pose graph did to it, if it had one.
     """
@@ -233,8 +243,7 @@ def summarise(
         lost=_lost_stretches(log),
         degraded_scans=log.statuses.count(Status.DEGRADED),
         graph=None if closed is None else GraphSummary.of(closed),
-        map_points=map_points,
-        map_voxel_size_m=map_voxel_size_m,
+        map=written,
         warnings=_warnings(log, skipped),
     )
 

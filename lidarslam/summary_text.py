@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidarslam.run import RunOutcome
 from lidarslam.run_directory import SCANS_CSV, SUMMARY
-from lidarslam.summary import GraphSummary, RunSummary
+from lidarslam.summary import GraphSummary, RunSummary, WrittenMap
 
 # Stretches of lost scans that are spelt out; summary.json has them all.
 _STRETCHES = 3
@@ -22,7 +22,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
     total = summary.ms_per_scan["total"]
     yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
-    yield format_map(summary.map_points, summary.map_voxel_size_m)
+    yield format_map(summary.map)
     if summary.graph is not None:
         yield _loops(summary.graph)
     if outcome.metrics is not None:
@@ -33,11 +33,13 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     yield f"written to {out}"
 
 
-def format_map(points: int, voxel_size_m: float | None) -> str:
-    """A line about a map; the voxels have no size where there is none."""
-    if voxel_size_m is None:
+def format_map(written: WrittenMap) -> str:
+    """A line about a map."""
+    if written.voxel_size_m is None:
         return "no map: no scan could be believed"
-    return f"map of {_count(points, 'point')}, one in every voxel of {100.0 * voxel_size_m:.0f} cm"
+    moved = f"; {_count(written.moved, 'point')} of what moved left out" if written.moved else ""
+    voxel_cm = 100.0 * written.voxel_size_m
+    return f"map of {_count(written.points, 'point')}, one in every voxel of {voxel_cm:.0f} cm{moved}"
 
 
 def _loops(graph: GraphSummary) -> str:

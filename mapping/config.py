@@ -18,6 +18,9 @@ class GlobalMapConfig(BaseModel):
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
     max_range_m: float = Field(80.0, gt=0.0, description="farther points, sparse and noisy, are left out")
     min_hits: int = Field(1, ge=1, description="scans' points a voxel needs before it is written")
+    leave_out_moved: bool = Field(
+        True, description="leave out what other scans saw through where it was: people and vehicles that passed"
+    )
     normal_neighbours: int = Field(20, ge=3, description="points that a normal is estimated from")
 
     @model_validator(mode="after")

@@ -169,9 +169,17 @@ class GlobalMap:
         chosen = self._well_seen(min_hits)
         return self._means(chosen)
 
-    def cloud(self, neighbours: int = 20, min_hits: int = 1) -> PointCloud:
-        """The map with normals, estimated from the nearest points and turned towards the sensor."""
+    def cloud(self, neighbours: int = 20, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> PointCloud:
+        """The map with normals, estimated from the nearest points and turned towards the sensor.
+
+        Args:
+            neighbours: points that a normal is estimated from.
+            min_hits: as in `points`.
+            left_out: (M,) which of `points` are not to be there.
+        """
         chosen = self._well_seen(min_hits)
+        if left_out is not None:
+            chosen = _Voxels(chosen.keys[~left_out], chosen.sums[~left_out])
         points = self._means(chosen)
         normals = estimate_normals(points, neighbours)
         seen_from = np.einsum("ij,ij->i", normals, chosen.sums[:, _VIEW])

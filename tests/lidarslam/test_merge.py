@@ -116,7 +116,7 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(
 ) -> None:
     out, outcome = merged
     common = load_map(out).points
-    assert len(common) == outcome.summary.map_points > 0
+    assert len(common) == outcome.summary.map.points > 0
     first, foreign, second = (load_map(out / name).points for name in ("01_first", "02_foreign", "03_second"))
     ours = cKDTree(np.concatenate([first, second]))
     assert ours.query(common)[0].max() < 0.2

@@ -4,11 +4,11 @@ from pathlib import Path
 
 from lidarslam.loop_closing import LoopReport
 from lidarslam.run import RunOutcome
-from lidarslam.summary import GraphSummary, LostStretch, Milliseconds, RunSummary
+from lidarslam.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.summary_text import format_outcome
 
 
-def summary_of(graph: GraphSummary | None = None) -> RunSummary:
+def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
     return RunSummary(
         scans=1,
         length_m=0.0,
@@ -20,8 +20,7 @@ def summary_of(graph: GraphSummary | None = None) -> RunSummary:
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),
         degraded_scans=0,
         graph=graph,
-        map_points=1,
-        map_voxel_size_m=0.1,
+        map=WrittenMap(1, 0.1, moved),
         warnings=(),
     )
 
@@ -30,6 +29,17 @@ def test_one_of_a_thing_is_singular() -> None:
     text = format_outcome(Path("out"), RunOutcome(summary_of(), None))
     for words in ("1 scan, 0.0 m", "map of 1 point, one", "LOST on 1 more stretch\n", "lost on 4 of 1 scan;"):
         assert words in text
+
+
+def test_what_moved_is_counted() -> None:
+    for moved, words in (
+        (0, "one in every voxel of 10 cm\n"),
+        (1, "voxel of 10 cm; 1 point of what moved left out\n"),
+        (2345, "voxel of 10 cm; 2,345 points of what moved left out\n"),
+    ):
+        summary = summary_of(moved=moved)
+        assert words in format_outcome(Path("out"), RunOutcome(summary, None))
+        assert summary.to_json()["map_points_moved"] == moved
 
 
 def test_loops_are_counted_and_their_effect_is_said() -> None:

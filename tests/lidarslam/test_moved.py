@@ -1,0 +1,125 @@
+"""Who passes a sensor is not in the map that a run leaves behind, and what stands is."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from click.testing import CliRunner
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.localisation import OdometryAlone
+from lidarslam.pipeline import Pipeline
+from mapping.config import GlobalMapConfig
+from odometry.config import ConsistencyConfig
+from odometry.consistency import ConsistencyCheck
+from odometry.external import ExternalOdometry
+
+SCANS = 60
+PASSES_UNTIL = 15
+ROOM = np.array([[-5.0, -4.0, -1.2], [5.0, 4.0, 1.5]])
+
+
+def truth() -> Trajectory:
+    """A slow way through the room, as seen from its first scan."""
+    phase = np.linspace(0.0, 1.0, SCANS)[:, None]
+    return Trajectory(0.1 * np.arange(1, SCANS + 1), exp(phase * [0.0, 0.0, 0.4, 1.0, 0.3, 0.0]))
+
+
+def person(number: int) -> FloatArray:
+    """The corners of somebody who walks along y during the first scans."""
+    at = np.array([2.5, -2.0 + 0.2 * number, 0.0])
+    return at + np.array([[-0.2, -0.25, -1.0], [0.2, 0.25, 0.7]])
+
+
+def sweep(T_world_lidar: FloatArray, number: int, rng: np.random.Generator) -> FloatArray:
+    """Points (N, 3) of walls, floor and ceiling, and of who stands before them."""
+    elevations, azimuths = np.deg2rad(np.meshgrid(np.linspace(-15.0, 15.0, 16), np.arange(0.0, 360.0, 0.6)))
+    level = np.cos(elevations)
+    rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), np.sin(elevations)], axis=-1).reshape(-1, 3)
+    directions, origin = rays @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
+    with np.errstate(divide="ignore"):
+        ranges = ((ROOM[:, None] - origin) / directions).max(axis=0).min(axis=1)
+        if number < PASSES_UNTIL:
+            sides = (person(number)[:, None] - origin) / directions
+            enter, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+            ranges = np.where((enter > 0.0) & (enter < leave), enter, ranges)
+    return rays * (ranges + 0.01 * rng.normal(size=len(rays)))[:, None]
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[FloatArray]:
+    rng = np.random.default_rng(0)
+    return [sweep(pose, number, rng) for number, pose in enumerate(truth().T_world_lidar)]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory, scans: list[FloatArray]) -> Path:
+    """A folder of them, and their trajectory beside it."""
+    folder = tmp_path_factory.mktemp("data") / "room"
+    folder.mkdir()
+    for number, points in enumerate(scans):
+        np.save(folder / f"{number:06d}.npy", points)
+    np.savetxt(folder / "timestamps.txt", truth().stamps, fmt="%.9f")
+    write_tum(folder.parent / "truth.tum", truth())
+    return folder
+
+
+def run(source: Path, out: Path, *arguments: str) -> str:
+    given = ["run", str(source), "--out", str(out), "--no-mapping", "--set", "odometry.method=external"]
+    given += ["--prior", str(source.parent / "truth.tum"), "--set", "global_map.voxel_size_m=0.1", *arguments]
+    ended = CliRunner().invoke(main, given)
+    assert ended.exit_code == 0, ended.output
+    return ended.output
+
+
+def written(out: Path) -> FloatArray:
+    return np.asarray(o3d.io.read_point_cloud(str(out / "map.ply")).points)
+
+
+def of_person(points: FloatArray) -> FloatArray:
+    """Those farther than 40 cm from all that stands."""
+    inside = np.minimum(points - ROOM[0], ROOM[1] - points).min(axis=1)
+    return points[inside > 0.4]
+
+
+def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
+    said = run(source, tmp_path / "without")
+    run(source, tmp_path / "with", "--set", "global_map.leave_out_moved=false")
+    all_points, points = written(tmp_path / "with"), written(tmp_path / "without")
+    assert len(of_person(all_points)) > 300
+    assert len(of_person(points)) < 0.2 * len(of_person(all_points))
+    stands = len(all_points) - len(of_person(all_points))
+    assert stands - (len(points) - len(of_person(points))) < 0.02 * stands
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("without", "with")]
+    left_out = len(all_points) - len(points)
+    assert [summary["map_points_moved"] for summary in summaries] == [left_out, 0]
+    assert [summary["map_points"] for summary in summaries] == [len(points), len(all_points)]
+    assert f"one in every voxel of 10 cm; {left_out:,} points of what moved left out" in said
+
+
+def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
+    """Also after a scan that shows nothing, and with a state restored in between."""
+    T_world_lidar, stamps = truth().T_world_lidar, truth().stamps
+    given = [Scan(points, float(stamp)) for points, stamp in zip(scans, stamps, strict=True)]
+    for number in range(20, 25):
+        given[number] = given[number].select(np.arange(0))
+    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    pipeline = Pipeline(ExternalOdometry(truth()), localiser, GlobalMapConfig(voxel_size_m=0.1))
+    results = list(pipeline.run(given))
+    poses = np.array([result.T_world_lidar for result in results])
+    numbers = pipeline.views.state()["numbers"]
+    assert numbers[:2].tolist() == [0, 5]
+    assert not set(numbers) & set(range(20, 25))
+    placed = pipeline.views.placed(poses)
+    np.testing.assert_array_equal(placed.T_world_lidar, poses[numbers])
+    # The image is that of the scan with this number: nearest ranges, a fraction of a voxel apart.
+    last = int(numbers[-1])
+    nearest = np.linalg.norm(results[last].points, axis=1).min()
+    assert placed.images[-1][placed.images[-1] > 0.0].min() == pytest.approx(nearest, rel=1e-3)
+    assert T_world_lidar[last, 0, 3] == pytest.approx(placed.T_world_lidar[-1, 0, 3], abs=1e-6)

@@ -1,0 +1,277 @@
+"""What moved is seen through, and what stands is not: in a room whose every surface is known."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.state import Saved, State
+from mapping.visibility import PlacedViews, Views, seen_through
+
+ThroughDisk = Callable[[State], Saved]
+VOXEL_M = 0.1
+ROWS, COLUMNS = 16, 360
+GRID = np.array([-math.radians(15.0), 15.0 / math.radians(30.0), 0.5])
+
+# Lowest and highest corners.
+PERSON = np.array([[1.0, 1.0, 0.1], [1.5, 1.5, 1.8]])
+FURNITURE = {
+    "table": np.array([[2.0, -2.0, 0.72], [3.6, -1.2, 0.76]]),
+    "pole": np.array([[-1.5, 1.5, 0.0], [-1.44, 1.56, 2.5]]),
+    "door": np.array([[-2.0, -3.0, 0.0], [-1.95, -2.1, 2.1]]),
+}
+ROOM = np.array([[-20.0, -3.0, 0.0], [5.0, 3.0, 2.6]])  # long: its floor is seen at grazing angles
+NAMES = ("room", *FURNITURE, "person")
+
+
+def look(T_world_lidar: FloatArray, with_person: bool, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.intp]]:
+    """A scan of 16 lasers with 2 cm of noise: points (N, 3) in its frame, and which of `NAMES` each is of."""
+    elevations, azimuths = np.deg2rad(np.meshgrid(np.linspace(-15.0, 15.0, 16), np.arange(0.0, 360.0, 0.5)))
+    level = np.cos(elevations)
+    rays = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), np.sin(elevations)], axis=-1).reshape(-1, 3)
+    directions, origin = rays @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
+    boxes = [*FURNITURE.values(), *([PERSON] if with_person else [])]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = ((ROOM[:, None] - origin) / directions).max(axis=0)
+        ranges = [np.where(np.isnan(ends), np.inf, ends).min(axis=1)]
+        for box in boxes:
+            sides = (box[:, None] - origin) / directions
+            enter, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+            ranges.append(np.where((enter > 0.0) & (enter < leave), enter, np.inf))
+    of = np.argmin(ranges, axis=0)
+    nearest = np.min(ranges, axis=0) + 0.02 * rng.normal(size=len(rays))
+    return rays * nearest[:, None], of
+
+
+def walk(count: int) -> FloatArray:
+    """Poses (count, 4, 4) of a sensor that goes through the room and turns."""
+    phase = np.linspace(0.0, 1.0, count)
+    ways = np.zeros((count, 6))
+    ways[:, 2], ways[:, 3], ways[:, 4], ways[:, 5] = 1.5 * phase, -6.0 + 5.5 * phase, -0.5 + phase, 1.1
+    turned = exp(np.concatenate([ways[:, :3], np.zeros((count, 3))], axis=1))
+    turned[:, :3, 3] = ways[:, 3:]
+    return turned
+
+
+def removed(rng: np.random.Generator, person_until: int, count: int = 30, noise_m: float = 0.01) -> dict[str, float]:
+    """The share of each thing's points that is left out, the person there in the first scans only."""
+    poses, views = walk(count), Views(every=1)
+    points, of = [], []
+    for number, pose in enumerate(poses):
+        seen, things = look(pose, number < person_until, rng)
+        views.add(seen, number)
+        points.append(transform_points(pose, seen))
+        of.append(things)
+    found = poses @ exp(noise_m * rng.normal(size=(count, 6)) * np.repeat([0.1, 1.0], 3))
+    moved = seen_through(np.concatenate(points), views.placed(found), VOXEL_M)
+    return {name: float(moved[np.concatenate(of) == number].mean()) for number, name in enumerate(NAMES)}
+
+
+def test_who_was_there_for_a_while_is_left_out_and_what_stands_is_kept(rng: np.random.Generator) -> None:
+    shares = removed(rng, person_until=4)
+    assert shares.pop("person") > 0.8
+    assert shares.pop("room") < 0.001
+    assert max(shares.values()) < 0.02, shares
+
+
+def test_who_stays_is_kept(rng: np.random.Generator) -> None:
+    shares = removed(rng, person_until=30)
+    assert max(shares.values()) < 0.02, shares
+
+
+def test_where_half_of_the_views_see_somebody_nothing_is_left_out(rng: np.random.Generator) -> None:
+    assert removed(rng, person_until=15)["person"] < 0.1
+
+
+def wall(range_m: float) -> NDArray[np.float32]:
+    return np.full((ROWS, COLUMNS), range_m, dtype=np.float32)
+
+
+def placed(images: list[NDArray[np.float32]], poses: FloatArray | None = None) -> PlacedViews:
+    count = len(images)
+    return PlacedViews(
+        np.array(images, dtype=np.float32).reshape(-1, ROWS, COLUMNS),
+        np.tile(GRID, (count, 1)),
+        np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses,
+    )
+
+
+def at(azimuth_deg: float, range_m: float = 5.0, elevation_deg: float = 1.0) -> FloatArray:
+    a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
+    return range_m * np.array([[np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]])
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.1, 45.3, 179.9, 180.1, 359.9, -1e-15])
+@pytest.mark.parametrize(
+    ("through", "support", "expected"),
+    [(2, 0, False), (3, 0, True), (3, 1, True), (3, 2, False), (4, 2, True), (5, 3, False)],
+)
+def test_views_are_counted_in_whatever_order(azimuth_deg: float, through: int, support: int, expected: bool) -> None:
+    images = [wall(10.0)] * through + [wall(5.1)] * support
+    for order in (images, images[::-1]):
+        assert seen_through(at(azimuth_deg), placed(order), VOXEL_M).tolist() == [expected]
+
+
+def test_between_lasers_that_are_far_apart_nothing_is_seen() -> None:
+    """A board that lies there is met by one in a few scans only; where rows are full of beams there is no between."""
+    lasers, all_over = Views(every=1), Views(every=1)
+    elevations = {lasers: np.arange(-15.0, 15.1, 2.0), all_over: np.arange(-15.0, 15.1, 0.25)}
+    for number in range(3):
+        for views, found in elevations.items():
+            views.add(np.concatenate([at(a + 0.5, 9.0, e) for a in range(40) for e in found]), number)
+    for views, above_deg, expected in (
+        (lasers, 0.5, True), (lasers, 0.7, False), (lasers, -0.7, False), (all_over, 0.7, True), (all_over, -0.7, True),
+    ):  # fmt: skip
+        seen = views.placed(np.tile(np.eye(4), (3, 1, 1)))
+        assert seen_through(at(10.0, 5.0, 1.0 + above_deg), seen, VOXEL_M).tolist() == [expected]
+
+
+def test_only_what_is_farther_all_around_is_seen_through() -> None:
+    """The pixel of the point is (8, 45): its direction is 1 degree up, the centre of row 8."""
+    point = at(45.3)
+    for row, column, is_beside in ((8, 45, True), (7, 44, True), (9, 46, True), (6, 45, False), (8, 47, False)):
+        nearer, same = wall(10.0), wall(10.0)
+        nearer[row, column], same[row, column] = 3.0, 5.2
+        assert seen_through(point, placed([nearer] * 9), VOXEL_M).tolist() == [not is_beside]
+        assert seen_through(point, placed([same] * 9), VOXEL_M).tolist() == [not is_beside]
+
+
+def test_where_nothing_returns_nothing_is_seen() -> None:
+    """Glass, the sky; and beams that are too few."""
+    point = at(45.3)
+    alone, none_here, few = wall(0.0), wall(10.0), wall(10.0)
+    alone[8, 45], none_here[8, 45], few[7:9, 44:46] = 10.0, 0.0, 0.0
+    few[8, 45] = 10.0  # six of nine
+    for image, expected in ((wall(0.0), False), (alone, False), (none_here, False), (few, True)):
+        assert seen_through(point, placed([image] * 9), VOXEL_M).tolist() == [expected]
+    few[9, 46] = 0.0
+    assert not seen_through(point, placed([few] * 9), VOXEL_M).any()
+
+
+def test_far_away_and_outside_the_rows_nothing_is_seen() -> None:
+    images = [wall(60.0)] * 9
+    reach_m = 3.0 * 0.1 * 360.0 / (2.0 * np.pi)
+    for point, expected in (
+        (at(10.0, reach_m - 0.1), True), (at(10.0, reach_m + 0.1), False),
+        (at(10.0, 5.0, 15.5), True), (at(10.0, 5.0, 16.5), False), (at(10.0, 5.0, -16.5), False),
+    ):  # fmt: skip
+        assert seen_through(point, placed(images), VOXEL_M).tolist() == [expected]
+    assert seen_through(at(10.0, 4.9), placed(images), 0.01).all()  # near, though pixels are wider than voxels
+    assert not seen_through(np.full((1, 3), np.nan), placed(images), VOXEL_M).any()
+
+
+def test_without_views_or_points_nothing_is_seen() -> None:
+    assert seen_through(at(10.0), placed([]), VOXEL_M).tolist() == [False]
+    assert seen_through(np.empty((0, 3)), placed([wall(9.0)]), VOXEL_M).shape == (0,)
+    assert len(Views().placed(np.empty((0, 4, 4)))) == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 12))
+def test_the_verdict_is_that_of_all_views(seed: int, count: int) -> None:
+    """Beside a count of every view's testimony, written down without a thought of speed."""
+    rng = np.random.default_rng(seed)
+    images = [rng.choice([0.0, 3.0, 5.0, 9.0, 9.0, 9.0, 9.0, 9.0], (ROWS, COLUMNS)) for _ in range(count)]
+    smooth = [np.repeat(np.repeat(image[::4, ::4], 4, axis=0), 4, axis=1).astype(np.float32) for image in images]
+    poses = exp(rng.normal(size=(count, 6)) * 0.2)
+    points = rng.normal(size=(200, 3)) * [4.0, 4.0, 0.5]
+    expected = np.zeros(200, dtype=bool)
+    for number, point in enumerate(points):
+        says = [
+            _says(transform_points(inverse(T), point[None])[0], image) for T, image in zip(poses, smooth, strict=True)
+        ]
+        expected[number] = says.count(1) >= max(3, 2 * says.count(-1))
+    np.testing.assert_array_equal(seen_through(points, placed(smooth, poses), VOXEL_M), expected)
+
+
+def _says(point: FloatArray, image: NDArray[np.float32]) -> int:
+    distance = float(np.linalg.norm(point))
+    row = math.floor((math.asin(point[2] / distance) - GRID[0]) * GRID[1] + 0.5)
+    column = math.floor(math.degrees(math.atan2(point[1], point[0])) % 360.0) % 360
+    if distance > 3.0 * VOXEL_M * 180.0 / math.pi or not 0 <= row < ROWS:
+        return 0
+    around = image[max(row - 1, 0) : row + 2].take([column - 1, column, column + 1], axis=1, mode="wrap")
+    seen = around[around > 0.0] - distance
+    margin = 0.1 + 0.01 * distance + VOXEL_M
+    if (np.abs(seen) <= margin).any():
+        return -1
+    return int(image[row, column] > 0.0 and len(seen) >= 6 and bool((seen > 0.0).all()))
+
+
+def test_a_view_keeps_the_nearest_of_each_pixel() -> None:
+    points = np.concatenate([at(a + 0.5, 1.0, e) for a in range(360) for e in (-15.0, 15.0)])
+    views = Views(every=1)
+    views.add(np.concatenate([points, at(45.3, 7.0), at(45.7, 6.0), at(45.4, 8.0), [[0.0, 0.0, 0.0]]]), 0)
+    (image,) = views.placed(np.eye(4)[None]).images
+    assert image[8, 45] == 6.0
+    assert (image[[0, 15]] == 1.0).all()
+    assert np.count_nonzero(image) == 2 * COLUMNS + 1
+
+
+def test_views_are_of_every_fifth_scan_and_where_these_are_in_the_end() -> None:
+    views, poses = Views(), exp(np.arange(30.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    for number in range(1, 30, 2):  # every second scan belongs in the map
+        views.add(at(10.0), number)
+    views.add(np.empty((0, 3)), 30)
+    np.testing.assert_array_equal(views.placed(poses).T_world_lidar[:, 0, 3], [1.0, 11.0, 21.0])
+    # A run that was stopped may know poses of fewer scans than were drawn.
+    np.testing.assert_array_equal(views.placed(poses[:21]).T_world_lidar[:, 0, 3], [1.0, 11.0])
+
+
+def test_views_are_bounded_however_long_the_way() -> None:
+    views = Views(every=1)
+    for number in range(2100):
+        views.add(at(10.0), number)
+        assert len(views) <= 512
+    poses = exp(np.arange(2100.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(views.placed(poses).T_world_lidar[:, 0, 3], np.arange(0.0, 2100.0, 8.0))
+    assert views.state()["images"].nbytes < 6e6
+
+
+def test_of_many_views_those_that_are_heard_are_from_the_whole_time() -> None:
+    """Somebody stood there for a quarter of the time, at its beginning, in its midst or at its end; or for a half."""
+    for begin in (0, 120, 240):
+        images = [wall(10.0)] * 320
+        images[begin : begin + 80] = [wall(5.1)] * 80
+        assert seen_through(at(10.0), placed(images), VOXEL_M).all()
+        images[:160] = [wall(5.1)] * 160
+        assert not seen_through(at(10.0), placed(images), VOXEL_M).any()
+
+
+def test_views_of_several_recordings_are_joined(rng: np.random.Generator) -> None:
+    """None of the two has three views."""
+    parts = [placed([wall(10.0)] * 2), placed([wall(9.0)])]
+    assert not any(seen_through(at(10.0), part, VOXEL_M).any() for part in parts)
+    assert seen_through(at(10.0), PlacedViews.join(parts), VOXEL_M).all()
+
+
+@pytest.mark.parametrize("after", [0, 1, 7, 600])
+def test_views_go_on(after: int, rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+    whole, first, second = Views(every=1), Views(every=1), Views()
+    clouds = rng.uniform(-5.0, 5.0, (700, 20, 3))
+    for number, cloud in enumerate(clouds):
+        whole.add(cloud, number)
+        (first if number < after else second).add(cloud, number)
+        if number + 1 == after or after == 0 == number:
+            second = Views()
+            second.restore(through_disk(first.state()))
+            if after == 0:
+                second.add(cloud, number)
+    expected, found = whole.state(), second.state()
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
+
+
+def test_a_damaged_state_is_refused(through_disk: ThroughDisk) -> None:
+    views = Views(every=1)
+    views.add(at(10.0), 0)
+    for name, value in (("images", np.zeros((2, ROWS, COLUMNS), np.float16)), ("every", 0), ("grid", np.zeros(2))):
+        with pytest.raises(InputError, match="is not what this program saves"):
+            Views().restore(through_disk(views.state() | {name: value}))
