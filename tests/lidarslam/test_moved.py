@@ -35,7 +35,8 @@ def truth() -> Trajectory:
 def person(number: int) -> FloatArray:
     """The corners of somebody who walks along y during the first scans."""
     at = np.array([2.5, -2.0 + 0.2 * number, 0.0])
-    return np.array([at + [-0.2, -0.25, -1.0], at + [0.2, 0.25, 0.7]])
+    corners: FloatArray = at + np.array([[-0.2, -0.25, -1.0], [0.2, 0.25, 0.7]])
+    return corners
 
 
 def sweep(T_world_lidar: FloatArray, number: int, rng: np.random.Generator) -> FloatArray:
