@@ -28,13 +28,15 @@ ROOM = np.array([[-5.0, -4.0, -1.2], [5.0, 4.0, 1.5]])
 def truth() -> Trajectory:
     """A slow way through the room, as seen from its first scan."""
     phase = np.linspace(0.0, 1.0, SCANS)[:, None]
-    return Trajectory(0.1 * np.arange(1, SCANS + 1), exp(phase * [0.0, 0.0, 0.4, 1.0, 0.3, 0.0]))
+    stamps = np.arange(1, SCANS + 1, dtype=np.float64) / 10.0
+    return Trajectory(stamps, exp(phase * [0.0, 0.0, 0.4, 1.0, 0.3, 0.0]))
 
 
 def person(number: int) -> FloatArray:
     """The corners of somebody who walks along y during the first scans."""
     at = np.array([2.5, -2.0 + 0.2 * number, 0.0])
-    return at + np.array([[-0.2, -0.25, -1.0], [0.2, 0.25, 0.7]])
+    corners: FloatArray = at + np.array([[-0.2, -0.25, -1.0], [0.2, 0.25, 0.7]])
+    return corners
 
 
 def sweep(T_world_lidar: FloatArray, number: int, rng: np.random.Generator) -> FloatArray:
@@ -49,7 +51,8 @@ def sweep(T_world_lidar: FloatArray, number: int, rng: np.random.Generator) -> F
             sides = (person(number)[:, None] - origin) / directions
             enter, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
             ranges = np.where((enter > 0.0) & (enter < leave), enter, ranges)
-    return rays * (ranges + 0.01 * rng.normal(size=len(rays)))[:, None]
+    points: FloatArray = rays * (ranges + 0.01 * rng.normal(size=len(rays)))[:, None]
+    return points
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +82,14 @@ def run(source: Path, out: Path, *arguments: str) -> str:
 
 
 def written(out: Path) -> FloatArray:
-    return np.asarray(o3d.io.read_point_cloud(str(out / "map.ply")).points)
+    return np.asarray(o3d.io.read_point_cloud(out / "map.ply").points)
 
 
 def of_person(points: FloatArray) -> FloatArray:
     """Those farther than 40 cm from all that stands."""
     inside = np.minimum(points - ROOM[0], ROOM[1] - points).min(axis=1)
-    return points[inside > 0.4]
+    chosen: FloatArray = points[inside > 0.4]
+    return chosen
 
 
 def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
