@@ -16,7 +16,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.merge import MergeOutcome
-from lidarslam.summary import MergedRecording, MergeSummary
+from lidarslam.summary import MergedRecording, MergeSummary, WrittenMap
 from odometry.checkpoint import checkpoint_of, save_checkpoint
 from odometry.image_config import ImageConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig
@@ -193,7 +193,7 @@ def test_merge_exits_as_run_does(
     status: int,
 ) -> None:
     entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
-    summary = MergeSummary(entries, 1.0, 100.0, None, 10, 0.1, ())
+    summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
     outcome = MergeOutcome(summary, (None, None), stopped)
     monkeypatch.setattr("lidarslam.merge.merge", lambda *_: outcome)
     assert (
