@@ -287,7 +287,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     command = [sys.executable, "-m", "lidarslam.cli", "run", str(source), "--out", str(out), *FAST]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     begun = time.monotonic()
-    while not list(out.glob(".partial-*-scans.csv")) and time.monotonic() - begun < 30.0:
+    while not (out / "unfinished" / "scans.csv").exists() and time.monotonic() - begun < 30.0:
         time.sleep(0.05)
     time.sleep(1.5)
     process.send_signal(sent)
