@@ -80,7 +80,6 @@ def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
         raise InputError(f"{path}: no such run directory or trajectory file")
     if not path.is_dir():
         return Estimate(read_poses(path), None, map_file, None, Config())
-    require_whole(path)
     poses = Poses.of(str(path), read_trajectory(path))
     own_map = path / files.MAP_PLY
     chosen_map = map_file or (own_map if own_map.is_file() else None)

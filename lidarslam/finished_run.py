@@ -52,7 +52,6 @@ def load_run(path: Path) -> FinishedRun:
     Raises:
         InputError: there is no run, or a file of it is damaged.
     """
-    require_whole(path)
     trajectory = read_trajectory(path)
     return FinishedRun(
         path.resolve().name,
@@ -67,8 +66,9 @@ def read_trajectory(path: Path) -> Trajectory:
     """The final poses of a run directory, as many as its summary says.
 
     Raises:
-        InputError: there is no run, or its trajectory is damaged or cut off.
+        InputError: there is no run, it did not finish, or its trajectory is damaged or cut off.
     """
+    require_whole(path)
     if not (path / files.TRAJECTORY_TUM).is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
     trajectory = read_tum(path / files.TRAJECTORY_TUM)

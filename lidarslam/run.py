@@ -244,9 +244,9 @@ def track(
     watch = _Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     keeper = None if unfinished is None else _keeper(config, unfinished, watch, graph)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, keeper)
-    if unfinished is not None and unfinished.saved is not None:
-        scans = _restore(unfinished.saved, pipeline, watch, scans, odometry)
     if unfinished is not None:
+        if unfinished.saved is not None:
+            scans = _restore(unfinished.saved, pipeline, watch, scans, odometry)
         _begin(request, unfinished, log)
     error = _process(pipeline, scans, watch)
     if not log.points_read:

@@ -1,7 +1,6 @@
 """What a run leaves for `--resume` until it is finished: a folder in its directory, and who is at work there."""
 
 import contextlib
-import fcntl
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -10,10 +9,11 @@ from typing import Any, Literal
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.state import Saved
+from lidarslam.directory_lock import only_writer
 from lidarslam.run_directory import ABOUT, UNFINISHED
 from lidarslam.state_file import read_state, replacing_for_good
 
-_STATE, _ROWS, _SUBMAPS, _LOCK = "state.npz", "scans.csv", "submaps.bin", "lock"
+_STATE, _ROWS, _SUBMAPS = "state.npz", "scans.csv", "submaps.bin"
 # Differences to what was asked for that are told.
 _TOLD = 3
 
@@ -106,13 +106,12 @@ class Unfinished:
             _require_same(run, about.description, description)
         try:
             folder.mkdir(exist_ok=True)
-            lock = (folder / _LOCK).open("w")
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from error
-        with lock:
+        with contextlib.ExitStack() as held:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+                held.enter_context(only_writer(folder))
+            except OutputError:
                 raise OutputError(f"{run}: somebody else is at work on this run; wait, or end that first") from None
             for partial in run.glob(".partial-*"):
                 partial.unlink(missing_ok=True)  # of whoever was killed
@@ -158,7 +157,7 @@ class Unfinished:
 
     def _remove_all(self) -> None:
         """Remove the folder, that first which says what the others are: without it they are nothing."""
-        self._remove(Path(ABOUT).name, _STATE, _ROWS, _SUBMAPS, _LOCK)
+        self._remove(Path(ABOUT).name, _STATE, _ROWS, _SUBMAPS)
         with contextlib.suppress(OSError):  # something else lies there
             (self._run / UNFINISHED).rmdir()
 

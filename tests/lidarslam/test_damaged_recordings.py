@@ -400,16 +400,23 @@ def test_what_may_not_be_read(tmp_path, tables):
     assert "check its permissions" in said
 
 
+IDENTITY_ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
+
+
+def kitti_drive(folder, tables):
+    """A sequence of KITTI's odometry with these scans, without poses and times."""
+    (folder / "velodyne").mkdir(parents=True)
+    for index, table in enumerate(tables):
+        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
+        points.astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
+    (folder / "calib.txt").write_text(f"Tr: {IDENTITY_ROW}\n")
+    return folder
+
+
 @pytest.mark.parametrize("name", ["calib.txt", "poses.txt", "times.txt"])
 @pytest.mark.parametrize("content", [None, b"", b"hello\n", b"\xff\xfe\x00", b"1 2 3\n", b"0.0\n0.1\n"])
 def test_kitti_files_missing_short_or_garbage(tmp_path, tables, name, content):
-    folder = tmp_path / "drive"
-    (folder / "velodyne").mkdir(parents=True)
-    for index, table in enumerate(tables[:4]):
-        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
-        points.astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
-    row = "1 0 0 0 0 1 0 0 0 0 1 0"
-    (folder / "calib.txt").write_text(f"Tr: {row}\n")
+    folder, row = kitti_drive(tmp_path / "drive", tables[:4]), IDENTITY_ROW
     (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
     (folder / "poses.txt").write_text(f"{row}\n" * 4)
     assert run(folder, asked=4)[1]["warnings"] == []
@@ -429,13 +436,7 @@ def test_kitti_files_missing_short_or_garbage(tmp_path, tables, name, content):
 
 
 def test_poses_of_which_some_are_missing_are_counted(tmp_path, tables):
-    folder = tmp_path / "drive"
-    (folder / "velodyne").mkdir(parents=True)
-    for index, table in enumerate(tables[:4]):
-        points = np.stack([table["x"], table["y"], table["z"], table["x"]], axis=1)
-        points.astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
-    row = "1 0 0 0 0 1 0 0 0 0 1 0"
-    (folder / "calib.txt").write_text(f"Tr: {row}\n")
+    folder, row = kitti_drive(tmp_path / "drive", tables[:4]), IDENTITY_ROW
     for lines in (2, 9):
         (folder / "poses.txt").write_text(f"{row}\n" * lines)
         (folder / "times.txt").write_text("".join(f"{i / 10}\n" for i in range(4 if lines == 2 else 7)))

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.simulation.motions import Motion, Sway
 from lidarslam.simulation.mounts import mount_pose
@@ -18,6 +20,7 @@ EXACT = RangeModel(0.05, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 STAND = (0.7, -0.4, 1.3)
 
 Scanner = Callable[..., Scan]
+RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 
 
 def _room() -> World:
@@ -43,3 +46,22 @@ def scan_room() -> Scanner:
         return Simulation(world, model, still, mount_pose(mount, 0.0), 5).scan(1).scan
 
     return scan
+
+
+@pytest.fixture(scope="session")
+def l_shaped_room() -> RoomPoints:
+    """Makes so many points, and a few more, of the room below."""
+    return _l_shaped_room
+
+
+def _l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
+    """Points (N, 3) on the walls, floor and ceiling of a room that looks the same from no two places."""
+    corners = np.array([[-4, -3], [6, -3], [6, 1], [1, 1], [1, 5], [-4, 5], [-4, -3]], dtype=float)
+    parts = []
+    for a, b in pairwise(corners):
+        along = rng.uniform(0.0, 1.0, (round(count * np.linalg.norm(b - a) / 36.0), 1))
+        parts.append(np.column_stack([a + along * (b - a), rng.uniform(-1.5, 1.5, len(along))]))
+    flat = rng.uniform([-4, -3], [6, 5], (count, 2))
+    flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
+    parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
+    return np.concatenate(parts)

@@ -1,5 +1,6 @@
 """A scan laid on a map from above: the right place, turn and height among the first."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -8,31 +9,24 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
 from mapping.floorplan import Floorplan
 
+RoomPoints = Callable[[np.random.Generator, int], FloatArray]
+
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points (N, 3) on the walls, floor and ceiling of a room that looks the same from no two places."""
-    corners = np.array([[-4, -3], [6, -3], [6, 1], [1, 1], [1, 5], [-4, 5], [-4, -3]], dtype=float)
-    parts = []
-    for a, b in pairwise(corners):
-        along = rng.uniform(0.0, 1.0, (round(count * np.linalg.norm(b - a) / 36.0), 1))
-        parts.append(np.column_stack([a + along * (b - a), rng.uniform(-1.5, 1.5, len(along))]))
-    flat = rng.uniform([-4, -3], [6, 5], (count, 2))
-    flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
-    parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
-    return np.concatenate(parts)
-
-
 @pytest.fixture
-def points(rng: np.random.Generator) -> FloatArray:
+def points(rng: np.random.Generator, l_shaped_room: RoomPoints) -> FloatArray:
     return l_shaped_room(rng, 20_000)
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 77.0, 180.0, -130.0])
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (-2.5, 3.0, -0.4), (4.0, -1.5, 0.5)])
 def test_place_turn_and_height_are_found(
-    rng: np.random.Generator, points: FloatArray, place: tuple[float, float, float], turned_deg: float
+    rng: np.random.Generator,
+    l_shaped_room: RoomPoints,
+    points: FloatArray,
+    place: tuple[float, float, float],
+    turned_deg: float,
 ) -> None:
     true = exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
     true[:3, 3] = place
@@ -43,7 +37,9 @@ def test_place_turn_and_height_are_found(
     assert np.rad2deg(rotation_angle(inverse(true) @ best)) < 6.0
 
 
-def test_in_a_tilted_world_the_lean_is_kept(rng: np.random.Generator, points: FloatArray) -> None:
+def test_in_a_tilted_world_the_lean_is_kept(
+    rng: np.random.Generator, l_shaped_room: RoomPoints, points: FloatArray
+) -> None:
     tilt = exp([0.2, -0.1, 0.0, 1.0, 2.0, 3.0])
     true = tilt @ exp([0.0, 0.0, 1.0, 1.0, -1.0, 0.0])
     scan = transform_points(inverse(true), transform_points(tilt, l_shaped_room(rng, 4_000)))
@@ -58,7 +54,7 @@ def test_what_shows_nothing_upright_lies_nowhere(points: FloatArray) -> None:
     assert Floorplan.of(points, UP, 0.4).find(floor, np.eye(4), 12.0, 5).shape == (0, 4, 4)
 
 
-def test_no_two_places_are_the_same(rng: np.random.Generator, points: FloatArray) -> None:
+def test_no_two_places_are_the_same(rng: np.random.Generator, l_shaped_room: RoomPoints, points: FloatArray) -> None:
     poses = Floorplan.of(points, UP, 0.4).find(l_shaped_room(rng, 4_000), np.eye(4), 12.0, 20)
     assert len(poses) == 20
     for one, other in pairwise(poses):

@@ -1,5 +1,6 @@
 """Starts all around, and the right one among them."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
 from mapping.local_map import LocalMap
 from mapping.recovery import best_starts, start_poses
+
+RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 
 UP = np.array([0.0, 0.0, 1.0])
 T_GIVEN = exp([0.1, -0.2, 0.7, 3.0, -2.0, 0.5])
@@ -45,21 +48,8 @@ def test_turns_are_about_the_given_vertical() -> None:
     np.testing.assert_allclose(up @ starts[:, :3, 2].T, up @ T_GIVEN[:3, 2], atol=1e-12)
 
 
-def l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
-    """Points (N, 3) on the walls, floor and ceiling of a room that looks the same from no two directions."""
-    corners = np.array([[-4, -3], [6, -3], [6, 1], [1, 1], [1, 5], [-4, 5], [-4, -3]], dtype=float)
-    parts = []
-    for a, b in pairwise(corners):
-        along = rng.uniform(0.0, 1.0, (round(count * np.linalg.norm(b - a) / 36.0), 1))
-        parts.append(np.column_stack([a + along * (b - a), rng.uniform(-1.5, 1.5, len(along))]))
-    flat = rng.uniform([-4, -3], [6, 5], (count, 2))
-    flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
-    parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
-    return np.concatenate(parts)
-
-
 @pytest.fixture
-def l_map(rng: np.random.Generator) -> LocalMap:
+def l_map(rng: np.random.Generator, l_shaped_room: RoomPoints) -> LocalMap:
     points = l_shaped_room(rng, 20_000)
     local_map = LocalMap(0.2, 100.0)
     elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
@@ -69,7 +59,7 @@ def l_map(rng: np.random.Generator) -> LocalMap:
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0, 100.0, 180.0, -97.0, 40.0])
 def test_the_right_yaw_is_found_in_an_l_shaped_room(
-    rng: np.random.Generator, l_map: LocalMap, turned_deg: float
+    rng: np.random.Generator, l_shaped_room: RoomPoints, l_map: LocalMap, turned_deg: float
 ) -> None:
     """The sensor was turned on the spot by some angle that nobody knows."""
     before = exp([0.0, 0.0, 0.2, 0.5, -0.5, 0.1])
