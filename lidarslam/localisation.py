@@ -160,7 +160,7 @@ class OdometryAlone:
             points_used=motion.points_used,
             residual_m=fit.residual_m,
             inlier_ratio=fit.inlier_ratio,
-            degenerate=(),
+            degenerate=motion.degenerate,
             stage_ms={"check": 1e3 * (time.perf_counter() - started)},
         )
 
@@ -216,9 +216,11 @@ class ScanToMap:
 
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
-    """A motion that was not measured is lost, whatever it fits; else the fit decides."""
+    """A motion that was not measured is lost, whatever it fits; else the fit decides, and what both leave open."""
     if motion.failure is not None:
         return Status.LOST, motion.failure
+    if fit.status is Status.OK and motion.degenerate:
+        return Status.DEGRADED, f"nothing to see along {', '.join(motion.degenerate)}"
     if fit.status is Status.OK:
         return Status.OK, ""
     if fit.inlier_ratio is None:

@@ -1,50 +1,14 @@
 """Which ways of moving the matched surfaces leave open: along a corridor, around the axis of a tank."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray
 
 # Share of all pulls that must be felt along a direction. A corridor's noisy walls are felt along it as well: what the
 # uncertainty of the normals alone would make is not counted.
 _LEAST_SHARE = 0.0005
 _NOISE_FACTOR = 3.0
-
-_NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
-
-
-@dataclass(frozen=True, eq=False)
-class Degeneracy:
-    """Directions of motion that the matches say too little about.
-
-    Attributes:
-        directions: (D, 6) orthonormal, rotation first, rotations scaled by `lever_m`, in the LiDAR frame.
-        lever_m: metres that a rotation of a radian counts for.
-    """
-
-    directions: FloatArray
-    lever_m: float
-
-    def __len__(self) -> int:
-        return len(self.directions)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The axes nearest to the directions, each but once, in the LiDAR frame."""
-        left = self.directions.T @ self.directions  # the same for any basis of the directions
-        axes = []
-        for _ in self.directions:
-            axis = int(left.diagonal().argmax())
-            left = left - np.outer(left[:, axis], left[axis]) / left[axis, axis]
-            axes.append(axis)
-        return tuple(_NAMES[axis] for axis in sorted(axes))
-
-    def projector(self) -> FloatArray:
-        """(6, 6): the part of a motion (rotation first, radians and metres), in metres, along the directions."""
-        D = self.directions.copy()
-        D[:, :3] *= self.lever_m
-        return np.asarray(D.T @ D, dtype=np.float64)
 
 
 def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray, lever_m: float) -> Degeneracy:

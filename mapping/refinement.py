@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from mapping.config import RefinementConfig
-from mapping.degeneracy import Degeneracy, find_degeneracy
+from mapping.degeneracy import find_degeneracy
 from mapping.deskew import move
 from mapping.local_map import LEVELS, LocalMap, Matches
 from mapping.prediction import Prediction

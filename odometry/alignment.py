@@ -71,10 +71,13 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """Motions (B, 4, 4) and the information (B, 6, 6) about them, for a change from the left; None: not to be kept."""
+    """Motions (B, 4, 4) and the information (B, 6, 6) about them and their bends, for a change from the left; None: not
+    to be kept.
+    """
 
     T_prev_curr: FloatArray
     information: FloatArray | None
+    bend_information: FloatArray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +109,11 @@ class _Before:
 
 @torch.no_grad()
 def align(
-    T_prev_curr: Tensor, sweeps: SweepPairs, config: AlignmentConfig, guess_information: Tensor | None = None
+    T_prev_curr: Tensor,
+    sweeps: SweepPairs,
+    config: AlignmentConfig,
+    guess_information: Tensor | None = None,
+    bend_information: Tensor | None = None,
 ) -> Aligned:
     """Refine motions (B, 4, 4) so that the current images lie on the previous ones.
 
@@ -118,8 +125,9 @@ def align(
         config: how.
         guess_information: (B, 6, 6) inverse covariance of the guesses, for a change from the left; None: they are
             only where to start from.
+        bend_information: (B, 6, 6) what is known of the bend beyond that it mostly goes on as before; None: nothing.
     """
-    guess = _Guess(_array(T_prev_curr), None if guess_information is None else _array(guess_information))
+    guess = _Guess(_array(T_prev_curr), _array_or_none(guess_information), _array_or_none(bend_information))
     before, sums = _Before.of(sweeps), _sums_over(sweeps, config)
     state = _State(guess.T_prev_curr, np.zeros((len(guess.T_prev_curr), 6)))
     for done in np.linspace(0.0, 1.0, config.iterations).tolist():
@@ -136,6 +144,10 @@ def _array(values: Tensor) -> FloatArray:
     return np.ascontiguousarray(values.double().numpy(force=True))
 
 
+def _array_or_none(values: Tensor | None) -> FloatArray | None:
+    return None if values is None else _array(values)
+
+
 def _sums_over(sweeps: SweepPairs, config: AlignmentConfig) -> PairSums:
     on_processor = sweeps.current.points.device.type == "cpu" and sweeps.current.points.dtype == torch.float32
     return CompiledSums(sweeps, config) if on_processor else TorchSums(sweeps, config)
@@ -144,9 +156,9 @@ def _sums_over(sweeps: SweepPairs, config: AlignmentConfig) -> PairSums:
 def _step(state: _State, H: FloatArray, g: FloatArray, guess: _Guess, config: AlignmentConfig) -> tuple[_State, float]:
     """One Gauss-Newton step, and by how much it moved the pair it moved most."""
     H, g = config.information_per_m2 * H, config.information_per_m2 * g
-    expected = _expected(config)
+    expected = _expected(config) + (0.0 if guess.bend_information is None else guess.bend_information)
     H[:, 6:, 6:] += expected
-    g[:, 6:] += state.surprise @ expected
+    g[:, 6:] += (expected @ state.surprise[..., None])[..., 0]
     if guess.information is not None:
         away = log(state.T_prev_curr @ inverse(guess.T_prev_curr))
         H[:, :6, :6] += guess.information

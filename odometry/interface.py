@@ -19,16 +19,18 @@ class Motion:
         failure: why the motion is only a prediction, None when it was measured.
         covariance: (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None when the method
             does not say.
+        degenerate: names of the directions of motion that the scans say nothing about, where the method tells.
     """
 
     T_prev_curr: FloatArray
     points_used: int
     failure: str | None = None
     covariance: FloatArray | None = None
+    degenerate: tuple[str, ...] = ()
 
     def state(self) -> State:
         """All of it."""
-        return dict(vars(self))
+        return {**vars(self), "degenerate": list(self.degenerate)}
 
     @classmethod
     def restored(cls, saved: Saved) -> "Motion":
@@ -38,6 +40,7 @@ class Motion:
             saved.integer("points_used"),
             saved.optional_text("failure"),
             saved.optional_array("covariance", (6, 6)),
+            tuple(saved.texts("degenerate")),
         )
 
 

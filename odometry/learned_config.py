@@ -27,3 +27,7 @@ class LearnedConfig(BaseModel):
         0.3, ge=0.0, le=1.0, description="of what a scan says that must agree with the last one for it to be believed"
     )
     least_points: int = Field(60, ge=6, description="that must agree")
+    changing_rad_s2: float = Field(
+        2.0, gt=0.0, description="by which a turn may change, along directions of which the scans say nothing"
+    )
+    changing_m_s2: float = Field(2.0, gt=0.0, description="and the speed")

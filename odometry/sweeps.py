@@ -28,6 +28,17 @@ class SweepImages:
     def __len__(self) -> int:
         return len(self.points)
 
+    def median_range_m(self) -> float:
+        """Of all points, roughly; 0 when there are none."""
+        ranges = self.points[..., ::4, ::8].norm(dim=1)
+        seen = ranges[ranges > 0.0]
+        return float(seen.median()) if len(seen) else 0.0
+
+    def share_with_normal(self) -> float:
+        """Of the pixels that have a point; 0 when there are none."""
+        points, normals = ((part != 0.0).any(dim=1).sum() for part in (self.points, self.normals))
+        return float(normals / points.clamp(min=1))
+
     def select(self, chosen: Tensor | slice) -> "SweepImages":
         """Some of the sweeps."""
         parts = (self.points, self.normals, self.offsets, self.low, self.high)

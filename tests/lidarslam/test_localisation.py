@@ -10,10 +10,11 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.localisation import Estimated, Localised, ScanToMap, SweepMotion
+from lidarslam.localisation import Estimated, Localised, OdometryAlone, ScanToMap, SweepMotion
 from lidarslam.pipeline import Pipeline, ScanResult
 from mapping.config import GlobalMapConfig, MappingConfig
 from mapping.mapper import Mapper
+from odometry.consistency import ConsistencyCheck, ConsistencyConfig
 from odometry.constant_velocity import ConstantVelocity
 from odometry.external import ExternalOdometry
 from odometry.interface import Motion, Odometry
@@ -43,6 +44,20 @@ def test_a_motion_known_on_one_side_only_serves_for_the_other() -> None:
     np.testing.assert_array_equal(SweepMotion(BEFORE, None).mean(scan), BEFORE)
     np.testing.assert_array_equal(SweepMotion(None, AFTER).mean(scan), AFTER)
     assert SweepMotion(None, None).mean(scan) is None
+
+
+def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> None:
+    """Standing still in a corner, of which the odometry says that it leaves nothing open, and that it leaves x open."""
+    rng = np.random.default_rng(0)
+    corner = np.concatenate([np.insert(rng.uniform(1.0, 6.0, (800, 2)), axis, 1.0, axis=1) for axis in range(3)])
+    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    told = [
+        localiser.localise(Estimated(Scan(corner, 0.1 * number), Motion(np.eye(4), 100, degenerate=names), 0.1), None)
+        for number, names in enumerate([(), (), ("x", "yaw")])
+    ]
+    assert [localised.status for localised in told[1:]] == [Status.OK, Status.DEGRADED]
+    assert (told[1].message, told[2].message) == ("", "nothing to see along x, yaw")
+    assert told[2].degenerate == ("x", "yaw")
 
 
 def test_a_sweep_that_was_compensated_already_is_left_alone() -> None:

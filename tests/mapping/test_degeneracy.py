@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, exp
-from mapping.degeneracy import Degeneracy, find_degeneracy
+from mapping.degeneracy import find_degeneracy
 
 Scene = tuple[FloatArray, FloatArray]
 

@@ -267,6 +267,19 @@ def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room):
     assert errors(told.T_prev_curr, motion) < (0.06, 0.004)
 
 
+def test_a_bend_is_held_along_the_directions_that_are_asked_for(box_room):
+    """Sweeps that a turn and a push bend: held about z alone, the bend is none there, and still some along x."""
+    sweeps = box_room.sweeps_along(2, speeding_up)
+    T = torch.from_numpy(speeding_up(np.array([0.0, 0.1]))).float()
+    motion = inverse(T[:1]) @ T[1:]
+    held = torch.diag(torch.tensor([0.0, 0.0, 1e8, 0.0, 0.0, 0.0], dtype=torch.float64))[None]
+    free = align(motion, consecutive(sweeps, 0, INTERVAL_S), CONFIG)
+    found = align(motion, consecutive(sweeps, 0, INTERVAL_S), CONFIG, bend_information=held)
+    assert free.bend[0, 2] == pytest.approx(0.4, abs=0.06)
+    assert found.bend[0, 2] == pytest.approx(0.0, abs=1e-4)
+    assert abs(float(found.bend[0, 3])) > 0.05
+
+
 def test_the_last_motion_may_have_taken_longer(box_room):
     """The change of velocity is shared out by time: over 0.3 s a third as fast as over 0.1 s."""
     sweeps = box_room.sweeps(2, TWIST)

@@ -213,15 +213,36 @@ def test_the_covariance_is_of_a_change_from_the_right(walls):
     assert found[3] < 0.05
 
 
+ALONG = (0.0, 0.0, 0.0, 4.0, 0.0, 0.0)
+
+
+def test_where_nothing_is_seen_along_a_direction_the_motion_goes_on_as_before(box_room):
+    """Past two cabinets into an even corridor; the network takes the latter for standing still."""
+    cabinets = (((-1.5, 1.4, -1.5), (-0.9, 2.0, 1.0)), ((0.9, -2.0, -1.5), (1.8, -1.5, 1.5)))
+    corridor = type(box_room)((-np.inf, -2.0, -0.8), (np.inf, 2.0, 1.0), cabinets)
+    scans = near(corridor.scans(29, ALONG), 5.0)
+    motions = estimates(scans, Told(*[moved(ALONG)] * 14, np.eye(4), log_sigma=math.log(0.05)))
+    for motion in motions[1:]:
+        assert_close(motion, moved(ALONG), translation_m=0.02)
+    assert [motion.degenerate for motion in motions[:10]] == [()] * 10
+    inside = motions[-8:]
+    assert [motion.degenerate for motion in inside] == [("x",)] * 8
+    variances = [motion.covariance[3, 3] for motion in inside if motion.covariance is not None]
+    # A random walk of the speed: 2 m/s^2 for 0.1 s, over 0.1 s; and what any motion is unsure by.
+    assert (np.diff(variances) > 0.02**2).all()
+    assert (np.diff(variances) < 0.025**2).all()
+    assert max(motion.covariance[4, 4] for motion in inside if motion.covariance is not None) < 0.01**2
+
+
 @pytest.fixture(scope="module")
 def walls(box_room):
     """Two walls along x, and nothing else."""
     return type(box_room)((-np.inf, -2.0, -np.inf), (np.inf, 2.0, np.inf))
 
 
-def near(scans: list[Scan]) -> list[Scan]:
-    """What is within 12 m; farther off, the two walls meet in one neighbourhood, which looks like a wall across."""
-    return [scan.select(np.linalg.norm(scan.points, axis=1) < 12.0) for scan in scans]
+def near(scans: list[Scan], within_m: float = 12.0) -> list[Scan]:
+    """What is not far; farther off, the two walls meet in one neighbourhood, which looks like a wall across."""
+    return [scan.select(np.linalg.norm(scan.points, axis=1) < within_m) for scan in scans]
 
 
 def sigmas(scans: list[Scan], network: Told) -> FloatArray:

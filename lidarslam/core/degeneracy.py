@@ -1,0 +1,47 @@
+"""Ways of moving that what a sensor sees leaves open: along a corridor, around the axis of a tank."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+
+_NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Degeneracy:
+    """Directions of motion that a scan says too little about.
+
+    Attributes:
+        directions: (D, 6) orthonormal, rotation first, rotations scaled by `lever_m`, in the LiDAR frame.
+        lever_m: metres that a rotation of a radian counts for.
+    """
+
+    directions: FloatArray
+    lever_m: float
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The axes nearest to the directions, each but once, in the LiDAR frame."""
+        left = self.directions.T @ self.directions  # the same for any basis of the directions
+        axes = []
+        for _ in self.directions:
+            axis = int(left.diagonal().argmax())
+            left = left - np.outer(left[:, axis], left[axis]) / left[axis, axis]
+            axes.append(axis)
+        return tuple(_NAMES[axis] for axis in sorted(axes))
+
+    def projector(self) -> FloatArray:
+        """(6, 6): the part of a motion (rotation first, radians and metres), in metres, along the directions."""
+        D = self.directions.copy()
+        D[:, :3] *= self.lever_m
+        return np.asarray(D.T @ D, dtype=np.float64)
+
+    def part_along(self) -> FloatArray:
+        """(6, 6): takes from a motion (rotation first, radians and metres) its part along the directions."""
+        scale = np.array([self.lever_m] * 3 + [1.0] * 3)
+        return np.asarray(self.directions.T @ self.directions * (scale / scale[:, None]), dtype=np.float64)
