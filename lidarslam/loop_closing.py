@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from lidarslam.config import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state import Saved
+from lidarslam.scan_log import ScanLog
+from lidarslam.viewer import Viewer
 from mapping.g2o import GraphFile
 from mapping.global_map import GlobalMap
 
@@ -100,6 +102,20 @@ def finish_graph(graph: "SlamGraph", scans: int, voxel_size_m: float) -> GraphOu
     """Close the loops of so many scans for good, and draw the map anew; None where no scan could be believed."""
     finished = finish_recordings(graph, [scans], voxel_size_m)
     return None if finished is None else finished.of([0])
+
+
+def close_loops(
+    graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog, viewer: Viewer
+) -> GraphOutcome | None:
+    """Correct what was logged, and show it, once all scans are there; None where there is nothing to correct."""
+    if graph is None or global_map is None:
+        return None
+    closed = finish_graph(graph, len(log), global_map.voxel_size_m)
+    if closed is not None:
+        log.correct(closed.T_world_lidar)
+        pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
+        viewer.show_closed(log.trajectory.positions, pairs, closed.global_map)
+    return closed
 
 
 def finish_recordings(graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float) -> "FinishedGraph | None":
