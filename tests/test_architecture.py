@@ -25,11 +25,12 @@ MAY_IMPORT = {
     "lidarslam": PACKAGES,
 }
 # The way down is cli -> commands -> run -> pipeline -> libraries: nobody looks up it.
+RUN = ("lidarslam.run", "lidarslam.run_state", "lidarslam.run_watch")
 MAY_NOT_IMPORT = {
     "lidarslam": ("lidarslam.cli", "lidarslam.commands"),
-    "lidarslam.pipeline": ("lidarslam.run",),
-    "lidarslam.viewer": ("lidarslam.run",),
-    "lidarslam.config": ("lidarslam.run",),
+    "lidarslam.pipeline": RUN,
+    "lidarslam.viewer": RUN,
+    "lidarslam.config": RUN,
 }
 ENTRY_POINTS = ("lidarslam.cli", "lidarslam.__main__")
 CORE_MAY_IMPORT = {"numpy", "scipy", "typing_extensions", *sys.stdlib_module_names}
