@@ -27,10 +27,10 @@ from lidarslam.config import Config, load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import State
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.localisation import make_localiser
 from lidarslam.loop_closing import begin_graph
 from lidarslam.pipeline import Pipeline
 from lidarslam.prefetch import prefetch
-from lidarslam.run import make_localiser
 from lidarslam.run_directory import RunDirectory
 from lidarslam.scan_log import ScanLog
 from lidarslam.unfinished import Unfinished

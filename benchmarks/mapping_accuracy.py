@@ -31,8 +31,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
+from lidarslam.localisation import make_localiser
 from lidarslam.pipeline import Pipeline
-from lidarslam.run import make_localiser
 from lidarslam.scan_order import in_order
 from lidarslam.simulation.carriers import CARRIERS
 from lidarslam.simulation.mounts import mount_pose

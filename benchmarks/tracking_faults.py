@@ -29,8 +29,8 @@ from lidarslam.config import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.localisation import make_localiser
 from lidarslam.pipeline import Pipeline, ScanResult
-from lidarslam.run import make_localiser
 from lidarslam.simulation.faults import (
     Cover,
     Faulty,

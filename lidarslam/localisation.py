@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from lidarslam.config import Config
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
@@ -226,3 +227,10 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
     if fit.inlier_ratio is None:
         return fit.status, "too few planes to check the motion against the previous scan"
     return fit.status, f"only {100.0 * fit.inlier_ratio:.0f} % of the scan lies on the previous one"
+
+
+def make_localiser(config: Config) -> Localiser:
+    """Scan-to-map refinement when it is enabled, else the odometry's word."""
+    if config.mapping.enabled:
+        return ScanToMap(Mapper(config.mapping))
+    return OdometryAlone(ConsistencyCheck(config.odometry.consistency))

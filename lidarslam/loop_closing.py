@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from lidarslam.config import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state import Saved
+from lidarslam.scan_log import ScanLog
+from lidarslam.viewer import Viewer
 from mapping.g2o import GraphFile
 from mapping.global_map import GlobalMap
 
@@ -102,6 +104,20 @@ def finish_graph(graph: "SlamGraph", scans: int, voxel_size_m: float) -> GraphOu
     return None if finished is None else finished.of([0])
 
 
+def close_loops(
+    graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog, viewer: Viewer
+) -> GraphOutcome | None:
+    """Correct what was logged, and show it, once all scans are there; None where there is nothing to correct."""
+    if graph is None or global_map is None:
+        return None
+    closed = finish_graph(graph, len(log), global_map.voxel_size_m)
+    if closed is not None:
+        log.correct(closed.T_world_lidar)
+        pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
+        viewer.show_closed(log.trajectory.positions, pairs, closed.global_map)
+    return closed
+
+
 def finish_recordings(graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float) -> "FinishedGraph | None":
     """Close the loops within and between recordings of so many scans each; None where no scan could be believed."""
     result = graph.finish()
@@ -130,23 +146,20 @@ class FinishedGraph:
     def common(self) -> GraphOutcome | None:
         """What became of the recordings that are joined; its refused loops tell why others are not."""
         joined = self.joined
-        outcome = self.of(joined)
-        if outcome is None:
-            return None
-        everywhere = self._loops(range(len(self._scans)), numbered=True)
         ours = {recording + 1 for recording in joined}
-        return replace(
-            outcome,
-            loops=tuple(
-                loop
-                for loop in everywhere
-                if {loop.first_recording, loop.second_recording} <= ours
-                or (loop.first_recording != loop.second_recording and not loop.accepted)
-            ),
+        loops = tuple(
+            loop
+            for loop in self._loops(range(len(self._scans)), numbered=True)
+            if {loop.first_recording, loop.second_recording} <= ours
+            or (loop.first_recording != loop.second_recording and not loop.accepted)
         )
+        return self._outcome(joined, loops)
 
     def of(self, recordings: Sequence[int]) -> GraphOutcome | None:
         """What became of some recordings, and of the loops between them; None when none has a keyframe."""
+        return self._outcome(recordings, self._loops(recordings, numbered=len(recordings) > 1))
+
+    def _outcome(self, recordings: Sequence[int], loops: tuple[LoopReport, ...]) -> GraphOutcome | None:
         chosen = np.flatnonzero(np.isin(self._result.keyframe_recordings, recordings))
         if not len(chosen):
             return None
@@ -155,7 +168,7 @@ class FinishedGraph:
             T_world_lidar=np.concatenate(poses),
             global_map=self._graph.draw_map(self._result, self._voxel_size_m, recordings),
             graph=_part(self._result.graph, chosen),
-            loops=self._loops(recordings, numbered=len(recordings) > 1),
+            loops=loops,
             largest_correction_m=max(self._correction_m(recording) for recording in recordings),
             keyframe_ms=tuple(self._graph.keyframe_ms[k] for k in chosen),
         )

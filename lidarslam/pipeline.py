@@ -21,17 +21,16 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
+from lidarslam.follower import Behind, Follower, graph_scan
 from lidarslam.localisation import Estimated, Localised, Localiser, SweepMotion
+from lidarslam.waiting_scans import Compensated, Timed
 from mapping.config import GlobalMapConfig
 from mapping.global_map import GlobalMap, voxel_size_for
-from mapping.graph_scan import GraphScan
 from mapping.visibility import Views
 from odometry.interface import Odometry
 
 # How many scans the second thread may lag behind: the map now and then takes as long as several scans to tidy up.
 _MAX_BEHIND = 8
-# And the third: a loop may take as long as all the scans up to the next keyframe.
-_MAX_BEHIND_GRAPH = 64
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
@@ -70,53 +69,6 @@ class ScanResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class _Timed:
-    """A scan whose motion is known, and the time that took."""
-
-    estimated: Estimated
-    stage_ms: dict[str, float]
-
-    def state(self) -> State:
-        return {"estimated": self.estimated.state(), "stage_ms": dict(self.stage_ms)}
-
-    @classmethod
-    def restored(cls, saved: Saved) -> "_Timed":
-        ms = saved.part("stage_ms")
-        return cls(Estimated.restored(saved.part("estimated")), {s: ms.number(s) for s in ("read", "odometry")})
-
-
-@dataclass(frozen=True, eq=False)
-class _Compensated:
-    """A scan that waits to be added to the map until the motion it was compensated with is checked."""
-
-    number: int
-    thinned: Scan
-    motion: SweepMotion
-    points: FloatArray
-    T_world_lidar: FloatArray
-
-    def state(self) -> State:
-        motion = dict(vars(self.motion))
-        return {**vars(self), "thinned": self.thinned.state(), "motion": motion}
-
-    @classmethod
-    def restored(cls, saved: Saved) -> "_Compensated":
-        thinned, motion = Scan.restored(saved.part("thinned")), SweepMotion.restored(saved.part("motion"))
-        points, T_world_lidar = saved.array("points", (len(thinned), 3)), saved.array("T_world_lidar", (4, 4))
-        return cls(saved.integer("number"), thinned, motion, points, T_world_lidar)
-
-
-class Follower(Protocol):
-    """Sees everything that a run comes to, scan by scan: what the scan before showed, then the next scan."""
-
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
-        """Points (N, 3) of the latest scan, in its LiDAR frame, that belong in the map."""
-
-    def add(self, scan: GraphScan) -> None:
-        """The next scan."""
-
-
 class Keeper(Protocol):
     """Keeps now and then what is needed to go on after the program was killed."""
 
@@ -148,11 +100,11 @@ class Pipeline:
         self._odometry = odometry
         self._localiser = localiser
         self._config = config
-        self._graph = None if graph is None else _Behind(graph)
+        self._graph = None if graph is None else Behind(graph)
         self._voxel_size_m = config.voxel_size_m
-        self._waiting: _Compensated | None = None
+        self._waiting: Compensated | None = None
         self._keeper = keeper
-        self._held: _Timed | None = None  # whose successor is not known yet
+        self._held: Timed | None = None  # whose successor is not known yet
         self._measured_stamp: float | None = None  # of the last scan, unless its motion was only predicted
         self._followed = 0  # scans that are done but for the map
         self.global_map: GlobalMap | None = None
@@ -184,8 +136,8 @@ class Pipeline:
         """Go on from a state, with the scans after the one that was held; not with the odometry's part."""
         self._localiser.restore(saved.part("localiser"))
         self._voxel_size_m = saved.optional_number("voxel_size_m")
-        self._waiting = saved.optional("waiting", _Compensated.restored)
-        self._held = saved.optional("held", _Timed.restored)
+        self._waiting = saved.optional("waiting", Compensated.restored)
+        self._held = saved.optional("held", Timed.restored)
         self._measured_stamp = saved.optional_number("measured_stamp")
         self._followed = saved.integer("followed")
         self.global_map = saved.optional("global_map", GlobalMap.restored)
@@ -231,7 +183,7 @@ class Pipeline:
         if error is not None:
             raise error
 
-    def _estimate(self, scans: Iterable[Scan]) -> Iterator[_Timed]:
+    def _estimate(self, scans: Iterable[Scan]) -> Iterator[Timed]:
         """Read and estimate scan after scan."""
         started = time.perf_counter()
         for scan in scans:
@@ -242,10 +194,10 @@ class Pipeline:
             before = self._measured_stamp
             interval_s = scan.stamp - before if measured and before is not None else None
             self._measured_stamp = scan.stamp if measured else None
-            yield _Timed(Estimated(scan, motion, interval_s), stage_ms)
+            yield Timed(Estimated(scan, motion, interval_s), stage_ms)
             started = time.perf_counter()
 
-    def _with_next(self, items: Iterable[_Timed]) -> Iterator[tuple[_Timed, _Timed | None]]:
+    def _with_next(self, items: Iterable[Timed]) -> Iterator[tuple[Timed, Timed | None]]:
         """Each item with the one after it, None after the last."""
         error: LidarSlamError | None = None
         try:
@@ -261,7 +213,7 @@ class Pipeline:
         if error is not None:
             raise error
 
-    def _follow(self, timed: _Timed, following: _Timed | None) -> ScanResult:
+    def _follow(self, timed: Timed, following: Timed | None) -> ScanResult:
         """Everything that follows from a motion: find the pose, compensate the sweep, add to the map."""
         scan = timed.estimated.scan
         localised = self._localiser.localise(timed.estimated, following.estimated if following else None)
@@ -271,10 +223,10 @@ class Pipeline:
         compensated = time.perf_counter()
         self._add_waiting(localised.status)
         if localised.belongs_in_map:  # a pose that is not believed must not draw walls
-            self._waiting = _Compensated(self._followed, thinned, localised.motion, points, localised.T_world_lidar)
+            self._waiting = Compensated(self._followed, thinned, localised.motion, points, localised.T_world_lidar)
         self._followed += 1
         if self._graph is not None:
-            self._graph.add(_graph_scan(timed.estimated, localised, points))
+            self._graph.add(graph_scan(timed.estimated, localised, points))
         followed_ms = {"deskew": _ms(found, compensated), "map": _ms(compensated, time.perf_counter())}
         return _result(scan, localised, points, timed.stage_ms | localised.stage_ms | followed_ms)
 
@@ -305,33 +257,6 @@ class Pipeline:
             self._graph.draw(points, scan.T_world_lidar, self._voxel_size_m)
 
 
-class _Behind:
-    """Lets a follower work on a thread of its own, and wait no longer than is good for the memory."""
-
-    def __init__(self, follower: Follower) -> None:
-        self._follower = follower
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graph")
-        self._jobs: deque[Future[None]] = deque()
-
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
-        self._jobs.append(self._pool.submit(self._follower.draw, points, T_world_lidar, voxel_size_m))
-
-    def add(self, scan: GraphScan) -> None:
-        self._jobs.append(self._pool.submit(self._follower.add, scan))
-        while len(self._jobs) > _MAX_BEHIND_GRAPH:
-            self._jobs.popleft().result()
-
-    def catch_up(self) -> None:
-        """Wait until all is done; an error of the follower's is raised."""
-        while self._jobs:
-            self._jobs.popleft().result()
-
-    def finish(self) -> None:
-        """Wait until all is done, for the last time."""
-        self.catch_up()
-        self._pool.shutdown()
-
-
 def _result(scan: Scan, localised: Localised, points: FloatArray, stage_ms: dict[str, float]) -> ScanResult:
     return ScanResult(
         stamp=scan.stamp,
@@ -348,19 +273,6 @@ def _result(scan: Scan, localised: Localised, points: FloatArray, stage_ms: dict
         degenerate=localised.degenerate,
         covariance=localised.covariance,
         stage_ms=stage_ms,
-    )
-
-
-def _graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:
-    measured = estimated.interval_s is not None and (localised.way_known or localised.status is Status.LOST)
-    return GraphScan(
-        T_world_lidar=localised.T_world_lidar,
-        points=points,
-        covariance=localised.covariance,
-        T_prev_curr=estimated.motion.T_prev_curr if measured else None,
-        motion_covariance=estimated.motion.covariance if measured else None,
-        lost=localised.status is Status.LOST or not localised.way_known,
-        belongs_in_map=localised.belongs_in_map,
     )
 
 

@@ -122,11 +122,6 @@ class RunSummary:
     warnings: tuple[str, ...]
 
     @property
-    def loop_closures(self) -> int:
-        """How many loops were closed."""
-        return 0 if self.graph is None else self.graph.closed
-
-    @property
     def lost_scans(self) -> int:
         """How many scans were lost."""
         return sum(stretch.last - stretch.first + 1 for stretch in self.lost)
@@ -181,11 +176,6 @@ class MergeSummary:
     warnings: tuple[str, ...]
 
     @property
-    def loop_closures(self) -> int:
-        """How many loops were closed, within the recordings of the common map and between them."""
-        return 0 if self.graph is None else self.graph.closed
-
-    @property
     def lost_scans(self) -> int:
         """How many scans were lost, of all recordings."""
         return sum(recording.lost_scans for recording in self.recordings)
@@ -204,7 +194,7 @@ class MergeSummary:
 def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
     """What the summary.json of a run and of several say alike."""
     return {
-        "loop_closures": summary.loop_closures,
+        "loop_closures": 0 if summary.graph is None else summary.graph.closed,
         "pose_graph": None if summary.graph is None else summary.graph.to_json(),
         "map_points": summary.map.points,
         "map_voxel_size_m": summary.map.voxel_size_m,

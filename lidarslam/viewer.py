@@ -1,12 +1,19 @@
 """What a run shows while it works; a run without a window uses `NullViewer`."""
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal, Protocol
 
+from lidarslam import run_directory as files
+from lidarslam.config import ViewerConfig
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline import ScanResult
+from lidarslam.run_directory import RunDirectory
+from lidarslam.scan_log import ScanLog
 from mapping.global_map import GlobalMap
+
+RerunMode = Literal["off", "save", "spawn"]
 
 
 class Viewer(Protocol):
@@ -52,3 +59,32 @@ class NullViewer:
 
     def close(self) -> None:
         """Nothing."""
+
+
+@contextmanager
+def viewing(
+    mode: RerunMode, name: str, config: ViewerConfig, directory: RunDirectory, log: ScanLog
+) -> Iterator[Viewer]:
+    """The viewer of a run; its recording takes its name in the run directory when all is shown.
+
+    Args:
+        mode: no Rerun recording, one in the run directory, or one there and a window.
+        name: of the recording that is run.
+        config: of the viewer.
+        directory, log: of the run.
+    """
+    if mode == "off":
+        yield NullViewer()
+        return
+    from lidarslam.rerun_viewer import IncompleteRecordingError, RerunViewer, require_complete
+
+    try:
+        with directory.replacing(files.RERUN) as path:
+            viewer = RerunViewer(name, config, path, mode == "spawn")
+            try:
+                yield viewer
+            finally:
+                viewer.close()
+            require_complete(path)
+    except IncompleteRecordingError as error:  # it costs the picture of the run, not the run
+        log.warn(f"no {files.RERUN}: {error}")

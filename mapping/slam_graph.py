@@ -18,18 +18,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, adjoint, inverse
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Saved, State, stack
 from mapping.correction import corrected
 from mapping.g2o import Edge, GraphFile, edges_state, restored_edges
 from mapping.global_map import GlobalMap
-from mapping.graph_config import SlamGraphConfig, TrajectoryEdgeConfig
+from mapping.graph_config import SlamGraphConfig
 from mapping.graph_scan import GraphScan
 from mapping.keyframe import KeyframeSelector
 from mapping.loop_closure import LoopClosure, LoopDetector, Submap, closures_state, restored_closures
 from mapping.pose_graph import PoseGraph
 from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
+from mapping.trajectory_edges import Way, trajectory_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,33 +62,6 @@ class Corrected:
         return _recordings_of(self.keyframe_scans, self.first_scans)
 
 
-class _Way:
-    """What happened since the last keyframe: the odometry's motion, how far it went, and whether tracking was lost."""
-
-    def __init__(self) -> None:
-        self.T_keyframe_lidar: FloatArray | None = np.eye(4)  # the odometry's; None once it failed
-        self.covariance: FloatArray = np.zeros((6, 6))
-        self.length_m = 0.0
-        self.lost = False
-
-    def restore(self, saved: Saved) -> None:
-        """Go on from what was saved, which is all of it."""
-        self.T_keyframe_lidar = saved.optional_array("T_keyframe_lidar", (4, 4))
-        self.covariance = saved.array("covariance", (6, 6))
-        self.length_m, self.lost = saved.number("length_m"), saved.flag("lost")
-
-    def go(self, scan: GraphScan, step_m: float) -> None:
-        """One scan further."""
-        self.length_m += step_m
-        self.lost |= scan.lost
-        if self.T_keyframe_lidar is None or scan.T_prev_curr is None or scan.motion_covariance is None:
-            self.T_keyframe_lidar = None
-            return
-        self.T_keyframe_lidar = self.T_keyframe_lidar @ scan.T_prev_curr
-        A = adjoint(inverse(scan.T_prev_curr))
-        self.covariance = A @ self.covariance @ A.T + scan.motion_covariance
-
-
 class SlamGraph:
     """Follows a run, one scan after the other, or several runs, one after the other.
 
@@ -111,7 +85,7 @@ class SlamGraph:
         self._keyframe_way_m: list[float] = []
         self._registered: list[FloatArray | None] = []  # covariance of each keyframe's pose
         self._sessions: list[int] = []
-        self._way, self._way_m, self._session = _Way(), 0.0, 0
+        self._way, self._way_m, self._session = Way(), 0.0, 0
         self.keyframe_ms: list[float] = []  # wall time of each, drawing left out
         self._edges: list[Edge] = []
         self._closures: list[LoopClosure] = []
@@ -180,7 +154,7 @@ class SlamGraph:
         self._close_submap()
         self._first_scans.append(len(self.scan_poses))
         self._selector = KeyframeSelector(self._config.keyframes)
-        self._way, self._way_m, self._session = _Way(), 0.0, self._session + 1
+        self._way, self._way_m, self._session = Way(), 0.0, self._session + 1
 
     def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
         """Add points (N, 3) of the latest scan, at its pose as refined, to the submap of the last keyframe."""
@@ -264,13 +238,14 @@ class SlamGraph:
 
     def _begin_keyframe(self, scan: GraphScan) -> None:
         key = len(self._keyframe_scans)
-        way, self._way = self._way, _Way()
+        way, self._way = self._way, Way()
         if not key or self._keyframe_scans[-1] < self._first_scans[-1]:
             self._graph.add_pose(key, scan.T_world_lidar)
         else:
             T_first_second = inverse(self.scan_poses[self._keyframe_scans[-1]]) @ scan.T_world_lidar
             self._graph.add_pose(key, self._graph.pose(key - 1) @ T_first_second)
-            for edge in self._edges_between(key, T_first_second, way, scan):
+            before, config = self._registered[-1], self._config.edges
+            for edge in trajectory_edges(key, T_first_second, way, before, scan.covariance, config):
                 self._graph.add_edge(edge)
                 self._edges.append(edge)
             self._session += way.lost  # drift does not explain what happens meanwhile
@@ -279,20 +254,6 @@ class SlamGraph:
         self._registered.append(scan.covariance)
         self._sessions.append(self._session)
         self._is_submap_open = True
-
-    def _edges_between(self, key: int, T_first_second: FloatArray, way: _Way, scan: GraphScan) -> list[Edge]:
-        """From the last keyframe to this one: what the trajectory says, and what the odometry says beside it."""
-        config, before, now = self._config.edges, self._registered[-1], scan.covariance
-        mapped = now is not None
-        covariance = trajectory_covariance(way.length_m, mapped, way.lost, config)
-        if now is not None and before is not None and not way.lost:
-            A = adjoint(inverse(T_first_second))
-            covariance = covariance + now + A @ before @ A.T
-        edges = [Edge(key - 1, key, T_first_second, covariance, "refinement" if mapped else "odometry")]
-        if mapped and way.T_keyframe_lidar is not None:
-            doubted = config.odometry_caution**2 * way.covariance
-            edges.append(Edge(key - 1, key, way.T_keyframe_lidar, doubted, "odometry"))
-        return edges
 
     def _close_submap(self) -> None:
         """The last keyframe has been seen enough of: keep its submap, and look for it among those before."""
@@ -330,14 +291,3 @@ def _joined(recordings: NDArray[np.intp], count: int, loops: list[Edge]) -> NDAr
 
 def _loop_edge(closure: LoopClosure) -> Edge:
     return Edge(closure.first, closure.second, closure.T_first_second, closure.covariance, "loop")
-
-
-def trajectory_covariance(length_m: float, mapped: bool, lost: bool, config: TrajectoryEdgeConfig) -> FloatArray:
-    """(6, 6) of the motion from one keyframe to the next, as far as drift goes; rotation first."""
-    if lost:
-        sigma_deg, sigma_m = config.lost_rotation_deg, config.lost_translation_m + 0.5 * length_m
-    else:
-        factor = 1.0 if mapped else config.unmapped_factor
-        sigma_deg = factor * (config.rotation_deg + config.drift_deg_per_m * length_m)
-        sigma_m = factor * (config.translation_m + 0.01 * config.drift_percent * length_m)
-    return np.diag(np.array([np.deg2rad(sigma_deg)] * 3 + [sigma_m] * 3) ** 2)

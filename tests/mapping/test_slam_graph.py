@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from lidarslam.core.state import Saved, State
-from mapping.graph_config import SlamGraphConfig, TrajectoryEdgeConfig
+from mapping.graph_config import SlamGraphConfig
 from mapping.graph_scan import GraphScan
 from mapping.pose_graph import Optimised
-from mapping.slam_graph import Corrected, SlamGraph, trajectory_covariance
+from mapping.slam_graph import Corrected, SlamGraph
 
 VOXEL_M = 0.1
 CONFIG = SlamGraphConfig(enabled=True)
@@ -292,16 +292,6 @@ def test_a_file_of_submaps_that_was_changed_is_refused(
     file.write_bytes(content[:100])
     with pytest.raises(InputError, match=r"submaps\.bin: is damaged"):
         SlamGraph.restored(CONFIG, saved, file)
-
-
-def test_drift_grows_with_the_way() -> None:
-    config = TrajectoryEdgeConfig(
-        rotation_deg=0.1, translation_m=0.01, drift_deg_per_m=0.05, drift_percent=1.0, unmapped_factor=3.0
-    )
-    sigmas = np.sqrt(np.diag(trajectory_covariance(4.0, True, False, config)))
-    np.testing.assert_allclose(sigmas, [np.deg2rad(0.3)] * 3 + [0.05] * 3)
-    np.testing.assert_allclose(np.sqrt(np.diag(trajectory_covariance(4.0, False, False, config))), 3.0 * sigmas)
-    assert trajectory_covariance(4.0, True, True, config)[3, 3] == pytest.approx(9.0)
 
 
 @pytest.fixture(scope="module")

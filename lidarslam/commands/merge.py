@@ -1,0 +1,59 @@
+"""`lidarslam merge`: one map of several recordings."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.options import (
+    PATH,
+    CommandWithExample,
+    config_options,
+    method_settings,
+    odometry_options,
+    reader_options,
+    resolve,
+    warn_of_ignored,
+)
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
+
+
+@click.command(cls=CommandWithExample, epilog="lidarslam merge ground_floor.mcap stairs.mcap --out building")
+@click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Directory of the merged map.")
+@odometry_options
+@click.option("--pcd", is_flag=True, help="Write the maps as map.pcd too.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
+@reader_options
+@config_options
+@click.pass_context
+def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options: Any) -> None:
+    """Build one map of several recordings of a place.
+
+    Each recording is run by itself and finds itself in the earlier ones where both show the same places. DIR holds the
+    common map, and for each recording a run directory with its poses in the common frame. A recording that nothing
+    joins to the others is left out of the common map, and the exit status is 1.
+    """
+    from lidarslam.merge import MergeRequest
+    from lidarslam.merge import merge as execute
+    from lidarslam.merge_text import format_merge
+    from lidarslam.progress import show_progress
+
+    settings = method_settings(
+        options.pop("odometry"), options.pop("weights"), None, None, None, options.pop("settings")
+    )
+    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
+    config = resolve(options.pop("config_file"), settings, **reader)
+    for source in sources:
+        warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
+    say(format_merge(out, outcome))
+    for line in outcome.stopped:
+        tell(line)
+    apart = [recording for recording in outcome.apart if recording.directory is not None]
+    for recording in apart:
+        tell(f"{recording.directory}: not joined to the others, left out of the common map")
+    if outcome.stopped or apart:
+        ctx.exit(EXIT_MENDABLE)
+    if outcome.summary.lost_scans:
+        ctx.exit(EXIT_LOST)

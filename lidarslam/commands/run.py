@@ -1,0 +1,90 @@
+"""`lidarslam run`: trajectory and map of a recording."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.options import (
+    FILE,
+    PATH,
+    SOURCE,
+    CommandWithExample,
+    config_options,
+    method_settings,
+    odometry_options,
+    reader_options,
+    resolve,
+    scan_options,
+    warn_of_ignored,
+)
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
+
+
+@click.command(
+    cls=CommandWithExample,
+    epilog="""lidarslam run KITTI --sequence 04 --out runs/04
+    lidarslam run office.mcap --out runs/office --rerun save
+    lidarslam run office.mcap --out runs/wheels --prior wheel_odometry.tum
+    lidarslam run office.mcap --out runs/office --rerun save --resume""",
+)
+@SOURCE
+@click.option("--out", type=PATH, required=True, metavar="RUN", help="Directory that the results are written to.")
+@odometry_options
+@click.option("--prior", type=FILE, metavar="TUM_FILE", help="A trajectory of another program as the odometry.")
+@click.option(
+    "--mapping/--no-mapping", default=None, help="Lay every scan on the map of those before.  [default: mapping]"
+)
+@click.option(
+    "--pose-graph/--no-pose-graph", default=None, help="Close loops in a pose graph.  [default: no-pose-graph]"
+)
+@scan_options
+@click.option(
+    "--rerun",
+    type=click.Choice(["off", "save", "spawn"]),
+    default="off",
+    show_default=True,
+    help="Write a Rerun recording beside the results; spawn opens a window too.",
+)
+@click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Go on with the run in the directory, which was killed or stopped, to the results that it would have had;"
+    " give all other options as they were.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
+@reader_options
+@config_options
+@click.pass_context
+def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
+    """Build trajectory and map of a recording."""
+    from lidarslam.progress import show_progress
+    from lidarslam.run import RunRequest, execute, lost_when_finished
+    from lidarslam.summary_text import format_outcome
+
+    if options["resume"] and options["overwrite"]:
+        raise click.UsageError("--resume goes on with a run, --overwrite replaces it; choose one")
+    settings = method_settings(
+        options.pop("odometry"),
+        options.pop("weights"),
+        options["prior"],
+        options.pop("mapping"),
+        options.pop("pose_graph"),
+        options.pop("settings"),
+    )
+    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
+    config = resolve(options.pop("config_file"), settings, **reader)
+    warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    request = RunRequest(source, out, config, **options)
+    if request.resume and (lost := lost_when_finished(request)) is not None:
+        say(f"{out}: is finished, nothing is left to do")
+        ctx.exit(EXIT_LOST if lost else 0)
+    with show_progress(source.name) as progress:
+        outcome = execute(request, progress)
+    say(format_outcome(out, outcome))
+    if outcome.stopped is not None:
+        tell(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; --resume goes on with it")
+        ctx.exit(EXIT_MENDABLE)
+    if outcome.summary.lost_scans:
+        ctx.exit(EXIT_LOST)

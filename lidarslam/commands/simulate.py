@@ -1,0 +1,84 @@
+"""`lidarslam simulate`: a recording with exact truth."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.options import FILE, PATH, CommandWithExample, Registered
+from lidarslam.commands.terminal import say
+
+
+def _worlds() -> Iterable[str]:
+    from lidarslam.simulation.worlds.registry import WORLDS
+
+    return WORLDS
+
+
+def _sensors() -> Iterable[str]:
+    from lidarslam.simulation.sensor_table import SENSORS
+
+    return SENSORS
+
+
+def _motions() -> Iterable[str]:
+    from lidarslam.simulation.carriers import CARRIERS
+
+    return CARRIERS
+
+
+def _mounts() -> Iterable[str]:
+    from lidarslam.simulation.mounts import MOUNTS
+
+    return MOUNTS
+
+
+def _formats() -> Iterable[str]:
+    from lidarslam.simulation.writers.registry import FORMATS
+
+    return FORMATS
+
+
+@click.command(
+    cls=CommandWithExample,
+    epilog="""lidarslam simulate --out recordings/office
+    lidarslam simulate --out recordings/street --world street --sensor hdl-64e --motion car --format kitti
+    lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000""",
+)
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that the recording is made in.")
+@click.option("--world", type=Registered(_worlds), default="office", show_default=True, help="Place to record in.")
+@click.option("--sensor", type=Registered(_sensors), default="vlp-16", show_default=True, help="LiDAR to record with.")
+@click.option(
+    "--motion",
+    type=Registered(_motions),
+    help="What carries the LiDAR.  [default: handheld; car on a trajectory]",
+)
+@click.option(
+    "--trajectory",
+    type=FILE,
+    metavar="FILE",
+    help="TUM or KITTI file to move along, KITTI's smoothed over 0.25 s. The street is built around it; elsewhere it"
+    " has to keep clear of what stands there.",
+)
+@click.option(
+    "--mount", type=Registered(_mounts), default="upright", show_default=True, help="How the LiDAR is mounted."
+)
+@click.option(
+    "--scans", type=click.IntRange(min=1), help="How many scans.  [default: 300, or as long as the trajectory lasts]"
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same recording.")
+@click.option("--format", type=Registered(_formats), default="mcap", show_default=True, help="Format of the files.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
+def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
+    """Make a recording in a simulated world, with the exact trajectory and the exact map."""
+    from lidarslam.progress import show_count
+    from lidarslam.simulation.record import record
+    from lidarslam.simulation.recording_request import RecordRequest
+    from lidarslam.simulation.recording_text import format_summary
+
+    motion = motion or ("handheld" if trajectory is None else "car")
+    request = RecordRequest(out, motion=motion, trajectory=trajectory, **options)
+    with show_count(out.name) as progress:
+        summary = record(request, progress)
+    say(format_summary(request, summary))

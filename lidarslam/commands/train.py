@@ -1,0 +1,53 @@
+"""`lidarslam train`: weights of the learned odometry."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.options import PATH, CommandWithExample, config_options, reader_options
+from lidarslam.commands.terminal import EXIT_MENDABLE, say
+
+
+@click.command(
+    cls=CommandWithExample,
+    epilog="""lidarslam train office.mcap street.mcap --out trained
+    lidarslam train KITTI --sequence 00 --out trained --from shipped --steps 2000
+    lidarslam train --out trained --set simulated.recordings=100
+    lidarslam train --out trained --resume""",
+)
+@click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Directory of the training.")
+@click.option("--resume", is_flag=True, help="Go on with the training in DIR, on the recordings it was begun with.")
+@click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="Where to compute; auto takes a GPU where there is one.",
+)
+@click.option("--steps", type=click.IntRange(min=1), help="How long to train.  [default: 12000]")
+@click.option("--network", type=click.Choice(["correlation", "delora"]), help="What to train.  [default: correlation]")
+@click.option(
+    "--losses",
+    type=click.Choice(["both", "point-to-plane", "plane-to-plane", "paper", "alignment"]),
+    help="What to minimise: geometric losses, as they are or as DeLORA's paper has them, or the distance to the motion"
+    " that alignment finds.  [default: both and alignment]",
+)
+@click.option("--from", "start_from", metavar="WEIGHTS", help="Begin with these weights; shipped: the program's own.")
+@click.option(
+    "--prepared", type=PATH, metavar="DIR", help="Where prepared recordings are kept.  [default: prepared in --out]"
+)
+@reader_options
+@config_options
+@click.pass_context
+def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> None:
+    """Teach a network how a sensor moves between scans; recordings need no labels.
+
+    Ctrl-C ends the training with what there is, and --resume goes on with it. Several GPUs: start it with torchrun.
+    """
+    from lidarslam.train_command import TrainOptions, run_train
+
+    if run_train(TrainOptions(sources, **options), say).interrupted:
+        ctx.exit(EXIT_MENDABLE)

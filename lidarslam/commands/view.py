@@ -1,0 +1,63 @@
+"""`lidarslam view`: finished runs, looked at."""
+
+import signal
+from pathlib import Path
+
+import click
+
+from lidarslam.commands.options import PATH, CommandWithExample, config_options, resolve
+from lidarslam.commands.terminal import say
+from lidarslam.core.errors import InputError
+
+
+@click.command(
+    cls=CommandWithExample,
+    epilog="""lidarslam view runs/04
+    lidarslam view runs/04 runs/wheels --web
+    lidarslam view runs/04 --picture map.png""",
+)
+@click.argument("runs", type=PATH, nargs=-1, required=True)
+@click.option("--web", is_flag=True, help="Serve a browser instead of opening a window.")
+@click.option("--save", type=PATH, metavar="FILE.rrd", help="Write a Rerun recording instead of opening a window.")
+@click.option("--picture", type=PATH, metavar="FILE.png", help="Draw the map of one run, or a .ply file, instead.")
+@config_options
+def view(
+    runs: tuple[Path, ...],
+    web: bool,
+    save: Path | None,
+    picture: Path | None,
+    config_file: Path | None,
+    settings: tuple[str, ...],
+) -> None:
+    """Look at finished runs in Rerun: trajectories, maps, and where tracking was lost."""
+    from lidarslam.finished_run import load_run
+
+    if sum([web, save is not None, picture is not None]) > 1:
+        raise click.UsageError("--web, --save and --picture exclude one another; choose one")
+    if picture is not None:
+        _draw_map(runs, picture)
+        return
+    config = resolve(config_file, settings)
+    finished = [load_run(path) for path in runs]
+    from lidarslam.rerun_viewer import show_runs
+
+    address = show_runs(finished, config.viewer, save, web)
+    if save is not None:
+        say(f"written to {save}")
+    elif web:
+        say(str(address))
+        say("serving until you press Ctrl-C; whoever reaches this machine's ports 9090 and 9876 can look")
+        signal.pause()
+
+
+def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
+    from lidarslam.finished_run import load_map
+    from lidarslam.picture import draw, height_colours, save_picture
+
+    if len(runs) != 1:
+        raise click.UsageError("--picture draws one map; name one run")
+    cloud = load_map(runs[0])
+    if not len(cloud):
+        raise InputError(f"{runs[0]}: holds no map to draw")
+    save_picture(picture, draw(cloud.points, height_colours(cloud.points), cloud.normals))
+    say(f"written to {picture}")
