@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Saved, State
-from mapping.visibility_kernels import TWO_PI, draw, judge
+from mapping.visibility_kernels import NO_GAPS, TWO_PI, draw, judge
 
 _ROWS, _COLUMNS = 16, 360
 # Elevations of the first scan's points between these quantiles make the rows, so that strays do not stretch them.
@@ -23,8 +23,8 @@ _STRAY_SHARE = 0.002
 _LEAST_HEIGHT = math.radians(1.0)
 # Whether there are beams all over a row is told by fourths of it: most hold a tenth of the mean number of points.
 _FOURTHS, _FILLED_OF_MEAN, _MOST = 4, 0.1, 0.6
-_AT_CENTRE, _EVERYWHERE = 0.3, 0.5
-_EVERY = 5
+_AT_CENTRE, _EVERYWHERE = 0.3, NO_GAPS
+_EVERY = 2
 _MOST_VIEWS = 512
 # A view says nothing where a pixel is wider than so many voxels, but for what is near all the same.
 _PIXEL_OF_VOXEL = 3.0
@@ -129,7 +129,9 @@ class Views:
 
 
 def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) -> NDArray[np.bool_]:
-    """Whether what was at the points has moved away: at least three views see through, two for each that does not.
+    """Whether what was at the points has moved away: at least three views see through, and no fewer than do not.
+
+    Of views with gaps between their beams it takes two for each that does not.
 
     Where more than 64 have something to say of a point, as many are heard, from the whole time.
 

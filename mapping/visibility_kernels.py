@@ -21,9 +21,12 @@ LEAST_RETURNS = 6
 # A return is at a point's range, within so much and a voxel: noise, errors of poses, and a surface seen at a slant.
 MARGIN_M = 0.1
 MARGIN_OF_RANGE = 0.01
-# A point is where something was while it passed when so many views see through it, and so many for each that does not.
+# A point is where something was while it passed when so many views see through it, and enough for those that do not. Of
+# lasers with gaps between them most pass a thin board, which single ones meet: it takes two of these for one that does.
 LEAST_THROUGH = 3
-THROUGH_PER_SUPPORT = 2
+WITH_GAPS = 0.5
+# Views whose beams pass so far from the centre of a row, in rows, have no gaps.
+NO_GAPS = 0.5
 # So many views that say something are enough to judge a point by, where hundreds would.
 ENOUGH = 64
 
@@ -71,18 +74,20 @@ def judge(
     views = len(images)
     for m in range(len(points)):
         a, b, c = points[m, 0], points[m, 1], points[m, 2]
-        through, support = 0, 0
+        through, support, weight = 0, 0, 0.0
         for v in range(views):
             says = _testimony(a, b, c, v, T_lidar_world, images, grids, reach_m, voxel_size_m)
             if says == _THROUGH:
                 through += 1
+                weight += 1.0 if grids[v, 2] >= NO_GAPS else WITH_GAPS
             elif says == _SUPPORTS:
                 support += 1
             # Most points are where they were: no need to hear all views once these cannot turn the balance.
-            outvoted = through + views - 1 - v < max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support)
+            left = views - 1 - v
+            outvoted = through + left < LEAST_THROUGH or weight + left < support
             if outvoted or through + support >= ENOUGH:
                 break
-        moved[m] = through >= max(LEAST_THROUGH, THROUGH_PER_SUPPORT * support)
+        moved[m] = through >= LEAST_THROUGH and weight >= support
 
 
 @compiled
