@@ -243,7 +243,7 @@ def test_views_are_bounded_however_long_the_way() -> None:
 
 
 def test_of_many_views_those_that_are_heard_are_from_the_whole_time() -> None:
-    """Somebody stood there for a quarter of the time, at the beginning, in the midst or at the end; or for most of it."""
+    """Somebody stood there for a quarter of the time, at its beginning, midst or end; or for most of it."""
     for begin in (0, 120, 240):
         images = [wall(10.0)] * 320
         images[begin : begin + 80] = [wall(5.1)] * 80
