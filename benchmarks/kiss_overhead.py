@@ -72,7 +72,8 @@ def run_ours(source: Path) -> dict[str, Any]:
     """Our run on the recording."""
     from lidarslam.config import load_config
     from lidarslam.core.trajectory_io import read_tum
-    from lidarslam.run import RunRequest, execute
+    from lidarslam.run import execute
+    from lidarslam.run_request import RunRequest
 
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()

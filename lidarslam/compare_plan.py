@@ -12,7 +12,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.method_run import PROCESS, MethodTask
 from lidarslam.methods import Method
-from lidarslam.run import RunRequest
+from lidarslam.run_request import RunRequest
 
 # In the comparison's folder; each recording's folder holds its own comparison.json.
 COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"

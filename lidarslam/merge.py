@@ -16,19 +16,12 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.loop_closing import FinishedGraph, GraphOutcome, begin_graph, finish_recordings
-from lidarslam.run import (
-    NoScanError,
-    Progress,
-    RunOutcome,
-    RunRequest,
-    Tracked,
-    open_odometry,
-    require_apart,
-    track,
-    write_map,
-    write_results,
-)
+from lidarslam.run import open_odometry, require_apart
 from lidarslam.run_directory import RunDirectory, remove_run
+from lidarslam.run_request import RunRequest
+from lidarslam.run_results import RunOutcome, write_map, write_results
+from lidarslam.run_tracking import NoScanError, Tracked, track
+from lidarslam.run_watch import Progress
 from lidarslam.scan_log import ScanLog
 from lidarslam.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
 from lidarslam.viewer import NullViewer

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.merge import MergeOutcome
-from lidarslam.run import RunOutcome
+from lidarslam.run_results import RunOutcome
 from lidarslam.summary import MergedRecording, MergeSummary
 from lidarslam.summary_text import format_map
 

@@ -12,7 +12,8 @@ from typing import Any
 
 from lidarslam.config import Config
 from lidarslam.core.errors import LidarSlamError
-from lidarslam.run import RunRequest, execute
+from lidarslam.run import execute
+from lidarslam.run_request import RunRequest
 
 STOPPED, LOST = 1, 3
 

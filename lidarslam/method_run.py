@@ -14,8 +14,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.finished_run import load_run
 from lidarslam.method_ending import WHOLE, judge, read_summary
 from lidarslam.method_process import encode
-from lidarslam.run import RunRequest
 from lidarslam.run_directory import RunDirectory
+from lidarslam.run_request import RunRequest
 from lidarslam.supervised import Limits, supervise
 from lidarslam.yaml_text import read_yaml
 

@@ -11,7 +11,7 @@ from rich.text import Text
 from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline import ScanResult
-from lidarslam.run import Progress as ProgressCallback
+from lidarslam.run_watch import Progress as ProgressCallback
 
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
 

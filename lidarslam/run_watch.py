@@ -17,6 +17,9 @@ from lidarslam.scan_log import ScanLog
 from lidarslam.viewer import Viewer
 from mapping.global_map import GlobalMap
 
+Progress = Callable[[int, int, ScanResult], None]
+"""Called after every scan with its number from 1, how many there are, and what became of it."""
+
 
 @dataclass
 class Watch:

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.run import RunOutcome
 from lidarslam.run_directory import SCANS_CSV, SUMMARY
+from lidarslam.run_results import RunOutcome
 from lidarslam.summary import GraphSummary, RunSummary, WrittenMap
 
 # Stretches of lost scans that are spelt out; summary.json has them all.

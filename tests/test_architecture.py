@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "lidarslam": PACKAGES,
 }
 # The way down is cli -> commands -> run -> pipeline -> libraries: nobody looks up it.
-RUN = ("lidarslam.run", "lidarslam.run_state", "lidarslam.run_watch")
+RUN = tuple(f"lidarslam.run{part}" for part in ("", "_request", "_results", "_state", "_tracking", "_watch"))
 MAY_NOT_IMPORT = {
     "lidarslam": ("lidarslam.cli", "lidarslam.commands"),
     "lidarslam.pipeline": RUN,

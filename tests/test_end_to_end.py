@@ -21,8 +21,9 @@ from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
 from lidarslam.finished_run import load_run
 from lidarslam.pipeline import ScanResult
-from lidarslam.run import RunRequest, execute
+from lidarslam.run import execute
 from lidarslam.run_directory import FILES
+from lidarslam.run_request import RunRequest
 from lidarslam.scan_order import in_order
 from mapping.g2o import read_g2o
 

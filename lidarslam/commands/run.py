@@ -60,7 +60,8 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.progress import show_progress
-    from lidarslam.run import RunRequest, execute, lost_when_finished
+    from lidarslam.run import execute, lost_when_finished
+    from lidarslam.run_request import RunRequest
     from lidarslam.summary_text import format_outcome
 
     if options["resume"] and options["overwrite"]:

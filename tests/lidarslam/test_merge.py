@@ -20,7 +20,7 @@ from lidarslam.finished_run import load_map, load_run
 from lidarslam.merge import MergeOutcome, MergeRequest, merge
 from lidarslam.merge_text import format_merge
 from lidarslam.pipeline import ScanResult
-from lidarslam.run import Progress
+from lidarslam.run_watch import Progress
 from lidarslam.simulation.motions import Motion
 from lidarslam.simulation.mounts import mount_pose
 from lidarslam.simulation.recorder import Simulation

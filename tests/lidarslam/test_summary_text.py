@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from lidarslam.loop_closing import LoopReport
-from lidarslam.run import RunOutcome
+from lidarslam.run_results import RunOutcome
 from lidarslam.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.summary_text import format_outcome
 
