@@ -114,7 +114,7 @@ def close_loops(
     if closed is not None:
         log.correct(closed.T_world_lidar)
         pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
-        viewer.show_closed(log.trajectory.positions, pairs, closed.global_map)
+        viewer.show_closed(log.trajectory.positions, pairs)
     return closed
 
 

@@ -19,7 +19,7 @@ from lidarslam.loop_closing import FinishedGraph, GraphOutcome, begin_graph, fin
 from lidarslam.run import open_odometry, require_apart
 from lidarslam.run_directory import RunDirectory, remove_run
 from lidarslam.run_request import RunRequest
-from lidarslam.run_results import RunOutcome, write_map, write_results
+from lidarslam.run_results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run_tracking import NoScanError, Tracked, track
 from lidarslam.run_watch import Progress
 from lidarslam.scan_log import ScanLog
@@ -247,7 +247,8 @@ def _write(
     if common is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(common.graph))
         views = _all_views(way, scans, joined, common)
-        written = write_map(directory, common.global_map, views, request.config.global_map, request.pcd)
+        drawn = drawn_map(common.global_map, views, request.config.global_map)
+        written = write_map(directory, drawn, request.pcd)
     recordings = [_entry(part, run, index in joined) for index, (part, run) in enumerate(zip(parts, runs, strict=True))]
     summary = MergeSummary(
         recordings=tuple(recordings),
@@ -291,7 +292,8 @@ def _write_run(
         tracked.log.correct(closed.T_world_lidar)
     if not is_joined:
         tracked.log.warn(_OF_ITS_OWN)
-    return write_results(part.directory, part.request, tracked, closed)
+    drawn = final_map(tracked, closed, part.request.config.global_map)
+    return write_results(part.directory, part.request, tracked, closed, drawn)
 
 
 def _entry(part: _Part, run: RunOutcome | None, is_joined: bool) -> MergedRecording:

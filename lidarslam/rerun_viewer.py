@@ -27,7 +27,6 @@ from lidarslam.finished_run import FinishedRun
 from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
 from lidarslam.run_directory import RunDirectory
-from mapping.global_map import GlobalMap
 
 _log = logging.getLogger(__name__)
 
@@ -133,17 +132,19 @@ class RerunViewer:
         if self._last_position is not None:
             near = np.linalg.norm(points - self._last_position, axis=1) < self._config.map_radius_m
             points = points[near]
+        self.show_final_map(points)
+
+    def show_final_map(self, points: FloatArray) -> None:
+        """All of the map, coloured by height."""
         points = _every_nth(points, self._config.map_points)
         cloud = rr.Points3D(points, colors=height_colours(points), radii=_MAP_RADIUS)
         self._recording.log("world/map", cloud)
 
-    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], global_map: GlobalMap) -> None:
-        """The corrected path beside the one that was seen to grow, the loops, and the map drawn anew."""
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]]) -> None:
+        """The corrected path beside the one that was seen to grow, and the loops."""
         path = rr.LineStrips3D([positions], colors=[_CLOSED_COLOUR], radii=_PATH_RADIUS, labels=["loops closed"])
         self._recording.log("world/closed/trajectory", path)
         self._recording.log("world/closed/loops", _loop_lines(positions, np.array(loops, dtype=np.intp).reshape(-1, 2)))
-        self._last_position = positions[-1]
-        self.show_map(global_map.points())
 
     def close(self) -> None:
         """Wait until everything is written; a window that went away does not fail the run."""

@@ -12,7 +12,7 @@ from lidarslam.loop_closing import close_loops
 from lidarslam.resuming import describe_computed, lost_before
 from lidarslam.run_directory import RunDirectory
 from lidarslam.run_request import RunRequest, describe_run
-from lidarslam.run_results import RunOutcome, write_results
+from lidarslam.run_results import RunOutcome, final_map, write_results
 from lidarslam.run_state import log_and_graph
 from lidarslam.run_tracking import track
 from lidarslam.run_watch import Progress
@@ -49,7 +49,10 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         with viewing(request.rerun, recording.name, config.viewer, directory, log) as viewer:
             tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
             closed = close_loops(graph, tracked.global_map, log, viewer)
-        outcome = write_results(directory, request, tracked, closed)
+            drawn = final_map(tracked, closed, config.global_map)
+            if drawn.cloud is not None:
+                viewer.show_final_map(drawn.cloud.points)
+        outcome = write_results(directory, request, tracked, closed, drawn)
     if unfinished is not None:
         unfinished.end(outcome.stopped is not None)
     return outcome

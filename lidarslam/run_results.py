@@ -13,7 +13,7 @@ from lidarslam.summary import RunSummary, WrittenMap, summarise
 from lidarslam.trajectory_files import write_trajectories
 from mapping.config import GlobalMapConfig
 from mapping.g2o import format_g2o
-from mapping.global_map import GlobalMap
+from mapping.global_map import GlobalMap, PointCloud
 from mapping.map_io import write_cloud
 from mapping.visibility import PlacedViews, seen_through
 
@@ -33,18 +33,46 @@ class RunOutcome:
     stopped: str | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class DrawnMap:
+    """A map as it is written.
+
+    Attributes:
+        cloud: its points; None when no scan was drawn.
+        voxel_size_m: it has one point in each of these; None when no scan was drawn.
+        moved: points that are left out, of what has moved.
+    """
+
+    cloud: PointCloud | None
+    voxel_size_m: float | None
+    moved: int = 0
+
+
+def final_map(tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig) -> DrawnMap:
+    """The map of a run whose poses are final; a graph has drawn it anew."""
+    views = tracked.views.placed(tracked.log.trajectory.T_world_lidar)
+    return drawn_map(tracked.global_map if closed is None else closed.global_map, views, config)
+
+
+def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig) -> DrawnMap:
+    """A map without what the views see through."""
+    if global_map is None:
+        return DrawnMap(None, None)
+    moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
+    cloud = global_map.cloud(config.normal_neighbours, config.min_hits, moved)
+    return DrawnMap(cloud, global_map.voxel_size_m, int(moved.sum()))
+
+
 def write_results(
-    directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None
+    directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None, drawn: DrawnMap
 ) -> RunOutcome:
-    """Write everything but the log of the scans: their poses are final by now, and a graph has drawn its map."""
+    """Write everything but the log of the scans: their poses are final by now."""
     config, log = request.config, tracked.log
     directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
-    global_map = tracked.global_map if closed is None else closed.global_map
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
     metrics = write_trajectories(directory, tracked.recording, tracked.truth, log)
-    views = tracked.views.placed(log.trajectory.T_world_lidar)
-    written = write_map(directory, global_map, views, config.global_map, request.pcd)
+    written = write_map(directory, drawn, request.pcd)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     summary = summarise(log, tracked.total_ms, written, skipped, closed)
@@ -52,18 +80,12 @@ def write_results(
     return RunOutcome(summary, metrics, tracked.stopped)
 
 
-def write_map(
-    directory: RunDirectory, global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig, pcd: bool
-) -> WrittenMap:
-    """Write the map without what the views see through, unless it is empty."""
-    if global_map is None:
-        return WrittenMap(0, None, 0)
-    moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
-    cloud = global_map.cloud(config.normal_neighbours, config.min_hits, moved)
-    written = WrittenMap(len(cloud), global_map.voxel_size_m, int(moved.sum()))
-    if not len(cloud):
-        return written
+def write_map(directory: RunDirectory, drawn: DrawnMap, pcd: bool) -> WrittenMap:
+    """Write a map, unless it is empty."""
+    cloud = drawn.cloud
+    if cloud is None or not len(cloud):
+        return WrittenMap(0, drawn.voxel_size_m, drawn.moved)
     for name in (files.MAP_PLY, files.MAP_PCD) if pcd else (files.MAP_PLY,):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
-    return written
+    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved)

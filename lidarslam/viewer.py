@@ -11,7 +11,6 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline import ScanResult
 from lidarslam.run_directory import RunDirectory
 from lidarslam.scan_log import ScanLog
-from mapping.global_map import GlobalMap
 
 RerunMode = Literal["off", "save", "spawn"]
 
@@ -31,8 +30,11 @@ class Viewer(Protocol):
     def show_map(self, points: FloatArray) -> None:
         """The points (N, 3) of the map so far, in the world."""
 
-    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], global_map: GlobalMap) -> None:
-        """Where all scans (N, 3) are once loops are closed, between which scans these are, and the map then."""
+    def show_final_map(self, points: FloatArray) -> None:
+        """The points (N, 3) of the map as it is written, in place of those so far."""
+
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]]) -> None:
+        """Where all scans (N, 3) are once loops are closed, and between which scans these are."""
 
     def close(self) -> None:
         """The run is over; everything shown is kept."""
@@ -54,7 +56,10 @@ class NullViewer:
     def show_map(self, points: FloatArray) -> None:
         """Nothing."""
 
-    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]], global_map: GlobalMap) -> None:
+    def show_final_map(self, points: FloatArray) -> None:
+        """Nothing."""
+
+    def show_closed(self, positions: FloatArray, loops: Sequence[tuple[int, int]]) -> None:
         """Nothing."""
 
     def close(self) -> None:

@@ -107,6 +107,23 @@ def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
     assert f"one in every voxel of 10 cm; {left_out:,} points of what moved left out" in said
 
 
+def test_the_last_map_that_rerun_shows_is_the_written_one(source: Path, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    run(source, tmp_path / "run", "--rerun", "save")
+    shown = [
+        batch.column("Points3D:positions")[row].values.to_numpy(zero_copy_only=False)
+        for chunk in RrdReader(tmp_path / "run" / "recording.rrd").stream()
+        if chunk.entity_path == "/world/map"
+        for batch in [chunk.to_record_batch()]
+        for row in range(batch.num_rows)
+    ]
+    assert len(shown) > 1
+    points = np.stack(list(shown[-1]))
+    assert len(points) == len(written(tmp_path / "run"))
+    np.testing.assert_allclose(np.sort(points, axis=0), np.sort(written(tmp_path / "run"), axis=0), atol=1e-4)
+
+
 def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
     """Also after a scan that shows nothing, and with a state restored in between."""
     T_world_lidar, stamps = truth().T_world_lidar, truth().stamps
