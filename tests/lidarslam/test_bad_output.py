@@ -98,6 +98,31 @@ def test_a_cut_recording_of_rerun_is_told_from_a_whole_one(tmp_path: Path, finis
             require_complete(tmp_path / "cut.rrd")
 
 
+def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:
+    out = tmp_path / "run"
+    command = ("run", small_recording, "--out", out, *FAST, "--set", "global_map.voxel_size_m=0.3", "--rerun", "save")
+    assert lidarslam(*command).exit_code == 0
+    sizes = {path.name: path.stat().st_size for path in out.iterdir()}
+    room = sizes.pop("recording.rrd") // 2
+    assert max(sizes.values()) < room
+    with files_no_longer_than(room):
+        result = lidarslam(*command, "--overwrite")
+    assert result.exit_code == 0
+    (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
+    assert warning.startswith("no recording.rrd: ")
+    assert f"warning: {warning}" in result.stdout
+    assert set(left_in(out)) == set(sizes)
+
+
+def test_a_view_that_finds_no_room_is_not_kept(tmp_path: Path, finished_run: Path) -> None:
+    with files_no_longer_than(5_000):
+        result = lidarslam("view", finished_run, "--save", tmp_path / "view.rrd")
+    assert result.exit_code == 1
+    assert result.stderr.count("lidarslam: ") == 1
+    assert f"{tmp_path}/view.rrd: cannot be written" in result.stderr
+    assert not [name for name in left_in(tmp_path) if "view.rrd" in name]
+
+
 def _evaluate(run: Path, out: Path) -> Sequence[object]:
     return ["evaluate", run, "--out", out / "metrics.json"]
 
