@@ -165,13 +165,12 @@ def remove_run(path: Path) -> None:
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
     present = [name for name in FILES if (path / name).exists()]
-    if (path / ABOUT).exists():
+    if (path / ABOUT).exists():  # whatever lies beside it is of that run, its description may be missing yet
         if not overwrite and not resume:
             raise OutputError(
                 f"{path}: holds a run that did not finish; go on with it by --resume, or replace it with --overwrite"
             )
-        if resume or not present:
-            return [*present, *([] if resume else [ABOUT])]
+        return [*present, *([] if resume else [ABOUT])]
     if not present or resume:
         return present
     listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
@@ -181,7 +180,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
         raise OutputError(
             f"{path}: holds a run already ({listed}); name another directory, or replace it with --overwrite"
         )
-    return [*present, *([ABOUT] if (path / ABOUT).exists() else [])]
+    return present
 
 
 def _is_run(path: Path) -> bool:
