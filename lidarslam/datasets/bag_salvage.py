@@ -1,13 +1,15 @@
 """What is left of a bag whose index is gone: its messages, one after another as they lie in the file.
 
-A recorder that was killed, or a copy that was cut short, leaves no index, and half a chunk at the end. Layouts: ROS bag
-format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the SQLite tables of rosbag2.
+A recorder that was killed, or a copy that was cut short, leaves no index, and half a chunk at the end. Where there is
+an index, and the bag is damaged in the midst, it says where the chunks behind the damage are. Layouts: ROS bag format
+2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the SQLite tables of rosbag2.
 """
 
 import sqlite3
 import struct
+import zlib
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
@@ -19,6 +21,7 @@ Expand = Callable[[str, bytes, int], bytes]
 """Decompresses a chunk: the compression's name, the data, and the size it should have afterwards."""
 
 _ROSBAG1_MAGIC, _MCAP_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"
+_ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id"
 # Records are read whole; a longer one is a damaged length.
 _LONGEST_RECORD = 1 << 30
 
@@ -48,7 +51,7 @@ class Salvage:
             ValueError, OSError, sqlite3.Error: it is no such file at all.
         """
         self._path = path
-        self._walk = {".bag": _Rosbag1, ".mcap": _Mcap, ".db3": _Sqlite}[suffix]
+        self._walk = _WALKS[suffix]
         self._expand = expand
         walk = self._walk(path, expand)
         self.counts = Counter((message.topic, message.message_type) for message in walk.messages())
@@ -61,6 +64,44 @@ class Salvage:
                 yield message
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where to go on in a file whose index is known.
+
+    Attributes:
+        path, suffix: the file, and which kind it is.
+        connections: topic and type of each number that messages carry.
+        chunks: where they begin, bytes; none where the file has none.
+    """
+
+    path: Path
+    suffix: str
+    connections: Mapping[int, tuple[str, str]]
+    chunks: Sequence[int]
+
+
+def messages_from(place: Place, expand: Expand, on_damage: Callable[[str], None]) -> Iterator[SalvagedMessage]:
+    """The messages in the chunks of a place, or of its whole file where that has none, without those that are damaged.
+
+    Damage is told, but for that of the first chunk: whoever goes on from there knows of it.
+    """
+    walk = _WALKS[place.suffix](place.path, expand)
+    if not place.chunks:
+        yield from walk.messages()
+        return
+    walk.know(place.connections)
+    with place.path.open("rb") as file:
+        for number, chunk in enumerate(place.chunks):
+            walk.damage = None
+            file.seek(chunk)
+            try:
+                yield from walk.record(file, whole=True)
+            except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
+                walk.damaged("it cannot be read", error)
+            if walk.damage is not None and number:
+                on_damage(f"the chunk at byte {chunk:,}: {walk.damage}")
+
+
 class _Walk:
     """One pass through a file; `damage` says what it met."""
 
@@ -69,6 +110,9 @@ class _Walk:
         self._expand = expand
         self.damage: str | None = None
 
+    def know(self, connections: Mapping[int, tuple[str, str]]) -> None:
+        """Topics and types by the numbers that messages carry, which stand in chunks that may not be read."""
+
     def messages(self) -> Iterator[SalvagedMessage]:
         """All messages, until the file ends or is damaged beyond a chunk."""
         with self._path.open("rb") as file:
@@ -76,29 +120,35 @@ class _Walk:
             self._begin(file)
             while (at := file.tell()) < size:
                 try:
-                    yield from self._record(file, whole=True)
+                    yield from self.record(file, whole=True)
                 except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
-                    self._damaged(f"it breaks off at byte {at:,} of {size:,}", error)
+                    self.damaged(f"it breaks off at byte {at:,} of {size:,}", error)
                     return
 
     def _begin(self, file: BinaryIO) -> None:
         raise NotImplementedError
 
-    def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
+    def record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
+        """The messages in the record that begins here, of a whole file or of a chunk."""
         raise NotImplementedError
 
-    def _chunk(self, compression: str, data: bytes, size: int, complete: bool) -> Iterator[SalvagedMessage]:
+    def _chunk(
+        self, compression: str, data: bytes, size: int, complete: bool, checksum: int = 0
+    ) -> Iterator[SalvagedMessage]:
         """The messages in a chunk; one that is damaged inside costs no more than itself."""
         try:
             chunk = BytesIO(data if compression in ("", "none") else self._expand(compression, data, size))
+            if complete and checksum and zlib.crc32(chunk.getbuffer()) != checksum:
+                raise ValueError("its checksum is another")
             end = len(chunk.getbuffer())
             while chunk.tell() < end:
-                yield from self._record(chunk, whole=False)
+                yield from self.record(chunk, whole=False)
         except Exception as error:
             if complete:
-                self._damaged("a chunk in it is damaged", error)
+                self.damaged("a chunk in it is damaged", error)
 
-    def _damaged(self, what: str, error: Exception) -> None:
+    def damaged(self, what: str, error: Exception) -> None:
+        """What is damaged, and how that shows; the first counts."""
         self.damage = self.damage or f"{what} ({str(error) or type(error).__name__})"
 
 
@@ -118,11 +168,14 @@ class _Rosbag1(_Walk):
         super().__init__(path, expand)
         self._connections: dict[bytes, tuple[str, str]] = {}
 
+    def know(self, connections: Mapping[int, tuple[str, str]]) -> None:
+        self._connections = {struct.pack("<I", number): named for number, named in connections.items()}
+
     def _begin(self, file: BinaryIO) -> None:
         if file.read(len(_ROSBAG1_MAGIC)) != _ROSBAG1_MAGIC:
             raise ValueError("it does not begin as a bag of ROS 1")
 
-    def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
+    def record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
         header = _fields(_take(file, *struct.unpack("<I", _take(file, 4))))
         (size,) = struct.unpack("<I", _take(file, 4))
         kind = header.get(b"op")
@@ -140,10 +193,8 @@ class _Rosbag1(_Walk):
         if kind == b"\x07":
             named = _fields(data)
             package, _, name = named[b"type"].decode().rpartition("/")
-            self._connections[header[b"conn"]] = (
-                header[b"topic"].decode(),
-                f"{package.removesuffix('/msg')}/msg/{name}",
-            )
+            message_type = f"{package.removesuffix('/msg')}/msg/{name}"
+            self._connections.setdefault(header[b"conn"], (header[b"topic"].decode(), message_type))
         elif kind == b"\x02":
             seconds, nanoseconds = struct.unpack("<II", header[b"time"])
             yield SalvagedMessage(*self._connections[header[b"conn"]], seconds * 10**9 + nanoseconds, data)
@@ -172,11 +223,14 @@ class _Mcap(_Walk):
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str]] = {}
 
+    def know(self, connections: Mapping[int, tuple[str, str]]) -> None:
+        self._channels = dict(connections)
+
     def _begin(self, file: BinaryIO) -> None:
         if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
             raise ValueError("it does not begin as an MCAP file")
 
-    def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
+    def record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
         kind, size = struct.unpack("<BQ", _take(file, 9))
         if kind in (0x02, 0x0F):  # the footer, or the end of the data: what follows repeats what was
             file.seek(0, 2)
@@ -185,9 +239,9 @@ class _Mcap(_Walk):
             if size > _LONGEST_RECORD:
                 raise ValueError(f"a chunk of {size:,} bytes")
             data = file.read(size)
-            _, _, expanded, _, characters = struct.unpack_from("<QQQII", data)
+            _, _, expanded, checksum, characters = struct.unpack_from("<QQQII", data)
             compression = data[32 : 32 + characters].decode()
-            yield from self._chunk(compression, data[40 + characters :], expanded, len(data) == size)
+            yield from self._chunk(compression, data[40 + characters :], expanded, len(data) == size, checksum)
             _require_whole(data, size)
             return
         data = _take(file, size)
@@ -195,7 +249,8 @@ class _Mcap(_Walk):
             self._schemas[struct.unpack_from("<H", data)[0]] = _text(data, 2)
         elif kind == 0x04:
             channel, schema = struct.unpack_from("<HH", data)
-            self._channels[channel] = (_text(data, 4), self._schemas[schema])
+            if channel not in self._channels:
+                self._channels[channel] = (_text(data, 4), self._schemas[schema])
         elif kind == 0x05:
             channel, _, record_ns, _ = struct.unpack_from("<HIQQ", data)
             yield SalvagedMessage(*self._channels[channel], record_ns, data[22:])
@@ -215,9 +270,48 @@ class _Sqlite(_Walk):
             # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
             database.execute("PRAGMA writable_schema=ON")
             topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
-            rows = database.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED")
+            held, is_cut = None, self._is_cut()
+            for topic, record_ns, raw in self._rows(database):
+                if held is not None:
+                    yield held
+                    held = None
+                try:
+                    message = SalvagedMessage(*topics[topic], int(record_ns), bytes(raw))
+                except (KeyError, TypeError, ValueError) as error:
+                    self.damaged("a row of it is no message", error)
+                    continue
+                if is_cut:  # of the last one SQLite may have made up the end, from zeros
+                    held = message
+                else:
+                    yield message
+
+    def _is_cut(self) -> bool:
+        """Whether pages are missing at the end (sqlite.org/fileformat2.html, 1.3)."""
+        with self._path.open("rb") as file:
+            header = file.read(32)
+        (page,), (pages,) = struct.unpack_from(">H", header, 16), struct.unpack_from(">I", header, 28)
+        return bool(self._path.stat().st_size < pages * (65536 if page == 1 else page))
+
+    def _rows(self, database: sqlite3.Connection) -> Iterator[tuple[int, int, bytes]]:
+        """Past pages that are damaged, row by row, as far as the table goes."""
+        done, last, lost = -1, None, 0
+        first: tuple[int, sqlite3.Error] | None = None
+        while last is None or done < last:
             try:
-                for topic, record_ns, raw in rows:
-                    yield SalvagedMessage(*topics[topic], int(record_ns), bytes(raw))
-            except (sqlite3.Error, KeyError, TypeError, ValueError) as error:
-                self._damaged("it breaks off", error)
+                for number, topic, record_ns, raw in database.execute(_ROWS, (done,)):
+                    yield topic, record_ns, raw
+                    done = number
+                break
+            except sqlite3.Error as error:
+                first = first or (done, error)
+            try:
+                (last,) = database.execute("SELECT max(id) FROM messages").fetchone()
+            except sqlite3.Error:  # its end is gone too
+                self.damaged(f"it breaks off after row {done:,}", first[1])
+                return
+            done, lost = done + 1, lost + 1
+        if first is not None:
+            self.damaged(f"{lost:,} rows of it cannot be read, the first after row {first[0]:,}", first[1])
+
+
+_WALKS: dict[str, type[_Walk]] = {".bag": _Rosbag1, ".mcap": _Mcap, ".db3": _Sqlite}
