@@ -155,7 +155,7 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
 
 def _begin(directory: RunDirectory, description: dict[str, Any], stack: ExitStack) -> Unfinished:
     """Say of a directory that what lies there is not whole, until it is."""
-    unfinished = stack.enter_context(Unfinished.claim(directory.path, description, resume=False))
+    unfinished = stack.enter_context(Unfinished.claim(directory.path, description, False, lambda: directory.is_mixed))
     unfinished.begin(None)
     return unfinished
 

@@ -99,6 +99,11 @@ class RunDirectory:
                 if is_new and not any(path.iterdir()):
                     path.rmdir()
 
+    @property
+    def is_mixed(self) -> bool:
+        """Whether some of an earlier run's files were replaced by now, and some were not."""
+        return bool(self._written) and bool(self._stale - {ABOUT})
+
     def __getitem__(self, name: str) -> Path:
         return self.path / name
 

@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -116,8 +116,12 @@ class Unfinished:
 
     @classmethod
     @contextlib.contextmanager
-    def claim(cls, run: Path, description: dict[str, Any], resume: bool) -> Iterator["Unfinished"]:
+    def claim(
+        cls, run: Path, description: dict[str, Any], resume: bool, is_mixed: Callable[[], bool] = lambda: False
+    ) -> Iterator["Unfinished"]:
         """Be the only one at work on a run, new or resumed; what nobody could resume is removed when this fails.
+
+        It stays where some results are this run's by then and some an earlier one's, which `is_mixed` tells.
 
         Raises:
             InputError: there is nothing to resume, it is damaged, or another run than the described one.
@@ -148,7 +152,7 @@ class Unfinished:
             try:
                 yield unfinished
             except BaseException:
-                if not was_there and not unfinished.state.is_file():
+                if not was_there and not unfinished.state.is_file() and not is_mixed():
                     unfinished._remove_all()
                 raise
 

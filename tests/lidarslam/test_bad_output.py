@@ -79,6 +79,29 @@ def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, 
     assert lidarslam("run", small_recording, "--out", out, *FAST, "--overwrite").exit_code == 0
 
 
+@pytest.mark.parametrize("size", [0, 4_000, 100_000])
+def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recording: Path, size: int) -> None:
+    """Where the disk fills up as a run replaces an earlier one, before it has replaced anything or after."""
+    out = tmp_path / "run"
+    assert lidarslam("run", small_recording, "--out", out, *FAST).exit_code == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with files_no_longer_than(size):
+        result = lidarslam("run", small_recording, "--out", out, *FAST, "--start", 1, "--overwrite")
+    assert result.exit_code == 1
+    is_mixed = before != {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    assert is_mixed == (size == 100_000)
+    evaluated = lidarslam("evaluate", out)
+    if is_mixed:
+        assert evaluated.exit_code == 1
+        assert "this run did not finish" in evaluated.stderr
+        assert evaluated.stderr.count("\n") == 1
+    else:
+        assert evaluated.exit_code == 0
+    assert lidarslam("run", small_recording, "--out", out, *FAST, "--start", 1, "--overwrite").exit_code == 0
+    assert lidarslam("evaluate", out).exit_code == 0
+    assert json.loads((out / "summary.json").read_text())["scans"] == 5
+
+
 def test_a_map_is_whole_or_absent(tmp_path: Path) -> None:
     cloud = PointCloud(np.ones((1_000, 3)), np.ones((1_000, 3)))
     for suffix in ("ply", "pcd"):
