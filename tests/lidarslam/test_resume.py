@@ -300,13 +300,17 @@ def go_on(run: Run, expected: Whole, source: Path, out: Path) -> None:
 EVERYWHERE = 24
 
 
-@pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute or two
-@pytest.mark.parametrize("method", ["constant velocity", "pose graph"])
+@pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
+@pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10)])
 def test_a_run_may_be_killed_before_anything_it_does_on_disk(
-    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str, every_scans: int
 ) -> None:
-    """What lies there before each of these things is kept of one run, as so many kills would leave it."""
+    """What lies there before each of these things is kept of one run, as so many kills would leave it.
+
+    A state is saved three times, each time by the same steps.
+    """
     expected, kept = whole(method), tmp_path / "kept"
+    expected = replace(expected, arguments=[*expected.arguments, "--set", f"checkpoints.every_scans={every_scans}"])
     kept.mkdir()
     ended = run(source, tmp_path / "run", *expected.arguments, keep_in=kept)
     assert ended.status == expected.ended.status, ended.said
