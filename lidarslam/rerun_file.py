@@ -4,6 +4,8 @@ import os
 import threading
 from pathlib import Path
 
+# Where an open file of this process has a path.
+_ENTRANCES = Path("/dev/fd")
 # A pipe hands over this much at most.
 _PIECE = 1 << 20
 # What there was to write is in the pipe by the time anybody waits, and the disk takes it.
@@ -28,7 +30,7 @@ class PipedFile:
         """
         self._file = path.open("wb", buffering=0)
         self._outlet, self._inlet = os.pipe()
-        self.entrance = Path(f"/dev/fd/{self._inlet}")
+        self.entrance = _ENTRANCES / str(self._inlet)
         self.failure: OSError | None = None
         self._thread = threading.Thread(target=self._follow, name="recording", daemon=True)
         self._thread.start()

@@ -90,6 +90,9 @@ class RerunViewer:
         config: how much is shown.
         save: the .rrd file to write, or None.
         spawn: whether to open a window.
+
+    Raises:
+        OutputError: the window cannot be opened, or the recording cannot be begun.
     """
 
     def __init__(self, name: str, config: ViewerConfig, save: Path | None = None, spawn: bool = False) -> None:
@@ -99,7 +102,11 @@ class RerunViewer:
         if spawn:
             open_window(_GRPC_PORT)
         self._file = None if save is None else PipedFile(save)
-        _send_to(self._recording, self._file, [rr.GrpcSink()] if spawn else [], _blueprint())
+        try:
+            _send_to(self._recording, self._file, [rr.GrpcSink()] if spawn else [], _blueprint())
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())
+            raise OutputError(f"the Rerun recording cannot be begun ({reason}); leave --rerun out") from error
         self._recording.send_recording_name(name)
         self._log_static()
 

@@ -27,7 +27,7 @@ _COLUMNS = 12
 _SAMPLES = 6
 # What noise and single misplaced scans left: cells that have less than this share of the mean of those in a cube of so
 # many cells around. They are looked for whenever there are so many times the cells there were.
-_STRAY_SHARE = 0.15
+_STRAY_SHARE = 0.05
 _AROUND = 12
 _REGROWN = 1.1
 

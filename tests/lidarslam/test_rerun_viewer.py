@@ -108,6 +108,14 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
         require_complete(tmp_path / "recording.rrd")
 
 
+def test_a_recording_that_cannot_be_begun_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where there is no /dev/fd."""
+    monkeypatch.setattr("lidarslam.rerun_file._ENTRANCES", tmp_path / "none")
+    with pytest.raises(OutputError, match=r"cannot be begun \(.*\); leave --rerun out") as caught:
+        RerunViewer("run", ViewerConfig(), tmp_path / "recording.rrd")
+    assert "\n" not in str(caught.value)
+
+
 def test_no_display_gets_one_line(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
