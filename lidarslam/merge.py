@@ -4,15 +4,15 @@ import json
 import re
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lidarslam import run_directory as files
 from lidarslam.config import Config, dump_yaml
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.loop_closing import FinishedGraph, GraphOutcome, begin_graph, finish_recordings
@@ -24,6 +24,7 @@ from lidarslam.run_tracking import NoScanError, Tracked, track
 from lidarslam.run_watch import Progress
 from lidarslam.scan_log import ScanLog
 from lidarslam.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
+from lidarslam.unfinished import About, Unfinished, remove_unfinished
 from lidarslam.viewer import NullViewer
 from mapping.g2o import format_g2o
 from mapping.visibility import PlacedViews
@@ -114,13 +115,19 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
     started = time.perf_counter()
     request = replace(request, config=_closing_loops(request.config))
     recordings = _open(request)
+    runs = _runs(request, recordings)
+    _require_free(request)
     earlier = _earlier_parts(request.out)
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite))
+        described = _describe(request)
+        names = [run.out.name for run in runs]
+        unfinished = [_begin(directory, described | {"merge": "all", "parts": names}, stack)]
         parts = []
-        for run, recording in zip(_runs(request, recordings), recordings, strict=True):
+        for run, recording in zip(runs, recordings, strict=True):
             own = stack.enter_context(RunDirectory.create(run.out, request.overwrite))
             parts.append(_Part(run, recording, own))
+            unfinished.append(_begin(own, described | {"merge": "part"}, stack))
         graph = begin_graph(request.config, request.out)
         assert graph is not None
         stack.callback(graph.close)
@@ -129,8 +136,26 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
             raise InputError(f"no scan of any recording could be used: {'; '.join(way.missing)}")
         outcome = _write(request, directory, parts, way, graph, started)
         for name in earlier - {part.name for part in parts}:
-            remove_run(request.out / name)
+            _remove_part(request.out / name)
+    for mark in reversed(unfinished):
+        mark.end(stopped=False)
+    for run, written in zip(runs, outcome.runs, strict=True):
+        if written is None:
+            with suppress(OSError):  # something else lies there
+                run.out.rmdir()
     return outcome
+
+
+def _begin(directory: RunDirectory, description: dict[str, Any], stack: ExitStack) -> Unfinished:
+    """Say of a directory that what lies there is not whole, until it is."""
+    unfinished = stack.enter_context(Unfinished.claim(directory.path, description, False, lambda: directory.is_mixed))
+    unfinished.begin(None)
+    return unfinished
+
+
+def _describe(request: MergeRequest) -> dict[str, Any]:
+    """What is merged, for config.yaml and for whoever finds it unfinished."""
+    return {"version": version("lidarslam"), "sources": [str(source.resolve()) for source in request.sources]}
 
 
 def _closing_loops(config: Config) -> Config:
@@ -170,14 +195,31 @@ def _runs(request: MergeRequest, recordings: Sequence[Recording]) -> list[RunReq
     return requests
 
 
+def _require_free(request: MergeRequest) -> None:
+    """See that no merge lies there unfinished, unless it is to be replaced."""
+    about = None if request.overwrite else About.read(request.out)
+    if about is not None:
+        raise OutputError(f"{request.out}: {about.remedy(request.out)}")
+
+
 def _earlier_parts(out: Path) -> set[str]:
-    """The directories of an earlier merge's recordings."""
-    try:
+    """The directories of an earlier merge's recordings, be it unfinished."""
+    names: list[Any] = []
+    with suppress(OSError, ValueError, KeyError, TypeError):
         entries = json.loads((out / files.SUMMARY).read_text(encoding="utf-8"))["recordings"]
-        names = {entry["directory"] for entry in entries}
-    except (OSError, ValueError, KeyError, TypeError):
-        return set()
+        names += [entry["directory"] for entry in entries]
+    with suppress(InputError, KeyError, TypeError):
+        about = About.read(out)
+        names += [] if about is None else about.description["parts"]
     return {name for name in names if isinstance(name, str) and _PART.fullmatch(name)}
+
+
+def _remove_part(path: Path) -> None:
+    """Remove the run of a recording that is no longer merged."""
+    if (path / files.ABOUT).exists():
+        remove_unfinished(path)
+    else:
+        remove_run(path)
 
 
 def _track_all(parts: Sequence[_Part], graph: "SlamGraph", show: Show) -> _Way:
@@ -243,6 +285,8 @@ def _write(
     ]
     runs += [None] * (len(parts) - len(runs))
     common = None if finished is None else finished.common()
+    # First, because it says whose files the others are.
+    directory.write_text(files.CONFIG, dump_yaml(request.config, _describe(request)))
     written = WrittenMap(0, way.voxel_size_m, 0)
     if common is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(common.graph))
@@ -258,9 +302,6 @@ def _write(
         map=written,
         warnings=_warnings(recordings, runs, way.missing),
     )
-    sources = [str(source.resolve()) for source in request.sources]
-    described = {"version": version("lidarslam"), "sources": sources}
-    directory.write_text(files.CONFIG, dump_yaml(request.config, described))
     directory.write_json(files.SUMMARY, summary.to_json())
     stopped = [
         f"{part.request.source}: stopped after {run.summary.scans} scans: {run.stopped}"

@@ -3,10 +3,11 @@
 import contextlib
 import logging
 import os
-import socket
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
@@ -26,6 +27,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.finished_run import FinishedRun
 from lidarslam.picture import height_colours
 from lidarslam.pipeline import STAGES, ScanResult
+from lidarslam.rerun_file import PipedFile
+from lidarslam.rerun_program import LOCAL, is_taken, open_window, serve_page
 from lidarslam.run_directory import RunDirectory
 
 _log = logging.getLogger(__name__)
@@ -86,6 +89,9 @@ class RerunViewer:
         config: how much is shown.
         save: the .rrd file to write, or None.
         spawn: whether to open a window.
+
+    Raises:
+        OutputError: the window cannot be opened, or the recording cannot be begun.
     """
 
     def __init__(self, name: str, config: ViewerConfig, save: Path | None = None, spawn: bool = False) -> None:
@@ -93,11 +99,13 @@ class RerunViewer:
         self._recording = rr.RecordingStream("lidarslam")
         self._last_position: FloatArray | None = None
         if spawn:
-            _open_window(self._recording)
-        sinks: list[rr.FileSink | rr.GrpcSink] = [] if save is None else [rr.FileSink(save)]
-        if spawn:
-            sinks.append(rr.GrpcSink())
-        self._recording.set_sinks(*sinks, default_blueprint=_blueprint())
+            open_window(_GRPC_PORT)
+        self._file = None if save is None else PipedFile(save)
+        try:
+            _send_to(self._recording, self._file, [rr.GrpcSink()] if spawn else [], _blueprint())
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())
+            raise OutputError(f"the Rerun recording cannot be begun ({reason}); leave --rerun out") from error
         self._recording.send_recording_name(name)
         self._log_static()
 
@@ -153,8 +161,7 @@ class RerunViewer:
         except RuntimeError as error:
             _log.info("Rerun: %s", str(error).strip().splitlines()[0])
             rerun_environment.abandoned = True
-            return
-        _disconnect(self._recording)
+        _disconnect(self._recording, self._file)
 
     def _log_static(self) -> None:
         self._recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -171,27 +178,26 @@ class RerunViewer:
         self._last_position = position.copy()
 
 
-def _disconnect(recording: rr.RecordingStream) -> None:
-    """Let the file be closed; on a full disk that never ends, and is left to itself after a while."""
+def _send_to(
+    recording: rr.RecordingStream,
+    file: PipedFile | None,
+    sinks: Sequence[rr.GrpcSink | rr.GrpcServerSink],
+    blueprint: rrb.Blueprint | None = None,
+) -> None:
+    """Send a recording into a file and wherever else."""
+    files = [] if file is None else [rr.FileSink(file.entrance)]
+    recording.set_sinks(*files, *sinks, default_blueprint=blueprint)
+    if file is not None:
+        file.let_go()
+
+
+def _disconnect(recording: rr.RecordingStream, file: PipedFile | None) -> None:
+    """Let the sinks be closed; one that never ends is left to itself after a while."""
     thread = threading.Thread(target=recording.disconnect, name="disconnect", daemon=True)
     thread.start()
     thread.join(_DISCONNECT_S)
-    if thread.is_alive():
+    if thread.is_alive() or not (file is None or file.finish()):
         rerun_environment.abandoned = True
-
-
-def _open_window(recording: rr.RecordingStream) -> None:
-    """Start the viewer that came with the library, which stands beside this Python and perhaps not on the path.
-
-    Raises:
-        OutputError: it cannot be started.
-    """
-    beside = Path(sys.executable).with_name("rerun")
-    try:
-        rr.spawn(connect=False, executable_path=str(beside) if beside.is_file() else None, recording=recording)
-    except RuntimeError as error:
-        reason = str(error).strip().splitlines()[0]
-        raise OutputError(f"the Rerun window cannot be opened ({reason}); write a file instead") from error
 
 
 def _blueprint() -> rrb.Blueprint:
@@ -226,32 +232,51 @@ def _every_nth(points: FloatArray, count: int) -> FloatArray:
     return points[:: max(1, -(-len(points) // count))]
 
 
-def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | None, web: bool) -> str | None:
+@dataclass(frozen=True, eq=False)
+class Served:
+    """What a browser is served as long as this is held.
+
+    Attributes:
+        address: for the browser.
+    """
+
+    address: str
+    recording: rr.RecordingStream
+    page: "subprocess.Popen[bytes]"
+
+
+def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | None, web: bool) -> Served | None:
     """Finished runs in one view: trajectories, maps, and where tracking was lost.
 
     Args:
         runs: what to show; each gets an entity of its own.
         config: how much is shown.
         save: the .rrd file to write, instead of a window.
-        web: serve a browser, instead of a window; it serves as long as the process lives.
+        web: serve a browser on this machine, instead of a window.
 
     Returns:
-        The address that a browser is served at, if one is.
+        What the browser is served, if one is.
 
     Raises:
         OutputError: the file cannot be written, the window cannot be opened or the browser cannot be served.
     """
     recording = rr.RecordingStream("lidarslam")
+    served = None
     try:
-        with _recording_file(save) as file:
-            address = _connect(recording, file, web)
+        with _recording_file(save) as path:
+            file = None if path is None else PipedFile(path)
+            _send_to(recording, file, [] if file is not None else [_local_server() if web else _window()])
             recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
             for number, run in enumerate(runs):
                 _log_run(recording, ["world", f"{number}_{run.name}"], run, number, config)
             recording.flush(timeout_sec=_FLUSH_S)
-            if file is not None:
-                _disconnect(recording)
-                require_complete(file)
+            if path is not None:
+                _disconnect(recording, file)
+                require_complete(path)
+            elif web:
+                server = f"rerun+http://{LOCAL}:{_GRPC_PORT}/proxy"
+                address = f"http://{LOCAL}:{_WEB_PORT}/?url={quote(server, safe='')}"
+                served = Served(address, recording, serve_page(_WEB_PORT, server))
     except (RuntimeError, OSError, IncompleteRecordingError) as error:
         rerun_environment.abandoned = True
         reason = " ".join(str(error).split())
@@ -262,7 +287,7 @@ def show_runs(runs: Sequence[FinishedRun], config: ViewerConfig, save: Path | No
         else:
             message = f"the Rerun window cannot be reached ({reason}); write a file with --save FILE.rrd, or use --web"
         raise OutputError(message) from error
-    return address
+    return served
 
 
 @contextlib.contextmanager
@@ -275,33 +300,32 @@ def _recording_file(save: Path | None) -> Iterator[Path | None]:
         yield file
 
 
-def _connect(recording: rr.RecordingStream, save: Path | None, web: bool) -> str | None:
-    """Send the recording where it is wanted; the address that a browser is served at, if one is."""
-    if save is not None:
-        recording.save(save)
-    elif web:
-        for port in (_GRPC_PORT, _WEB_PORT):
-            if _is_taken(port):
-                raise OutputError(
-                    f"port {port} is in use; close the Rerun viewer or the lidarslam view --web that has it,"
-                    " or write a file with --save FILE.rrd"
-                )
-        server = recording.serve_grpc(grpc_port=_GRPC_PORT)
-        rr.serve_web_viewer(web_port=_WEB_PORT, connect_to=server)
-        return f"http://localhost:{_WEB_PORT}/?url={quote(server, safe='')}"
-    else:
-        # A viewer that runs already, perhaps at the other end of a tunnel, needs no display here.
-        if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not _is_taken(_GRPC_PORT):
-            raise OutputError("no display to open a window on; write a file with --save FILE.rrd, or use --web")
-        _open_window(recording)
-        recording.connect_grpc()
-    return None
+def _local_server() -> rr.GrpcServerSink:
+    """Where a browser on this machine finds the recording.
+
+    Raises:
+        OutputError: somebody else serves there.
+    """
+    for port in (_GRPC_PORT, _WEB_PORT):
+        if is_taken(port):
+            raise OutputError(
+                f"port {port} is in use; close the Rerun viewer or the lidarslam view --web that has it,"
+                " or write a file with --save FILE.rrd"
+            )
+    return rr.GrpcServerSink(bind_ip=LOCAL, port=_GRPC_PORT)
 
 
-def _is_taken(port: int) -> bool:
-    """Whether somebody listens on a port of this machine."""
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+def _window() -> rr.GrpcSink:
+    """The viewer, opened unless it is.
+
+    Raises:
+        OutputError: there is no display for it, or it cannot be opened.
+    """
+    # A viewer that runs already, perhaps at the other end of a tunnel, needs no display here.
+    if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not is_taken(_GRPC_PORT):
+        raise OutputError("no display to open a window on; write a file with --save FILE.rrd, or use --web")
+    open_window(_GRPC_PORT)
+    return rr.GrpcSink()
 
 
 def _log_run(
@@ -336,7 +360,8 @@ def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | N
     points = comparison.reference_errors.points
     middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
     try:
-        recording.save(path)
+        file = PipedFile(path)
+        _send_to(recording, file, [])
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _log_errors(recording, "world/map_to_reference", comparison.map_errors, middle, clip_m)
         _log_errors(recording, "world/reference_to_map", comparison.reference_errors, middle, clip_m)
@@ -347,7 +372,7 @@ def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | N
         recording.log("legend", rr.TextDocument(text), static=True)
         recording.send_blueprint(_errors_blueprint())
         recording.flush(timeout_sec=_FLUSH_S)
-        _disconnect(recording)
+        _disconnect(recording, file)
         require_complete(path)
     except (RuntimeError, OSError, IncompleteRecordingError) as error:
         rerun_environment.abandoned = True

@@ -44,7 +44,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         odometry = open_odometry(config, request.prior)
         stack.callback(odometry.close)
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
-        unfinished = _claim(request, recording, stack)
+        unfinished = _claim(request, recording, directory, stack)
         log, graph = log_and_graph(config, directory, unfinished, stack)
         with viewing(request.rerun, recording.name, config.viewer, directory, log) as viewer:
             tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
@@ -67,12 +67,12 @@ def lost_when_finished(request: RunRequest) -> int | None:
     return lost_before(request.out, request.config, describe_run(request))
 
 
-def _claim(request: RunRequest, recording: Recording, stack: ExitStack) -> Unfinished | None:
+def _claim(request: RunRequest, recording: Recording, directory: RunDirectory, stack: ExitStack) -> Unfinished | None:
     """What makes a run resumable."""
     if not request.resumable:
         return None
     description = describe_computed(request.config, recording, describe_run(request), request.prior)
-    return stack.enter_context(Unfinished.claim(request.out, description, request.resume))
+    return stack.enter_context(Unfinished.claim(request.out, description, request.resume, lambda: directory.is_mixed))
 
 
 def require_apart(out: Path, source: Path) -> None:

@@ -99,6 +99,11 @@ class RunDirectory:
                 if is_new and not any(path.iterdir()):
                     path.rmdir()
 
+    @property
+    def is_mixed(self) -> bool:
+        """Whether some of an earlier run's files were replaced by now, and some were not."""
+        return bool(self._written) and bool(self._stale - {ABOUT})
+
     def __getitem__(self, name: str) -> Path:
         return self.path / name
 
@@ -165,13 +170,12 @@ def remove_run(path: Path) -> None:
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
     present = [name for name in FILES if (path / name).exists()]
-    if (path / ABOUT).exists():
+    if (path / ABOUT).exists():  # whatever lies beside it is of that run, its description may be missing yet
         if not overwrite and not resume:
             raise OutputError(
                 f"{path}: holds a run that did not finish; go on with it by --resume, or replace it with --overwrite"
             )
-        if resume or not present:
-            return [*present, *([] if resume else [ABOUT])]
+        return [*present, *([] if resume else [ABOUT])]
     if not present or resume:
         return present
     listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
@@ -181,7 +185,7 @@ def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
         raise OutputError(
             f"{path}: holds a run already ({listed}); name another directory, or replace it with --overwrite"
         )
-    return [*present, *([ABOUT] if (path / ABOUT).exists() else [])]
+    return present
 
 
 def _is_run(path: Path) -> bool:

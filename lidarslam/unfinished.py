@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +10,7 @@ from typing import Any, Literal
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.state import Saved
 from lidarslam.directory_lock import only_writer
-from lidarslam.run_directory import ABOUT, UNFINISHED
+from lidarslam.run_directory import ABOUT, FILES, UNFINISHED
 from lidarslam.state_file import read_state, replacing_for_good
 
 _STATE, _ROWS, _SUBMAPS = "state.npz", "scans.csv", "submaps.bin"
@@ -61,6 +61,21 @@ class About:
         with replacing_for_good(run / ABOUT) as out:
             out.write(json.dumps(vars(self), indent=2).encode())
 
+    def remedy(self, run: Path) -> str:
+        """What to do about it, as the end of a sentence that says where it lies."""
+        if "merge" not in self.description:
+            source = self.description.get("source", "SOURCE")
+            return (
+                f"this run did not finish; resume it with lidarslam run {source} --out {run} --resume"
+                " and the options it was begun with"
+            )
+        sources = " ".join(map(str, self.description.get("sources", ["SOURCE..."])))
+        out = run if self.description["merge"] == "all" else run.parent
+        return (
+            f"this merge did not finish; make it again with lidarslam merge {sources} --out {out} --overwrite"
+            " and the options it was begun with"
+        )
+
 
 def require_whole(run: Path) -> None:
     """See that a directory's results are not those of a run that was killed or is at work.
@@ -70,11 +85,21 @@ def require_whole(run: Path) -> None:
     """
     about = About.read(run)
     if about is not None and about.standing == "at work":
-        source = about.description.get("source", "SOURCE")
-        raise InputError(
-            f"{run}: this run did not finish; resume it with lidarslam run {source} --out {run} --resume"
-            " and the options it was begun with"
-        )
+        raise InputError(f"{run}: {about.remedy(run)}")
+
+
+def remove_unfinished(run: Path) -> None:
+    """Remove a run, or a part of a merge, that was killed, and its directory when nothing else lies there.
+
+    Raises:
+        OutputError: somebody is at work on it.
+    """
+    with Unfinished.claim(run, {}, resume=False) as unfinished:
+        for name in FILES:
+            (run / name).unlink(missing_ok=True)
+    unfinished.end(stopped=False)
+    if not any(run.iterdir()):
+        run.rmdir()
 
 
 class Unfinished:
@@ -91,8 +116,12 @@ class Unfinished:
 
     @classmethod
     @contextlib.contextmanager
-    def claim(cls, run: Path, description: dict[str, Any], resume: bool) -> Iterator["Unfinished"]:
+    def claim(
+        cls, run: Path, description: dict[str, Any], resume: bool, is_mixed: Callable[[], bool] = lambda: False
+    ) -> Iterator["Unfinished"]:
         """Be the only one at work on a run, new or resumed; what nobody could resume is removed when this fails.
+
+        It stays where some results are this run's by then and some an earlier one's, which `is_mixed` tells.
 
         Raises:
             InputError: there is nothing to resume, it is damaged, or another run than the described one.
@@ -123,7 +152,7 @@ class Unfinished:
             try:
                 yield unfinished
             except BaseException:
-                if not was_there and not unfinished.state.is_file():
+                if not was_there and not unfinished.state.is_file() and not is_mixed():
                     unfinished._remove_all()
                 raise
 

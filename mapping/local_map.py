@@ -19,6 +19,8 @@ LEVELS = (1, 2, 4)
 _SHORT = 0.5
 # Memory is bounded by forgetting what is far away, now and then rather than at every scan.
 _FORGET_AFTER = 0.1
+# After so many scans the grids are tidied.
+_TIDIED_AFTER = 500
 # A sensor is tilted by less than this from the vertical, as a cosine, when it first looks.
 _LEAST_COSINE_UP = 0.7
 
@@ -74,6 +76,7 @@ class LocalMap:
         self._planes = [SurfelGrid(cell_m * level) for level in LEVELS]
         self._lines = SurfelGrid(cell_m * LEVELS[1])
         self._centre: FloatArray | None = None
+        self._scans = 0
 
     def __len__(self) -> int:
         """How many cells are held, all grids together."""
@@ -87,6 +90,7 @@ class LocalMap:
             "planes": [grid.state() for grid in self._planes],
             "lines": self._lines.state(),
             "centre": self._centre,
+            "scans": self._scans,
         }
 
     @classmethod
@@ -98,6 +102,7 @@ class LocalMap:
             raise saved.refuse(f"{len(restored._planes)} grids of planes instead of {len(LEVELS)}")
         restored._lines = SurfelGrid.restored(saved.part("lines"))
         restored._centre = saved.optional_array("centre", (3,))
+        restored._scans = saved.integer("scans")
         return restored
 
     def add(self, planes: FloatArray, elevations: FloatArray, edges: FloatArray, sensor: FloatArray) -> None:
@@ -118,6 +123,10 @@ class LocalMap:
             self._centre = sensor
             for grid in (*self._planes, self._lines):
                 grid.forget_beyond(sensor, self._radius_m)
+        self._scans += 1
+        if self._scans % _TIDIED_AFTER == 0:
+            for grid in (*self._planes, self._lines):
+                grid.tidy()
 
     def match_planes(self, points: FloatArray, T_world_lidar: FloatArray, first_level: int = 0) -> Matches:
         """For points (N, 3) of the world, seen from a pose (4, 4), the plane in the finest grid that shows one.
@@ -168,7 +177,7 @@ class LocalMap:
     def resized(self, cell_m: float) -> "LocalMap":
         """The same map in cells of another size, made of the surfaces in the finest of these."""
         other = LocalMap(cell_m, self._radius_m)
-        other._centre = self._centre
+        other._centre, other._scans = self._centre, self._scans
         points, elevations = self._planes[0].samples()
         for grid in other._planes:
             grid.add(points, elevations)

@@ -16,7 +16,7 @@ from mapping import cell_kernels as kernels
 from mapping.patch_kernels import refresh
 from mapping.patches import PATCH_COLUMNS, PatchTable
 from mapping.symmetric import SYMMETRIC
-from mapping.voxel_table import Rows, VoxelTable, key_cells, point_keys
+from mapping.voxel_table import Rows, VoxelTable, cell_keys, key_cells, point_keys
 
 # Columns of a cell's sums: points, first and second moments about the cell's centre in units of the cell, and first
 # and second moment of the elevation they were seen at.
@@ -25,6 +25,11 @@ _COLUMNS = 12
 
 # A cell is handed on to another grid as so many points.
 _SAMPLES = 6
+# What noise and single misplaced scans left: cells that have less than this share of the mean of those in a cube of so
+# many cells around. They are looked for whenever there are so many times the cells there were.
+_STRAY_SHARE = 0.05
+_AROUND = 12
+_REGROWN = 1.1
 
 
 class SurfelGrid:
@@ -37,6 +42,7 @@ class SurfelGrid:
         self._sums = np.zeros((0, _COLUMNS), dtype=np.float32)
         self._patches = np.zeros((0, PATCH_COLUMNS))
         self._patch_counts = np.zeros(0, dtype=np.float32)
+        self._tidied = 0  # how many cells were left when strays were forgotten last
 
     def __len__(self) -> int:
         return len(self._table)
@@ -50,6 +56,7 @@ class SurfelGrid:
             "sums": self._sums[:count],
             "patches": self._patches[:count],
             "patch_counts": self._patch_counts[:count],
+            "tidied": self._tidied,
         }
 
     @classmethod
@@ -62,6 +69,7 @@ class SurfelGrid:
         grid._patches = saved.array("patches", (count, PATCH_COLUMNS))
         grid._patch_counts = saved.array("patch_counts", (count,), np.float32)
         grid._table.rebuild(grid._keys)
+        grid._tidied = saved.integer("tidied")
         return grid
 
     def add(self, points: FloatArray, elevations: FloatArray) -> None:
@@ -124,7 +132,26 @@ class SurfelGrid:
         count = len(self._table)
         offsets = (key_cells(self._keys[:count]) + 0.5) * self.cell_m - centre
         kept = np.flatnonzero(np.einsum("ij,ij->i", offsets, offsets) <= radius_m**2)
-        if len(kept) == count:
+        self._keep(kept)
+
+    def tidy(self) -> None:
+        """Have all that cells show worked out anew, and forget strays.
+
+        What a cell shows is worked out again only when it has grown itself. One beside a wall hardly does, while the
+        wall grows a hundredfold; and where a sensor goes round and round, noise reaches ever more cells.
+        """
+        count = len(self._table)
+        if count > _REGROWN * self._tidied:
+            counts = self._sums[:count, _COUNT]
+            _, cube = np.unique(cell_keys(key_cells(self._keys[:count]) // _AROUND), return_inverse=True)
+            mean = np.bincount(cube, weights=counts) / np.bincount(cube)
+            self._keep(np.flatnonzero(counts >= _STRAY_SHARE * mean[cube]))
+            self._tidied = len(self._table)
+        self._patch_counts[:] = 0.0
+
+    def _keep(self, kept: NDArray[np.intp]) -> None:
+        """Drop all cells but those in these rows."""
+        if len(kept) == len(self._table):
             return
         self._keys = self._keys[kept]
         self._sums = self._sums[kept]

@@ -16,6 +16,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.merge import MergeOutcome
+from lidarslam.rerun_viewer import Served
 from lidarslam.summary import MergedRecording, MergeSummary, WrittenMap
 from odometry.checkpoint import checkpoint_of, save_checkpoint
 from odometry.image_config import ImageConfig
@@ -256,10 +257,9 @@ def test_view_says_where_the_browser_is_served(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert lidarslam("run", recording, "--out", tmp_path / "run", "--stop", 2).exit_code == 0
-    monkeypatch.setattr("rerun.serve_web_viewer", lambda **_: None)
-    monkeypatch.setattr("rerun.RecordingStream.serve_grpc", lambda *_, **__: "rerun+http://127.0.0.1:9876/proxy")
-    monkeypatch.setattr("lidarslam.rerun_viewer._is_taken", lambda _: False)
+    served = Served("http://127.0.0.1:9090/?url=there", None, None)  # type: ignore[arg-type]
+    monkeypatch.setattr("lidarslam.rerun_viewer.show_runs", lambda *_: served)
     monkeypatch.setattr("signal.pause", lambda: None)
     lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
-    assert lines[0].startswith("http://localhost:9090")
-    assert lines[1].startswith("serving until you press Ctrl-C; whoever reaches this machine")
+    assert lines[0] == "http://127.0.0.1:9090/?url=there"
+    assert lines[1].startswith("serving this machine alone until you press Ctrl-C; ")

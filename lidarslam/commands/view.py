@@ -17,7 +17,7 @@ from lidarslam.core.errors import InputError
     lidarslam view runs/04 --picture map.png""",
 )
 @click.argument("runs", type=PATH, nargs=-1, required=True)
-@click.option("--web", is_flag=True, help="Serve a browser instead of opening a window.")
+@click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
 @click.option("--save", type=PATH, metavar="FILE.rrd", help="Write a Rerun recording instead of opening a window.")
 @click.option("--picture", type=PATH, metavar="FILE.png", help="Draw the map of one run, or a .ply file, instead.")
 @config_options
@@ -41,12 +41,12 @@ def view(
     finished = [load_run(path) for path in runs]
     from lidarslam.rerun_viewer import show_runs
 
-    address = show_runs(finished, config.viewer, save, web)
+    served = show_runs(finished, config.viewer, save, web)
     if save is not None:
         say(f"written to {save}")
-    elif web:
-        say(str(address))
-        say("serving until you press Ctrl-C; whoever reaches this machine's ports 9090 and 9876 can look")
+    elif served is not None:
+        say(served.address)
+        say("serving this machine alone until you press Ctrl-C; from another, forward ports 9090 and 9876 by ssh -L")
         signal.pause()
 
 

@@ -6,12 +6,12 @@ a damaged or unusual definition of some other topic must not matter.
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Rosbag1Reader
@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.bag_salvage import Salvage
+from lidarslam.datasets.bag_salvage import Place, Salvage, messages_from
 from lidarslam.datasets.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
 from lidarslam.datasets.point_cloud2 import DecodedCloud, PointCloud2Message, decode_point_cloud2
 from lidarslam.datasets.recording import Topic
@@ -36,6 +36,8 @@ STORAGE_SUFFIXES = (".db3", ".mcap")
 
 _LAST_MESSAGES_NS = 1_000_000_000
 _LONGEST_FRAME_ID = 256
+# Up to the end of a header's frame; a message that is shorter is none.
+_SHORTEST_MESSAGE = 16
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class BagMessage:
         record_ns: when it was recorded, nanoseconds.
         header_ns: the stamp of its header, nanoseconds.
         frame_id: of its header: the sensor it comes from.
+        damage: why it is no message and has neither stamp nor frame; None where it is one.
     """
 
     record_ns: int
@@ -53,6 +56,7 @@ class BagMessage:
     frame_id: str
     message_type: str
     raw: bytes
+    damage: str | None = None
 
 
 class BagFile:
@@ -118,32 +122,80 @@ class BagFile:
         files = [entry for entry in self.path.iterdir() if entry.suffix in STORAGE_SUFFIXES and entry.is_file()]
         return files[0] if len(files) == 1 else None
 
-    def messages(self, topic: Topic) -> Iterator[BagMessage]:
+    def messages(self, topic: Topic, on_damage: Callable[[str], None] = lambda _: None) -> Iterator[BagMessage]:
         """All messages of a topic in the order they were recorded, not decoded.
 
+        Damaged places are told and passed over, as far as the index says what is behind them.
+
         Raises:
-            InputError: the bag is damaged, at the message where it is.
+            InputError: the bag is damaged so that nothing can be read, or nothing behind the damage could be.
         """
         if self._salvage is not None:
             yield from self._salvaged(self._salvage, topic)
             return
         with self._opened() as reader:
-            yield from self._stream(reader, topic, None)
+            last = None
+            try:
+                for message in self._stream(reader, topic, None):
+                    yield message
+                    last = message
+                return
+            except InputError as error:
+                damage = error
+            places = self._places(reader, -1 if last is None else last.record_ns)
+            if places is None:
+                raise damage
+            on_damage(str(damage))
+            for message in self._behind(places, topic, on_damage):
+                if last is None or message.record_ns > last.record_ns:
+                    yield message
+                    last = message
+            if last is None:
+                raise damage
+
+    def _places(self, reader: RosbagReader, after_ns: int) -> list[Place] | None:
+        """Where there are messages recorded after a time; None in files that cannot be read without rosbags."""
+        if isinstance(reader, Rosbag1Reader):
+            chunks = sorted(chunk.pos for chunk in reader.chunk_infos if chunk.end_time - 1 > after_ns)
+            return [Place(self.path, ".bag", _named(reader.connections), chunks)]
+        if reader.compression_mode:
+            return None
+        storages: list[Any] = getattr(reader.storage, "storages", None) or [reader.storage]
+        places = []
+        for storage in storages:
+            infos = [chunk for chunk in getattr(storage, "chunks", ()) if chunk.message_end_time > after_ns]
+            chunks = sorted(chunk.chunk_start_offset for chunk in infos)
+            if infos or not getattr(storage, "chunks", ()):
+                places.append(Place(storage.path, storage.path.suffix, _named(storage.connections), chunks))
+        return places
+
+    def _behind(self, places: list[Place], topic: Topic, on_damage: Callable[[str], None]) -> Iterator[BagMessage]:
+        for place in places:
+            for message in messages_from(place, _expand, on_damage):
+                if (message.topic, message.message_type) == (topic.name, topic.message_type):
+                    yield self._message(message.record_ns, message.raw, topic)
 
     def _salvaged(self, salvage: Salvage, topic: Topic) -> Iterator[BagMessage]:
         with closing(salvage.messages(topic.name, topic.message_type)) as messages:
             for message in messages:
-                with self._damage("a message cannot be read"):
-                    found = self._message(message.record_ns, message.raw, topic)
-                yield found
+                yield self._message(message.record_ns, message.raw, topic)
 
     def last_message(self, topic: Topic) -> BagMessage | None:
         """The message of a topic recorded last, found from the end of the bag; None if there is none."""
         if self._salvage is not None:
-            last = None
-            for message in self.messages(topic):
-                last = message
-            return last
+            return self._last_of_all(topic)
+        try:
+            return self._last_by_index(topic)
+        except InputError:  # damaged there
+            return self._last_of_all(topic)
+
+    def _last_of_all(self, topic: Topic) -> BagMessage | None:
+        last = None
+        for message in self.messages(topic):
+            last = message if message.damage is None else last
+        return last
+
+    def _last_by_index(self, topic: Topic) -> BagMessage | None:
         with self._opened() as reader:
             with self._damage("its index cannot be read"):
                 end_ns, length_ns = reader.end_time, reader.duration
@@ -151,7 +203,7 @@ class BagFile:
             while True:
                 last = None
                 for message in self._stream(reader, topic, end_ns - look_back_ns):
-                    last = message
+                    last = message if message.damage is None else last
                 if last is not None or look_back_ns > length_ns:
                     return last
                 look_back_ns *= 8
@@ -203,12 +255,17 @@ class BagFile:
 
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         """With the header's stamp and frame, which stand at fixed places; looking there spares decoding the message."""
+        damage = None
+        if not isinstance(raw, bytes) or len(raw) < _SHORTEST_MESSAGE:
+            damage = f"a message of {len(raw)} bytes, too few for its header"
+        elif self._ros2 and raw[0] != 0:
+            damage = (
+                "it is not plain CDR; if the bag's messages are compressed, give the rosbag2 folder with its"
+                " metadata.yaml instead of the file"
+            )
+        if damage is not None:
+            return BagMessage(record_ns, 0, "", topic.message_type, b"", f"{self.path}: {damage}")
         if self._ros2:
-            if raw[0] != 0:
-                raise InputError(
-                    f"{self.path}: its messages are not plain CDR; if they are compressed, give the rosbag2 folder with"
-                    f" its metadata.yaml instead of the file"
-                )
             seconds, nanoseconds, characters = struct.unpack_from("<iII" if raw[1] == 1 else ">iII", raw, 4)
         else:
             seconds, nanoseconds, characters = struct.unpack_from("<III", raw, 4)
@@ -235,6 +292,10 @@ class BagFile:
             ".mcap": f"try `mcap recover {self.path} -o recovered.mcap`, or copy the bag again",
             ".db3": f"try `sqlite3 {self.path} .recover | sqlite3 recovered.db3`, or copy the bag again",
         }.get(suffix, "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml")
+
+
+def _named(connections: Sequence[Connection]) -> dict[int, tuple[str, str]]:
+    return {connection.id: (connection.topic, connection.msgtype) for connection in connections}
 
 
 @cache

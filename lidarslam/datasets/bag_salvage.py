@@ -1,36 +1,18 @@
 """What is left of a bag whose index is gone: its messages, one after another as they lie in the file.
 
-A recorder that was killed, or a copy that was cut short, leaves no index, and half a chunk at the end. Layouts: ROS bag
-format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the SQLite tables of rosbag2.
+A recorder that was killed, or a copy that was cut short, leaves no index, and half a chunk at the end. Where there is
+an index, and the bag is damaged in the midst, it says where the chunks behind the damage are.
 """
 
-import sqlite3
-import struct
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
-from urllib.parse import quote
 
-Expand = Callable[[str, bytes, int], bytes]
-"""Decompresses a chunk: the compression's name, the data, and the size it should have afterwards."""
+from lidarslam.datasets.bag_database import DatabaseWalk
+from lidarslam.datasets.bag_walks import Expand, McapWalk, Rosbag1Walk, SalvagedMessage, Walk
 
-_ROSBAG1_MAGIC, _MCAP_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"
-# Records are read whole; a longer one is a damaged length.
-_LONGEST_RECORD = 1 << 30
-
-
-@dataclass(frozen=True)
-class SalvagedMessage:
-    """One message, its type named as ROS 2 names types."""
-
-    topic: str
-    message_type: str
-    record_ns: int
-    raw: bytes
+_WALKS: dict[str, type[Walk]] = {".bag": Rosbag1Walk, ".mcap": McapWalk, ".db3": DatabaseWalk}
 
 
 class Salvage:
@@ -48,7 +30,7 @@ class Salvage:
             ValueError, OSError, sqlite3.Error: it is no such file at all.
         """
         self._path = path
-        self._walk = {".bag": _Rosbag1, ".mcap": _Mcap, ".db3": _Sqlite}[suffix]
+        self._walk = _WALKS[suffix]
         self._expand = expand
         walk = self._walk(path, expand)
         self.counts = Counter((message.topic, message.message_type) for message in walk.messages())
@@ -61,163 +43,39 @@ class Salvage:
                 yield message
 
 
-class _Walk:
-    """One pass through a file; `damage` says what it met."""
+@dataclass(frozen=True)
+class Place:
+    """Where to go on in a file whose index is known.
 
-    def __init__(self, path: Path, expand: Expand) -> None:
-        self._path = path
-        self._expand = expand
-        self.damage: str | None = None
+    Attributes:
+        path, suffix: the file, and which kind it is.
+        connections: topic and type of each number that messages carry.
+        chunks: where they begin, bytes; none where the file has none.
+    """
 
-    def messages(self) -> Iterator[SalvagedMessage]:
-        """All messages, until the file ends or is damaged beyond a chunk."""
-        with self._path.open("rb") as file:
-            size = self._path.stat().st_size
-            self._begin(file)
-            while (at := file.tell()) < size:
-                try:
-                    yield from self._record(file, whole=True)
-                except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
-                    self._damaged(f"it breaks off at byte {at:,} of {size:,}", error)
-                    return
-
-    def _begin(self, file: BinaryIO) -> None:
-        raise NotImplementedError
-
-    def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
-        raise NotImplementedError
-
-    def _chunk(self, compression: str, data: bytes, size: int, complete: bool) -> Iterator[SalvagedMessage]:
-        """The messages in a chunk; one that is damaged inside costs no more than itself."""
-        try:
-            chunk = BytesIO(data if compression in ("", "none") else self._expand(compression, data, size))
-            end = len(chunk.getbuffer())
-            while chunk.tell() < end:
-                yield from self._record(chunk, whole=False)
-        except Exception as error:
-            if complete:
-                self._damaged("a chunk in it is damaged", error)
-
-    def _damaged(self, what: str, error: Exception) -> None:
-        self.damage = self.damage or f"{what} ({str(error) or type(error).__name__})"
+    path: Path
+    suffix: str
+    connections: Mapping[int, tuple[str, str]]
+    chunks: Sequence[int]
 
 
-def _take(file: BinaryIO, size: int) -> bytes:
-    if size > _LONGEST_RECORD:
-        raise ValueError(f"a record of {size:,} bytes")
-    data = file.read(size)
-    if len(data) < size:
-        raise ValueError(f"expected {size:,} bytes more, got {len(data):,}")
-    return data
+def messages_from(place: Place, expand: Expand, on_damage: Callable[[str], None]) -> Iterator[SalvagedMessage]:
+    """The messages in the chunks of a place, or of its whole file where that has none, without those that are damaged.
 
-
-class _Rosbag1(_Walk):
-    """Records of a header, fields `name=value`, and data; chunks hold connections and messages."""
-
-    def __init__(self, path: Path, expand: Expand) -> None:
-        super().__init__(path, expand)
-        self._connections: dict[bytes, tuple[str, str]] = {}
-
-    def _begin(self, file: BinaryIO) -> None:
-        if file.read(len(_ROSBAG1_MAGIC)) != _ROSBAG1_MAGIC:
-            raise ValueError("it does not begin as a bag of ROS 1")
-
-    def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
-        header = _fields(_take(file, *struct.unpack("<I", _take(file, 4))))
-        (size,) = struct.unpack("<I", _take(file, 4))
-        kind = header.get(b"op")
-        if kind is None:
-            raise ValueError("a record of no kind")
-        if kind == b"\x05" and whole:
-            if size > _LONGEST_RECORD:
-                raise ValueError(f"a chunk of {size:,} bytes")
-            data = file.read(size)  # of the last one perhaps only a part is left
-            expanded = struct.unpack("<I", header[b"size"])[0]
-            yield from self._chunk(header[b"compression"].decode(), data, expanded, len(data) == size)
-            _require_whole(data, size)
-            return
-        data = _take(file, size)
-        if kind == b"\x07":
-            named = _fields(data)
-            package, _, name = named[b"type"].decode().rpartition("/")
-            self._connections[header[b"conn"]] = (
-                header[b"topic"].decode(),
-                f"{package.removesuffix('/msg')}/msg/{name}",
-            )
-        elif kind == b"\x02":
-            seconds, nanoseconds = struct.unpack("<II", header[b"time"])
-            yield SalvagedMessage(*self._connections[header[b"conn"]], seconds * 10**9 + nanoseconds, data)
-
-
-def _fields(data: bytes) -> dict[bytes, bytes]:
-    fields, at = {}, 0
-    while at < len(data):
-        (size,) = struct.unpack_from("<I", data, at)
-        name, _, value = data[at + 4 : at + 4 + size].partition(b"=")
-        fields[name] = value
-        at += 4 + size
-    return fields
-
-
-def _require_whole(data: bytes, size: int) -> None:
-    if len(data) < size:
-        raise ValueError(f"expected a chunk of {size:,} bytes, got {len(data):,}")
-
-
-class _Mcap(_Walk):
-    """Records of a kind, a length and their content; chunks hold schemas, channels and messages."""
-
-    def __init__(self, path: Path, expand: Expand) -> None:
-        super().__init__(path, expand)
-        self._schemas: dict[int, str] = {}
-        self._channels: dict[int, tuple[str, str]] = {}
-
-    def _begin(self, file: BinaryIO) -> None:
-        if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
-            raise ValueError("it does not begin as an MCAP file")
-
-    def _record(self, file: BinaryIO, whole: bool) -> Iterator[SalvagedMessage]:
-        kind, size = struct.unpack("<BQ", _take(file, 9))
-        if kind in (0x02, 0x0F):  # the footer, or the end of the data: what follows repeats what was
-            file.seek(0, 2)
-            return
-        if kind == 0x06 and whole:
-            if size > _LONGEST_RECORD:
-                raise ValueError(f"a chunk of {size:,} bytes")
-            data = file.read(size)
-            _, _, expanded, _, characters = struct.unpack_from("<QQQII", data)
-            compression = data[32 : 32 + characters].decode()
-            yield from self._chunk(compression, data[40 + characters :], expanded, len(data) == size)
-            _require_whole(data, size)
-            return
-        data = _take(file, size)
-        if kind == 0x03:
-            self._schemas[struct.unpack_from("<H", data)[0]] = _text(data, 2)
-        elif kind == 0x04:
-            channel, schema = struct.unpack_from("<HH", data)
-            self._channels[channel] = (_text(data, 4), self._schemas[schema])
-        elif kind == 0x05:
-            channel, _, record_ns, _ = struct.unpack_from("<HIQQ", data)
-            yield SalvagedMessage(*self._channels[channel], record_ns, data[22:])
-
-
-def _text(data: bytes, at: int) -> str:
-    (size,) = struct.unpack_from("<I", data, at)
-    return data[at + 4 : at + 4 + size].decode()
-
-
-class _Sqlite(_Walk):
-    """The rows of a table in the order they were written, without the index, whose pages lie at the end."""
-
-    def messages(self) -> Iterator[SalvagedMessage]:
-        uri = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(uri, uri=True)) as database:
-            # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
-            database.execute("PRAGMA writable_schema=ON")
-            topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
-            rows = database.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED")
+    Damage is told, but for that of the first chunk: whoever goes on from there knows of it.
+    """
+    walk = _WALKS[place.suffix](place.path, expand)
+    if not place.chunks:
+        yield from walk.messages()
+        return
+    walk.know(place.connections)
+    with place.path.open("rb") as file:
+        for number, chunk in enumerate(place.chunks):
+            walk.damage = None
+            file.seek(chunk)
             try:
-                for topic, record_ns, raw in rows:
-                    yield SalvagedMessage(*topics[topic], int(record_ns), bytes(raw))
-            except (sqlite3.Error, KeyError, TypeError, ValueError) as error:
-                self._damaged("it breaks off", error)
+                yield from walk.record(file, whole=True)
+            except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
+                walk.damaged("it cannot be read", error)
+            if walk.damage is not None and number:
+                on_damage(f"the chunk at byte {chunk:,}: {walk.damage}")

@@ -35,6 +35,7 @@ _CLOUDS_LOOKED_AT = 30
 _CLOUDS_WITHOUT_TIME = 3
 _FRAMES_LOOKED_AT = 10
 
+_DAMAGED = "damaged places in the bag were passed over"
 _MISSING = "scans are missing that the index lists"
 _NEVER_SET = "scans were left out: their stamps were never set"
 
@@ -109,18 +110,22 @@ class BagRecording:
     def _scans(self, wanted: range, faults: Faults | None) -> Iterator[Scan]:
         counted = Faults() if faults is None else faults
         try:
-            messages = in_stamp_order(self._wanted(wanted, counted), self._stamps.stamp, counted)
+            messages = in_stamp_order(self._wanted(wanted, counted, faults is None), self._stamps.stamp, counted)
             yield from readable_scans(messages, lambda message: self._scan(message, counted), faults)
         finally:
             if faults is None:
                 for warning in counted.warnings():
                     logger.warning("%s: %s", self._source, warning)
 
-    def _wanted(self, wanted: range, faults: Faults) -> Iterator[BagMessage]:
+    def _wanted(self, wanted: range, faults: Faults, strict: bool = False) -> Iterator[BagMessage]:
         for index, message in enumerate(islice(self._messages(faults), max(0, wanted.stop))):
             if index not in wanted:
                 continue
-            if message.frame_id != self._frame_id:
+            if message.damage is not None:
+                if strict:
+                    raise InputError(message.damage)
+                faults.unreadable(InputError(message.damage))
+            elif message.frame_id != self._frame_id:
                 kind = (
                     f"scans were left out: they come from another sensor than {self._frame_id!r};"
                     " for that one set reader.frame_id"
@@ -133,7 +138,7 @@ class BagRecording:
 
     def _messages(self, faults: Faults) -> Iterator[BagMessage]:
         count = 0
-        for message in self._bag.messages(self._topic):
+        for message in self._bag.messages(self._topic, lambda damage: faults.note(_DAMAGED, damage)):
             count += 1
             yield message
         if not count:
@@ -144,10 +149,14 @@ class BagRecording:
         if count < len(self):
             faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", len(self) - count)
 
+    def _sound(self) -> Iterator[BagMessage]:
+        """The messages that have a header, for what is learnt of them; the others are counted when it is their turn."""
+        return (message for message in self._bag.messages(self._topic) if message.damage is None)
+
     @cached_property
     def _frame_id(self) -> str:
         """The sensor that most of the first messages come from, unless another is asked for."""
-        frames = Counter(m.frame_id for m in islice(self._bag.messages(self._topic), _FRAMES_LOOKED_AT))
+        frames = Counter(m.frame_id for m in islice(self._sound(), _FRAMES_LOOKED_AT))
         if self._config.frame_id is None:
             return frames.most_common(1)[0][0] if frames else ""
         if self._config.frame_id not in frames:
@@ -173,7 +182,7 @@ class BagRecording:
 
     @cached_property
     def _stamps(self) -> StampSource:
-        return find_stamp_source(self._bag.messages(self._topic))
+        return find_stamp_source(self._sound())
 
     @cached_property
     def _last_stamp(self) -> float | None:
@@ -189,7 +198,7 @@ class BagRecording:
         if self._config.time_reference == "none":
             return None
         model, failures, period_s = None, 0, None
-        for message in islice(self._bag.messages(self._topic), _CLOUDS_LOOKED_AT):
+        for message in islice(self._sound(), _CLOUDS_LOOKED_AT):
             stamp = self._stamps.stamp(message)
             if period_s is None and self._last_stamp is not None and len(self) > 1:
                 period_s = (self._last_stamp - stamp) / (len(self) - 1)
@@ -221,7 +230,12 @@ class BagRecording:
         """
         faults = Faults()
         messages = in_stamp_order(self._wanted(range(len(self)), faults), self._stamps.stamp, faults)
-        message, first, unreadable = first_readable(self._source, messages, lambda message: self._scan(message, faults))
+        try:
+            message, first, unreadable = first_readable(self._source, messages, lambda item: self._scan(item, faults))
+        except InputError as error:
+            if not faults.left_out:
+                raise
+            raise InputError(f"{error}; {'; '.join(faults.warnings())}") from error
         cloud = self._decode(message)
         duration_s = max(0.0, (self._last_stamp or first.stamp) - first.stamp)
         return RecordingInfo(
@@ -238,7 +252,7 @@ class BagRecording:
             topic=self._topic.name,
             topics=self._bag.topics,
             fields=cloud.fields,
-            notes=(*self.warnings, *unreadable.warnings(), *self._notes(cloud, first.stamp)),
+            notes=(*self.warnings, *faults.warnings(), *unreadable.warnings(), *self._notes(cloud, first.stamp)),
         )
 
     def _describe_point_time(self, scan: Scan) -> PointTime | None:

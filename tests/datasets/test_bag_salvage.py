@@ -2,11 +2,14 @@
 
 import shutil
 import sqlite3
+import zlib
 from contextlib import closing
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import Reader as Rosbag2Reader
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.bag_file import BagFile
@@ -21,9 +24,9 @@ PERIOD_NS = 100_000_000
 def write_drive(make_bag_kit, make_sweep):
     """Write a bag of velodyne scans of 2 000 points; gives the storage file, the folder or file, and the points."""
 
-    def write(kind, count=6, **options):
-        kit = make_bag_kit(kind)
-        sweeps = [make_sweep("velodyne", STAMP_NS + i * PERIOD_NS, height=16, width=125) for i in range(count)]
+    def write(kind, count=6, width=125, kit=None, **options):
+        kit = kit or make_bag_kit(kind)
+        sweeps = [make_sweep("velodyne", STAMP_NS + i * PERIOD_NS, height=16, width=width) for i in range(count)]
         clouds = [
             (STAMP_NS + i * PERIOD_NS, kit.cloud(sweep.records, STAMP_NS + i * PERIOD_NS))
             for i, sweep in enumerate(sweeps)
@@ -167,8 +170,130 @@ def test_a_record_that_claims_to_be_endless_is_not_read(write_drive):
 
 
 def test_a_database_whose_rows_are_no_messages(write_drive):
-    file, _, _ = write_drive("db3")
+    file, _, points = write_drive("db3")
     with closing(sqlite3.connect(file)) as database, database:
         database.execute("UPDATE messages SET data = 'text' WHERE id = 4")
-    with pytest.raises(InputError, match=r"drive\.db3"):
-        list(open_recording(file).scans(faults=Faults()))
+    assert_all_but(open_recording(file), points, [3], "1 scans were left out: they could not be read; the first: ")
+
+
+def assert_all_but(recording, points, missing, *warnings):
+    """See that all scans are read but some, and that this is what is said of them."""
+    faults = Faults()
+    scans = list(recording.scans(faults=faults))
+    left = [i for i in range(len(points)) if i not in missing]
+    assert [scan.stamp for scan in scans] == [(STAMP_NS + i * PERIOD_NS) / 10**9 for i in left]
+    for scan, i in zip(scans, left, strict=True):
+        np.testing.assert_array_equal(scan.points, points[i])
+    assert len(faults.warnings()) == len(warnings)
+    for said, expected in zip(faults.warnings(), warnings, strict=True):
+        assert said.startswith(expected)
+        assert "\n" not in said
+    assert faults.left_out == len(missing)
+
+
+@pytest.mark.parametrize("length", [0, 3, 15])
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+@pytest.mark.parametrize("places", [[2], [0, 5]])
+def test_a_message_that_is_too_short_costs_no_other(make_bag_kit, write_drive, kind, length, places):
+    """Shorter than a header; the first and the last are those that most is learnt from."""
+    kit = make_bag_kit(kind)
+    serialize = kit.serialize
+    count = 0
+
+    def cut(message):
+        nonlocal count
+        count += 1
+        return serialize(message)[:length] if count - 1 in places else serialize(message)
+
+    kit.serialize = cut
+    file, _, points = write_drive(kind, kit=kit)
+    recording = open_recording(file)
+    told = f"{len(places)} scans were left out: they could not be read; the first: {file}: a message of {length} bytes"
+    assert_all_but(recording, points, places, told)
+    assert recording.describe().first_stamp == (STAMP_NS + (0 in places) * PERIOD_NS) / 10**9
+    with pytest.raises(InputError, match=f"a message of {length} bytes"):
+        list(recording.scans())
+
+
+def chunks_of(file):
+    """Where the chunks of a bag begin, behind their headers, and how long they are, by its index."""
+    if file.suffix == ".bag":
+        with Rosbag1Reader(file) as reader:
+            return [(chunk.datapos, chunk.datasize) for chunk in reader.chunks.values()]
+    with Rosbag2Reader(file) as reader:
+        return [
+            (chunk.chunk_start_offset + 49 + len(chunk.compression), chunk.compressed_size)
+            for chunk in reader.storage.chunks
+        ]
+
+
+def overwrite(file, begin, content):
+    data = bytearray(file.read_bytes())
+    data[begin : begin + len(content)] = content
+    file.write_bytes(data)
+
+
+def write_checksums(file):
+    """As recorders do: of every chunk of an MCAP file."""
+    for begin, length in chunks_of(file):
+        content = file.read_bytes()[begin : begin + length]
+        overwrite(file, begin - 49 + 9 + 24, zlib.crc32(content).to_bytes(4, "little"))
+
+
+BIG = {"count": 8, "width": 1500}  # two of these scans fill a chunk
+KINDS = [("bag", None), ("bag", Rosbag1Writer.CompressionFormat.LZ4), ("mcap", None)]
+
+
+@pytest.mark.parametrize("damaged", [[0], [1], [3], [0, 2], [1, 2, 3]])
+@pytest.mark.parametrize(("kind", "compression"), KINDS)
+def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive, kind, compression, damaged):
+    file, _, points = write_drive(kind, **BIG, **({} if compression is None else {"compression": (compression,)}))
+    chunks = chunks_of(file)
+    assert len(chunks) == 4
+    if kind == "mcap":
+        write_checksums(file)
+    for chunk in damaged:
+        begin, length = chunks[chunk]
+        overwrite(file, begin, np.random.default_rng(chunk).bytes(length))
+    recording = open_recording(file)
+    assert len(recording) == 8
+    lost = [2 * chunk + i for chunk in damaged for i in (0, 1)]
+    told = (
+        f"{len(damaged)} damaged places in the bag were passed over; the first: {file}: reading stopped after"
+        f" {2 * damaged[0]} messages of /points",
+        f"{len(lost)} scans are missing that the index lists; the first: its index lists 8 scans, it holds",
+    )
+    assert_all_but(recording, points, lost, *told)
+    assert recording.describe().duration_s > 0.0
+
+
+def test_a_folder_of_several_files_is_read_past_a_damaged_chunk(write_drive):
+    file, folder, _ = write_drive("mcap", **BIG)
+    begin, length = chunks_of(file)[1]
+    overwrite(file, begin, bytes(length))
+    metadata = folder / "metadata.yaml"
+    shutil.copy(file, folder / "again.mcap")
+    metadata.write_text(metadata.read_text().replace(f"- {file.name}\n", f"- {file.name}\n  - again.mcap\n", 1))
+    faults = Faults()
+    scans = list(open_recording(folder).scans(faults=faults))
+    assert len(scans) == 6
+    assert any("damaged places" in warning for warning in faults.warnings())
+
+
+def test_a_damaged_page_of_a_database_costs_its_rows(write_drive):
+    file, folder, points = write_drive("db3", count=60)
+    with closing(sqlite3.connect(file)) as database:
+        (size,) = database.execute("PRAGMA page_size").fetchone()
+    data = file.read_bytes()
+    pages = [data[at : at + size] for at in range(0, len(data), size)]
+    leaves = [number for number, page in enumerate(pages) if page[0] == 0x0D and b"lidar" in page[100:]]
+    assert len(leaves) > 3
+    overwrite(file, leaves[len(leaves) // 2] * size, bytes(size))
+    for source in (folder, file):
+        recording = open_recording(source)
+        scans = list(recording.scans(faults=Faults()))
+        assert 40 < len(scans) < 60
+        for scan in scans:
+            np.testing.assert_array_equal(scan.points, points[round((scan.stamp * 10**9 - STAMP_NS) / PERIOD_NS)])
+        assert scans[-1].stamp == (STAMP_NS + 59 * PERIOD_NS) / 10**9
+        assert any(f"{60 - len(scans)} rows of it cannot be read, the first after row" in w for w in recording.warnings)

@@ -79,6 +79,29 @@ def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, 
     assert lidarslam("run", small_recording, "--out", out, *FAST, "--overwrite").exit_code == 0
 
 
+@pytest.mark.parametrize("size", [0, 4_000, 100_000])
+def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path, small_recording: Path, size: int) -> None:
+    """Where the disk fills up as a run replaces an earlier one, before it has replaced anything or after."""
+    out = tmp_path / "run"
+    assert lidarslam("run", small_recording, "--out", out, *FAST).exit_code == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with files_no_longer_than(size):
+        result = lidarslam("run", small_recording, "--out", out, *FAST, "--start", 1, "--overwrite")
+    assert result.exit_code == 1
+    is_mixed = before != {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    assert is_mixed == (size == 100_000)
+    evaluated = lidarslam("evaluate", out)
+    if is_mixed:
+        assert evaluated.exit_code == 1
+        assert "this run did not finish" in evaluated.stderr
+        assert evaluated.stderr.count("\n") == 1
+    else:
+        assert evaluated.exit_code == 0
+    assert lidarslam("run", small_recording, "--out", out, *FAST, "--start", 1, "--overwrite").exit_code == 0
+    assert lidarslam("evaluate", out).exit_code == 0
+    assert json.loads((out / "summary.json").read_text())["scans"] == 5
+
+
 def test_a_map_is_whole_or_absent(tmp_path: Path) -> None:
     cloud = PointCloud(np.ones((1_000, 3)), np.ones((1_000, 3)))
     for suffix in ("ply", "pcd"):
@@ -96,6 +119,31 @@ def test_a_cut_recording_of_rerun_is_told_from_a_whole_one(tmp_path: Path, finis
         (tmp_path / "cut.rrd").write_bytes(content[:kept])
         with pytest.raises(IncompleteRecordingError):
             require_complete(tmp_path / "cut.rrd")
+
+
+def test_a_recording_of_rerun_that_finds_no_room_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:
+    out = tmp_path / "run"
+    command = ("run", small_recording, "--out", out, *FAST, "--set", "global_map.voxel_size_m=0.3", "--rerun", "save")
+    assert lidarslam(*command).exit_code == 0
+    sizes = {path.name: path.stat().st_size for path in out.iterdir()}
+    room = sizes.pop("recording.rrd") // 2
+    assert max(sizes.values()) < room
+    with files_no_longer_than(room):
+        result = lidarslam(*command, "--overwrite")
+    assert result.exit_code == 0
+    (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
+    assert warning.startswith("no recording.rrd: ")
+    assert f"warning: {warning}" in result.stdout
+    assert set(left_in(out)) == set(sizes)
+
+
+def test_a_view_that_finds_no_room_is_not_kept(tmp_path: Path, finished_run: Path) -> None:
+    with files_no_longer_than(5_000):
+        result = lidarslam("view", finished_run, "--save", tmp_path / "view.rrd")
+    assert result.exit_code == 1
+    assert result.stderr.count("lidarslam: ") == 1
+    assert f"{tmp_path}/view.rrd: cannot be written" in result.stderr
+    assert not [name for name in left_in(tmp_path) if "view.rrd" in name]
 
 
 def _evaluate(run: Path, out: Path) -> Sequence[object]:

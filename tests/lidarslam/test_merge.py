@@ -1,6 +1,10 @@
 """Several recordings of one simulated office become one map; one of another office does not."""
 
 import json
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -20,6 +24,7 @@ from lidarslam.finished_run import load_map, load_run
 from lidarslam.merge import MergeOutcome, MergeRequest, merge
 from lidarslam.merge_text import format_merge
 from lidarslam.pipeline import ScanResult
+from lidarslam.run_directory import FILES
 from lidarslam.run_watch import Progress
 from lidarslam.simulation.motions import Motion
 from lidarslam.simulation.mounts import mount_pose
@@ -244,6 +249,73 @@ def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path
     assert any("in room 1: stopped after 2 scans: interrupted" in line for line in outcome.stopped)
     assert any("in room 2: not begun" in line for line in outcome.stopped)
     assert len(read_tum(tmp_path / "out" / "02_in_room_1" / "trajectory.tum")) == 2
+
+
+KILLED_MERGE = """
+import os, signal, sys
+import lidarslam.merge, mapping.map_io, mapping.slam_graph, odometry.kiss
+from lidarslam.cli import main
+
+count = 0
+
+def see(event, args):
+    global count
+    if event in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") and str(args[0]).startswith(sys.argv[1]):
+        count += 1
+        if count == kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+pids, kills = [], [int(number) for number in sys.argv[2].split(",")]
+for kill_at in kills:
+    pid = os.fork()
+    if pid == 0:
+        sys.argv[1] = f"{sys.argv[1]}/{kill_at}"
+        sys.addaudithook(see)
+        try:
+            main(["merge", *sys.argv[3:], "--out", sys.argv[1]])
+        finally:
+            print(count)
+            sys.stdout.flush()
+            os._exit(0)
+    os.waitpid(pid, 0)
+"""
+
+
+def killed_merges(root: Path, kills: list[int], rooms: list[Path]) -> str:
+    """Merge into root/K for every K, each killed as it is about to do the Kth thing there; what was said."""
+    arguments = [argument for setting in (*SETTINGS, *FAST) for argument in ("--set", setting)]
+    command = [sys.executable, "-c", KILLED_MERGE, str(root), ",".join(map(str, kills)), *map(str, rooms), *arguments]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+
+
+def test_a_killed_merge_is_refused_and_made_again(rooms: list[Path], tmp_path: Path) -> None:
+    """Killed as it begins, halfway and among its results, it leaves no run and no map."""
+    rooms = rooms[:2]
+    whole = tmp_path / "whole" / "1000000"
+    things = int(killed_merges(whole.parent, [1_000_000], rooms).splitlines()[-1])
+    kills = [round(share * things) for share in (0.2, 0.5, 0.75)]
+    killed_merges(tmp_path / "killed", kills, rooms)
+    for kill_at in kills:
+        out = tmp_path / "killed" / str(kill_at)
+        again = f"this merge did not finish; make it again with lidarslam merge {rooms[0]} {rooms[1]} --out {out}"
+        with pytest.raises(InputError, match=re.escape(again)):
+            load_map(out)
+        for part in out.glob("0*"):
+            if (part / "unfinished" / "run.json").exists():
+                with pytest.raises(InputError, match=re.escape(again)):
+                    load_run(part)
+            elif any((part / name).exists() for name in FILES):  # all was written, and only that was not said yet
+                assert len(load_run(part).trajectory) == 5
+        with pytest.raises(OutputError, match=re.escape(again)):
+            merge(request(out, *rooms, settings=FAST), quiet)
+    merge(request(out, *rooms, overwrite=True, settings=FAST), quiet)
+    expected, made = ({path.relative_to(out) for path in out.rglob("*")} for out in (whole, out))
+    assert made == expected
+    assert len(load_run(out / "02_in_room_1").trajectory) == 5
+    reversed_out = tmp_path / "killed" / str(kills[1])
+    merge(request(reversed_out, *rooms[::-1], overwrite=True, settings=FAST), quiet)
+    assert sorted(path.name for path in reversed_out.iterdir() if path.is_dir()) == ["01_in_room_1", "02_in_room_0"]
 
 
 def test_what_cannot_be_merged_is_said_before_anything_is_written(rooms: list[Path], tmp_path: Path) -> None:

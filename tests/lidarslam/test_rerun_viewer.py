@@ -1,17 +1,23 @@
 """Finished runs in Rerun, and one line when they cannot be shown."""
 
+import resource
+import signal
 import socket
+import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from lidarslam import rerun_environment
 from lidarslam.config import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.finished_run import FinishedRun
-from lidarslam.rerun_viewer import show_runs
+from lidarslam.rerun_program import is_taken
+from lidarslam.rerun_viewer import IncompleteRecordingError, RerunViewer, require_complete, show_runs
 
 
 @pytest.fixture
@@ -45,10 +51,75 @@ def test_a_port_in_use_gets_one_line(finished: FinishedRun, monkeypatch: pytest.
             show_runs([finished], ViewerConfig(), None, web=True)
 
 
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_a_browser_is_served_to_this_machine_alone(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server on all interfaces would be there on each address of the loopback; one on 127.0.0.1 is on that alone."""
+    ports = free_port(), free_port()
+    monkeypatch.setattr("lidarslam.rerun_viewer._GRPC_PORT", ports[0])
+    monkeypatch.setattr("lidarslam.rerun_viewer._WEB_PORT", ports[1])
+    served = show_runs([finished], ViewerConfig(), None, web=True)
+    assert served is not None
+    try:
+        assert served.address.startswith(f"http://127.0.0.1:{ports[1]}/?url=")
+        with urlopen(served.address, timeout=10) as page:
+            assert b"<html" in page.read().lower()
+        for port in ports:
+            assert is_taken(port)
+            with socket.socket() as probe:
+                assert probe.connect_ex(("127.0.0.2", port)) != 0
+    finally:
+        served.recording.disconnect()
+        assert served.page.stdin is not None
+        served.page.stdin.close()  # as when this process ends, however it does
+        served.page.wait(10)
+    begun = time.monotonic()
+    while is_taken(ports[1]) and time.monotonic() - begun < 10:
+        time.sleep(0.05)
+    assert not is_taken(ports[1]), "the page goes with whoever served it"
+
+
+@pytest.mark.parametrize("size", [0, 1_000, 100_000])
+def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    """Rerun's own writer is never told, because it may wait without end then; the room it took is given back."""
+    monkeypatch.setattr(rerun_environment, "abandoned", False)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    begun = time.monotonic()
+    try:
+        viewer = RerunViewer("run", ViewerConfig(), tmp_path / "recording.rrd")
+        for seed in range(20):
+            viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
+        viewer.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert time.monotonic() - begun < 10
+    assert (tmp_path / "recording.rrd").stat().st_size == 0
+    assert not rerun_environment.abandoned
+    with pytest.raises(IncompleteRecordingError, match="is the disk full"):
+        require_complete(tmp_path / "recording.rrd")
+
+
+def test_a_recording_that_cannot_be_begun_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where there is no /dev/fd."""
+    monkeypatch.setattr("lidarslam.rerun_file._ENTRANCES", tmp_path / "none")
+    with pytest.raises(OutputError, match=r"cannot be begun \(.*\); leave --rerun out") as caught:
+        RerunViewer("run", ViewerConfig(), tmp_path / "recording.rrd")
+    assert "\n" not in str(caught.value)
+
+
 def test_no_display_gets_one_line(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.setattr("lidarslam.rerun_viewer._is_taken", lambda _: False)
+    monkeypatch.setattr("lidarslam.rerun_viewer.is_taken", lambda _: False)
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
         show_runs([finished], ViewerConfig(), None, web=False)

@@ -1,6 +1,7 @@
 """A run that was killed, wherever, and resumed comes to the results of one that was not."""
 
 import csv
+import hashlib
 import json
 import os
 import shutil
@@ -29,9 +30,10 @@ KILL = signal.SIGKILL
 KILLED = -KILL
 
 # Loads the program once, and for every line forks a run of it; told to, that kills itself without further notice as it
-# is about to do something to its directory, or at some time. It counts what it does there.
+# is about to do something to its directory, or at some time. It counts what it does there, and may keep what lies there
+# before each of these things, which is what a run that is killed then leaves.
 SERVER = """
-import json, os, signal, sys, threading
+import json, os, shutil, signal, sys, threading
 from pathlib import Path
 import lidarslam.rerun_viewer, lidarslam.run, mapping.map_io, mapping.slam_graph, odometry.learned
 from lidarslam.cli import main
@@ -42,13 +44,19 @@ def run(order):
     log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(log, 1)
     os.dup2(log, 2)
-    count = 0
+    count, busy = 0, threading.local()
 
     def see(event, args):
         nonlocal count
         if event not in EVENTS or not (event == "fsync" or str(args[0]).startswith(order["out"])):
             return
+        if hasattr(busy, "copying"):
+            return
         count += 1
+        if order["keep_in"] is not None and os.path.isdir(order["out"]):
+            busy.copying = True
+            shutil.copytree(order["out"], os.path.join(order["keep_in"], str(count)))
+            del busy.copying
         if count == order["kill_at"]:
             os.kill(os.getpid(), order["signal"])
 
@@ -114,6 +122,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         kill_at: int | None = None,
         kill_after_s: float | None = None,
         signal: int = KILL,
+        keep_in: Path | None = None,
     ) -> Ended:
         order = {
             "arguments": ["run", str(source), "--out", str(out), *arguments],
@@ -122,6 +131,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             "kill_at": kill_at,
             "kill_after_s": kill_after_s,
             "signal": int(signal),
+            "keep_in": None if keep_in is None else str(keep_in),
         }
         count = Path(f"{log}.count")
         count.unlink(missing_ok=True)
@@ -263,9 +273,16 @@ def test_the_graph_that_is_resumed_has_loops(whole: Callable[[str], Whole]) -> N
 def kill_and_resume(run: Run, expected: Whole, source: Path, out: Path, **kill: Any) -> None:
     """Kill a run, resume it until it is done, and see that it is as it should be."""
     ended = run(source, out, *expected.arguments, **kill)
-    if ended.status != KILLED:  # it was done before
-        assert ended.status == expected.ended.status, ended.said
-    elif out.exists() and (out / "unfinished" / "run.json").exists():
+    if ended.status == KILLED:
+        go_on(run, expected, source, out)
+        return
+    assert ended.status == expected.ended.status, ended.said  # it was done before
+    assert_same(out, expected.out)
+
+
+def go_on(run: Run, expected: Whole, source: Path, out: Path) -> None:
+    """Go on with what a killed run left, until it is done, and see that it is as it should be."""
+    if out.exists() and (out / "unfinished" / "run.json").exists():
         with pytest.raises(InputError, match="did not finish"):
             load_run(out)
         ended = run(source, out, *expected.arguments, "--resume")
@@ -283,17 +300,37 @@ def kill_and_resume(run: Run, expected: Whole, source: Path, out: Path, **kill: 
 EVERYWHERE = 24
 
 
-@pytest.mark.slow  # a fork and two runs for every kill: some two minutes
-@pytest.mark.parametrize("method", ["constant velocity", "pose graph"])
+@pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
+@pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10)])
 def test_a_run_may_be_killed_before_anything_it_does_on_disk(
-    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str
+    run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str, every_scans: int
 ) -> None:
-    expected = whole(method)
-    for event in range(1, expected.ended.events + 1):
-        kill_and_resume(run, expected, source, tmp_path / str(event), kill_at=event)
+    """What lies there before each of these things is kept of one run, as so many kills would leave it.
+
+    A state is saved three times, each time by the same steps.
+    """
+    expected, kept = whole(method), tmp_path / "kept"
+    expected = replace(expected, arguments=[*expected.arguments, "--set", f"checkpoints.every_scans={every_scans}"])
+    kept.mkdir()
+    ended = run(source, tmp_path / "run", *expected.arguments, keep_in=kept)
+    assert ended.status == expected.ended.status, ended.said
+    assert_same(tmp_path / "run", expected.out)
+    left = {content(path): path for path in sorted(kept.iterdir(), key=lambda path: int(path.name))}
+    assert len(left) > 20
+    for out in left.values():
+        go_on(run, expected, source, out)
+        shutil.rmtree(out)
 
 
-@pytest.mark.slow  # likewise
+def content(folder: Path) -> tuple[tuple[str, bytes], ...]:
+    """All that lies in a folder."""
+    return tuple(
+        (str(path.relative_to(folder)), hashlib.sha256(path.read_bytes()).digest() if path.is_file() else b"")
+        for path in sorted(folder.rglob("*"))
+    )
+
+
+@pytest.mark.slow  # a fork and two runs for every kill: a minute
 @pytest.mark.parametrize("method", METHODS)
 def test_a_run_may_be_killed_at_any_time(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, rng: np.random.Generator, method: str

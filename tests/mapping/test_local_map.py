@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
+from lidarslam.core.state import Saved
 from mapping.local_map import LEVELS, LocalMap, Matches
 
 CELL = 0.4
@@ -225,3 +226,22 @@ def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(
 def test_without_a_floor_the_vertical_is_the_worlds(rng: np.random.Generator) -> None:
     wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
     np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])
+
+
+def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    monkeypatch.setattr("mapping.local_map._TIDIED_AFTER", 3)
+    tidied: list[float] = []
+    monkeypatch.setattr("mapping.surfel_grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
+
+    def add(local_map: LocalMap) -> int:
+        tidied.clear()
+        local_map.add(rng.uniform(-1.0, 1.0, (50, 3)), np.zeros(50), np.empty((0, 3)), np.zeros(3))
+        return len(tidied)
+
+    local_map = LocalMap(0.1, 30.0)
+    assert [add(local_map) for _ in range(5)] == [0, 0, 4, 0, 0]
+    restored = LocalMap.restored(Saved(local_map.state()))
+    assert [add(restored) for _ in range(4)] == [4, 0, 0, 4]
+    assert [add(local_map.resized(0.2)), add(local_map)] == [4, 4]

@@ -58,9 +58,14 @@ def test_a_mapper_goes_on(scans: list[Scan], through_disk: ThroughDisk) -> None:
             assert_same(second.process(scan, Prior()), mapped)
 
 
-def test_a_map_that_has_forgotten_goes_on(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+@pytest.mark.parametrize("tidied_after", [1_000, 3])
+def test_a_map_that_has_forgotten_goes_on(
+    rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch, tidied_after: int
+) -> None:
     """Rows of cells are in the order in which they came, also after some were dropped."""
     from mapping.local_map import LocalMap
+
+    monkeypatch.setattr("mapping.local_map._TIDIED_AFTER", tidied_after)
 
     def add(local_map: LocalMap, step: int, seed: int) -> None:
         points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])

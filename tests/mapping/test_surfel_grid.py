@@ -216,3 +216,51 @@ def test_one_ring_has_no_spread_of_elevation_and_two_have_half_their_distance(rn
     assert one.patches(one.look_up(points)).elevation_spreads.max() < 3e-4
     two = grid_of(points, np.repeat([0.25, 0.29], 200))
     np.testing.assert_allclose(two.patches(two.look_up(points)).elevation_spreads, 0.02, rtol=0.1)
+
+
+def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng: np.random.Generator) -> None:
+    """A cell beside a wall keeps what a few stray points made of it, until it is worked out anew."""
+    stray = np.array([[0.25, 0.25, 0.6]]) + rng.normal(0.0, 0.02, (10, 3))
+    wall = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.array([0.25, 0.25, 0.45]), half_size=2.0)
+    grid = grid_of(stray)
+    assert not grid.patches(grid.look_up(stray)).is_plane.any()
+    grid.add(wall, np.zeros(len(wall)))
+    assert not grid.patches(grid.look_up(stray)).is_plane.any()
+    grid._tidied = len(grid)  # so that no cell is forgotten
+    grid.tidy()
+    patches = grid.patches(grid.look_up(stray))
+    assert patches.is_plane.all()
+    np.testing.assert_allclose(np.abs(patches.normals[:, 2]), 1.0, atol=1e-3)
+
+
+def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng: np.random.Generator) -> None:
+    wall = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.25]), half_size=2.9, count=100_000)
+    strays = rng.uniform([-2.9, -2.9, 1.2], [2.9, 2.9, 2.9], (40, 3))
+    once = on_plane(rng, np.array([1.0, 0.0, 0.0]), np.array([30.25, 0.0, 0.0]), count=60)  # as few as a stray, alone
+    grid = grid_of(np.concatenate([wall, strays, once]))
+    inner = wall[np.abs(wall).max(axis=1) < 1.9]  # at its border cells have few points, too
+    seen = grid.patches(grid.look_up(inner)).points
+    grid.tidy()
+    assert (grid.look_up(strays[strays[:, 2] > 1.8]) == ABSENT).all()
+    assert (grid.look_up(once) != ABSENT).all()
+    np.testing.assert_allclose(grid.patches(grid.look_up(inner)).points, seen, atol=1e-3)
+
+
+def test_a_place_seen_again_and_again_takes_no_more_cells(rng: np.random.Generator) -> None:
+    """Without tidying noise would reach 40 % more of them."""
+
+    def cells(tidied: bool) -> list[int]:
+        grid, counts = SurfelGrid(0.1), []
+        for scan in range(1, 4_001):
+            points = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.zeros(3), half_size=1.0, count=300)
+            grid.add(points + rng.normal(0.0, 0.03, points.shape), np.zeros(len(points)))
+            if tidied and scan % 250 == 0:
+                grid.tidy()
+            if scan % 1_000 == 0:
+                counts.append(len(grid))
+        return counts
+
+    tidied, untidied = cells(True), cells(False)
+    assert tidied[-1] < 1.05 * tidied[0]
+    assert untidied[-1] > 1.1 * untidied[0]
+    assert tidied[-1] < 0.7 * untidied[-1]
