@@ -109,9 +109,10 @@ class LocalMap:
             edges: (E, 3) points on edges, in the world.
             sensor: (3,) where they were seen from.
         """
+        views = _views(planes, sensor)
         for grid in self._planes:
-            grid.add(planes, elevations)
-        self._lines.add(edges, np.zeros(len(edges)))
+            grid.add(planes, elevations, views)
+        self._lines.add(edges, np.zeros(len(edges)), np.zeros((len(edges), 3)))  # both sides of an edge are the edge
         if self._centre is None:
             self._centre = sensor
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
@@ -169,11 +170,18 @@ class LocalMap:
         """The same map in cells of another size, made of the surfaces in the finest of these."""
         other = LocalMap(cell_m, self._radius_m)
         other._centre = self._centre
-        points, elevations = self._planes[0].samples()
+        samples = self._planes[0].samples()
         for grid in other._planes:
-            grid.add(points, elevations)
+            grid.add(*samples)
         other._lines.add(*self._lines.samples())
         return other
+
+
+def _views(points: FloatArray, sensor: FloatArray) -> FloatArray:
+    """Unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
+    towards = sensor - points
+    distances = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+    return np.asarray(towards / np.maximum(distances, 1e-9)[:, None], dtype=np.float64)
 
 
 def _room_for(count: int) -> Pulls:

@@ -77,6 +77,7 @@ class Mapper:
         self._earlier = EarlierMaps()
         self._scans_in_map = 0
         self._first: SampledScan | None = None  # while the map is one sweep whose motion was made up
+        self._usual = 0.0
         self._has_velocity = False  # no change of velocity is seen from one that was made up
 
     @property
@@ -117,6 +118,8 @@ class Mapper:
         sampled = self._sampler.sample(scan)
         last = self._state or State.first(scan.stamp, prior.velocity)
         prediction = predict(last, scan.stamp, prior, self._carrier, self._config)
+        from mapping.prediction import _WILDEST
+        self._wild = predict(last, scan.stamp, prior, Carrier(*_WILDEST), self._config)
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
             made_up = prior.velocity is None and sampled.times is not None and self._config.continuous_time
@@ -185,7 +188,9 @@ class Mapper:
         if self._is_blind(sampled):
             return self._see_nothing(sampled, prediction)
         coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
-        near = place(sampled, prediction, last, local_map, self._config, coarse_first)
+        near = place(sampled, prediction, last, local_map, self._config, coarse_first, self._usual, self._wild)
+        if near.status is Status.OK:
+            self._usual += 0.2 * (near.quality - self._usual)
         placed = self._look(near, sampled, prediction, last, local_map)
         if placed is None:
             return self._miss(sampled, prediction, near.fit)

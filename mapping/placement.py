@@ -64,7 +64,7 @@ class Placed:
 
 def place(
     sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
-    coarse_first: bool,
+    coarse_first: bool, usual: float = 0.0, wild: Prediction | None = None,
 ) -> Placed:  # fmt: skip
     """Lay a scan on the map from where it is expected; where it does not fit there, by way of coarser cells.
 
@@ -77,10 +77,14 @@ def place(
         coarse_first: whether to begin with coarser cells at once.
     """
     placed = _place_once(sampled, prediction, last, local_map, config, coarse_first)
-    if coarse_first or placed.status is Status.OK:
+    import os
+    A, B = float(os.environ.get("A", "0.9")), float(os.environ.get("B", "0.8"))
+    if placed.status is Status.OK and placed.quality > A * usual:
         return placed
-    again = _place_once(sampled, prediction, last, local_map, config, coarse_first=True)
-    return again if again.fit.inlier_share > placed.fit.inlier_share else placed
+    patient = config.model_copy(update={"refinement": config.refinement.model_copy(update=_PATIENCE)})
+    again = _place_once(sampled, wild, last, local_map, patient, coarse_first=True)
+    STAT.append((placed.quality, usual, again.quality))
+    return again if again.quality > placed.quality else placed
 
 
 def search(
@@ -184,3 +188,6 @@ def _with_velocity(covariance: FloatArray, last: State, interval_s: float) -> Fl
     both[:6, 6:] = both[6:, :6] = covariance[:6, :6] / interval_s
     both[6:, 6:] = (covariance[:6, :6] + last.covariance[:6, :6]) / interval_s**2
     return both
+
+
+STAT = []

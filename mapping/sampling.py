@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
-from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.thinning import nearest_per_cell, one_per_cell
 from mapping.config import MappingConfig
 from mapping.features import extract_features
 from mapping.refinement import Sweep
@@ -161,6 +161,12 @@ def _any_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     Of a tree in a cell the last point of the sweep is always that on the same side: each scan would be laid a little
     turned on the one before, and a sensor that stands still would turn, by a tenth of a degree in ten scans.
     """
+    import os
+    how = os.environ.get("KEYS", "random")
+    if how == "last":
+        return one_per_cell(points, cell_m)
+    if how in ("centre", "mean"):
+        return nearest_per_cell(points, cell_m, how == "mean")
     shuffled = np.random.default_rng(len(points)).permutation(len(points))
     return np.sort(shuffled[one_per_cell(points.take(shuffled, axis=0), cell_m)])
 

@@ -64,3 +64,59 @@ def _last_comers(slots: NDArray[np.int32], last_comer: NDArray[np.int32], kept: 
             kept[count] = n
             count += 1
     return count
+
+
+def nearest_per_cell(points: FloatArray, cell_m: float, to_mean: bool) -> NDArray[np.intp]:
+    if not hasattr(_room, "best"):
+        _room.best = np.empty(_SLOTS, dtype=np.int32)
+        _room.sums = np.zeros((_SLOTS, 4), dtype=np.float32)
+    kept = np.empty(len(points), dtype=np.intp)
+    slots = np.empty(len(points), dtype=np.int32)
+    _write_slots(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots)
+    return kept[: _nearest(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots, _room.best, _room.sums, to_mean, kept)]
+
+
+@compiled
+def _nearest(points: FloatArray, per_metre: np.float32, slots: NDArray[np.int32], best: NDArray[np.int32], sums: NDArray[np.float32], to_mean: bool, kept: NDArray[np.intp]) -> int:
+    for n in range(len(slots)):
+        s = slots[n]
+        best[s] = -1
+        for a in range(4):
+            sums[s, a] = 0.0
+    if to_mean:
+        for n in range(len(slots)):
+            s = slots[n]
+            sums[s, 0] += np.float32(points[n, 0])
+            sums[s, 1] += np.float32(points[n, 1])
+            sums[s, 2] += np.float32(points[n, 2])
+            sums[s, 3] += np.float32(1.0)
+        for n in range(len(slots)):
+            s = slots[n]
+            if best[s] == -1:
+                best[s] = -2
+                for a in range(3):
+                    sums[s, a] /= sums[s, 3]
+                sums[s, 3] = np.inf
+    else:
+        for n in range(len(slots)):
+            s = slots[n]
+            if best[s] == -1:
+                best[s] = -2
+                for a in range(3):
+                    sums[s, a] = (np.floor(np.float32(points[n, a]) * per_metre) + np.float32(0.5)) / per_metre
+                sums[s, 3] = np.inf
+    for n in range(len(slots)):
+        s = slots[n]
+        x = np.float32(points[n, 0]) - sums[s, 0]
+        y = np.float32(points[n, 1]) - sums[s, 1]
+        z = np.float32(points[n, 2]) - sums[s, 2]
+        d = x * x + y * y + z * z
+        if d < sums[s, 3]:
+            sums[s, 3] = d
+            best[s] = n
+    count = 0
+    for n in range(len(slots)):
+        if best[slots[n]] == n:
+            kept[count] = n
+            count += 1
+    return count
