@@ -1,4 +1,4 @@
-"""Laying one scan on the map: from its prediction, again from coarser cells, and at last from anywhere."""
+"""Laying one scan on the map: from its prediction, again and patiently, and at last from anywhere."""
 
 from dataclasses import dataclass, replace
 
@@ -64,9 +64,9 @@ class Placed:
 
 def place(
     sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
-    coarse_first: bool, usual: float = 0.0, wild: Prediction | None = None,
+    coarse_first: bool,
 ) -> Placed:  # fmt: skip
-    """Lay a scan on the map from where it is expected; where it does not fit there, by way of coarser cells.
+    """Lay a scan on the map from where it is expected.
 
     Args:
         sampled: the points.
@@ -74,17 +74,27 @@ def place(
         last: the scan before.
         local_map: what is laid on.
         config: how.
-        coarse_first: whether to begin with coarser cells at once.
+        coarse_first: whether to begin with coarser cells.
     """
-    placed = _place_once(sampled, prediction, last, local_map, config, coarse_first)
-    import os
-    A, B = float(os.environ.get("A", "0.9")), float(os.environ.get("B", "0.8"))
-    if placed.status is Status.OK and placed.quality > A * usual:
-        return placed
-    patient = config.model_copy(update={"refinement": config.refinement.model_copy(update=_PATIENCE)})
-    again = _place_once(sampled, wild, last, local_map, patient, coarse_first=True)
-    STAT.append((placed.quality, usual, again.quality))
-    return again if again.quality > placed.quality else placed
+    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
+    refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
+    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
+        refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
+    if refined is None:
+        return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
+    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
+    fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
+    return Placed(refined, fit, fit.status(config.tracking))
+
+
+def place_patiently(
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
+) -> Placed:
+    """Lay a scan on the map by way of coarser cells, from which there may be a long way to go."""
+    refinement = config.refinement
+    patience = {name: max(steps, getattr(refinement, name)) for name, steps in _PATIENCE.items()}
+    patient = config.model_copy(update={"refinement": refinement.model_copy(update=patience)})
+    return place(sampled, prediction, last, local_map, patient, coarse_first=True)
 
 
 def search(
@@ -131,11 +141,10 @@ def _from_starts(
     config: MappingConfig,
 ) -> list[Placed]:  # fmt: skip
     """What a scan comes to from each of the poses (K, 4, 4), where it comes to something that is ok."""
-    patient = config.model_copy(update={"refinement": config.refinement.model_copy(update=_PATIENCE)})
     tried = []
     for start in starts:
         free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
-        tried.append(_place_once(sampled, free, last, local_map, patient, coarse_first=True))
+        tried.append(place_patiently(sampled, free, last, local_map, config))
     return [placed for placed in tried if placed.status is Status.OK]
 
 
@@ -143,21 +152,6 @@ def _apart_m(one: Placed, other: Placed) -> float:
     assert one.refined is not None
     assert other.refined is not None
     return float(np.linalg.norm(one.refined.T_world_lidar[:3, 3] - other.refined.T_world_lidar[:3, 3]))
-
-
-def _place_once(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
-    coarse_first: bool,
-) -> Placed:  # fmt: skip
-    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
-    refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
-    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
-        refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
-    if refined is None:
-        return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
-    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
-    fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
-    return Placed(refined, fit, fit.status(config.tracking))
 
 
 def _with_own_motion(
@@ -188,6 +182,3 @@ def _with_velocity(covariance: FloatArray, last: State, interval_s: float) -> Fl
     both[:6, 6:] = both[6:, :6] = covariance[:6, :6] / interval_s
     both[6:, 6:] = (covariance[:6, :6] + last.covariance[:6, :6]) / interval_s**2
     return both
-
-
-STAT = []

@@ -95,6 +95,11 @@ class Carrier:
     translation: float = _USUAL[1]
 
     @classmethod
+    def wildest(cls) -> "Carrier":
+        """One that anything is believed of."""
+        return cls(*_WILDEST)
+
+    @classmethod
     def restored(cls, saved: Saved) -> "Carrier":
         """What was saved, which is all of it."""
         return cls(saved.number("rotation"), saved.number("translation"))

@@ -29,12 +29,40 @@ def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
         points: (N, 3).
         cell_m: edge of a cell.
     """
-    if not hasattr(_room, "last_comer"):
-        _room.last_comer = np.empty(_SLOTS, dtype=np.int32)
     kept = np.empty(len(points), dtype=np.intp)
+    slots = _slots_of(np.ascontiguousarray(points), cell_m)
+    return kept[: _last_comers(slots, _slot_values(), kept)]
+
+
+def central_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
+    """Indices, ascending, of one point in nearly every occupied cell of a grid: the nearest to the mean of the cell's.
+
+    That is on the same part of a surface whichever way the sensor goes round, which the last comer is not. The hash is
+    that of `one_per_cell`; where two cells meet in one slot they count as one.
+
+    Args:
+        points: (N, 3), finite.
+        cell_m: edge of a cell.
+    """
+    points = np.ascontiguousarray(points)
+    kept = np.empty(len(points), dtype=np.intp)
+    slots = _slots_of(points, cell_m)
+    sums = np.empty((len(points), 4), dtype=np.float32)
+    return np.sort(kept[: _most_central(points, slots, _slot_values(), sums, kept)])
+
+
+def _slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
     slots = np.empty(len(points), dtype=np.int32)
-    _write_slots(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots)
-    return kept[: _last_comers(slots, _room.last_comer, kept)]
+    _write_slots(points, np.float32(1.0 / cell_m), slots)
+    return slots
+
+
+def _slot_values() -> NDArray[np.int32]:
+    """This thread's slots, with whatever is in them."""
+    if not hasattr(_room, "values"):
+        _room.values = np.empty(_SLOTS, dtype=np.int32)
+    values: NDArray[np.int32] = _room.values
+    return values
 
 
 @compiled
@@ -66,57 +94,42 @@ def _last_comers(slots: NDArray[np.int32], last_comer: NDArray[np.int32], kept: 
     return count
 
 
-def nearest_per_cell(points: FloatArray, cell_m: float, to_mean: bool) -> NDArray[np.intp]:
-    if not hasattr(_room, "best"):
-        _room.best = np.empty(_SLOTS, dtype=np.int32)
-        _room.sums = np.zeros((_SLOTS, 4), dtype=np.float32)
-    kept = np.empty(len(points), dtype=np.intp)
-    slots = np.empty(len(points), dtype=np.int32)
-    _write_slots(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots)
-    return kept[: _nearest(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots, _room.best, _room.sums, to_mean, kept)]
-
-
 @compiled
-def _nearest(points: FloatArray, per_metre: np.float32, slots: NDArray[np.int32], best: NDArray[np.int32], sums: NDArray[np.float32], to_mean: bool, kept: NDArray[np.intp]) -> int:
-    for n in range(len(slots)):
-        s = slots[n]
-        best[s] = -1
-        for a in range(4):
-            sums[s, a] = 0.0
-    if to_mean:
-        for n in range(len(slots)):
-            s = slots[n]
-            sums[s, 0] += np.float32(points[n, 0])
-            sums[s, 1] += np.float32(points[n, 1])
-            sums[s, 2] += np.float32(points[n, 2])
-            sums[s, 3] += np.float32(1.0)
-        for n in range(len(slots)):
-            s = slots[n]
-            if best[s] == -1:
-                best[s] = -2
-                for a in range(3):
-                    sums[s, a] /= sums[s, 3]
-                sums[s, 3] = np.inf
-    else:
-        for n in range(len(slots)):
-            s = slots[n]
-            if best[s] == -1:
-                best[s] = -2
-                for a in range(3):
-                    sums[s, a] = (np.floor(np.float32(points[n, a]) * per_metre) + np.float32(0.5)) / per_metre
-                sums[s, 3] = np.inf
-    for n in range(len(slots)):
-        s = slots[n]
-        x = np.float32(points[n, 0]) - sums[s, 0]
-        y = np.float32(points[n, 1]) - sums[s, 1]
-        z = np.float32(points[n, 2]) - sums[s, 2]
-        d = x * x + y * y + z * z
-        if d < sums[s, 3]:
-            sums[s, 3] = d
-            best[s] = n
+def _most_central(
+    points: FloatArray, slots: NDArray[np.int32], cells: NDArray[np.int32], sums: NDArray[np.float32],
+    nearest: NDArray[np.intp],
+) -> int:  # fmt: skip
+    """Write which points (N, 3) are the nearest to the means of those in their slots (N,); return how many.
+
+    Args:
+        points, slots: which.
+        cells: of all slots, written: the number of the cell in it.
+        sums: (N, 4) room for sums of coordinates and how many they are of, by cell.
+        nearest: (N,) written, by cell.
+    """
     count = 0
     for n in range(len(slots)):
-        if best[slots[n]] == n:
-            kept[count] = n
+        cell = cells[slots[n]]
+        # A number that was left here by an earlier scan points to a cell of another slot, or to none.
+        if cell < 0 or cell >= count or slots[nearest[cell]] != slots[n]:
+            cell = count
+            cells[slots[n]] = cell
+            nearest[cell] = n
+            sums[cell, :] = np.float32(0.0)
             count += 1
+        for axis in range(3):
+            sums[cell, axis] += np.float32(points[n, axis])
+        sums[cell, 3] += np.float32(1.0)
+    for cell in range(count):
+        for axis in range(3):
+            sums[cell, axis] /= sums[cell, 3]
+        sums[cell, 3] = np.inf  # the least square of a distance so far
+    for n in range(len(slots)):
+        cell = cells[slots[n]]
+        squared = np.float32(0.0)
+        for axis in range(3):
+            squared += (np.float32(points[n, axis]) - sums[cell, axis]) ** 2
+        if squared < sums[cell, 3]:
+            sums[cell, 3] = squared
+            nearest[cell] = n
     return count

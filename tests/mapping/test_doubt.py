@@ -13,7 +13,7 @@ def test_after_a_lost_scan_it_is_surprised_until_one_is_laid() -> None:
     doubt = Doubt()
     doubt.missed()
     assert doubt.is_surprised(0.1)
-    doubt.laid(Status.OK, found=False)
+    doubt.laid(Status.OK, False, 0.8)
     assert not doubt.is_surprised(0.1)
 
 
@@ -38,24 +38,24 @@ def test_looking_everywhere_becomes_rare() -> None:
 
 def test_found_again_is_confirmed_by_three_scans() -> None:
     doubt = Doubt()
-    doubt.laid(Status.OK, found=True)
+    doubt.laid(Status.OK, True, 0.8)
     unconfirmed = []
     for _ in range(4):
         unconfirmed.append(doubt.is_unconfirmed)
-        doubt.laid(Status.OK, found=False)
+        doubt.laid(Status.OK, False, 0.8)
     assert unconfirmed == [True, True, True, False]
 
 
 def test_scans_that_lie_badly_confirm_nothing() -> None:
     doubt = Doubt()
-    doubt.laid(Status.OK, found=True)
+    doubt.laid(Status.OK, True, 0.8)
     for _ in range(10):
-        doubt.laid(Status.DEGRADED, found=False)
+        doubt.laid(Status.DEGRADED, False, 0.8)
     assert doubt.is_unconfirmed
 
 
 def test_the_second_degraded_scan_is_reason_to_look_around() -> None:
     doubt = Doubt()
     assert not doubt.looks_around
-    doubt.laid(Status.DEGRADED, found=False)
+    doubt.laid(Status.DEGRADED, False, 0.8)
     assert doubt.looks_around
