@@ -212,7 +212,7 @@ class Mapper:
             return near
         anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config)
         again = place_patiently(sampled, anyhow, last, local_map, self._config)
-        return again if again.quality > near.quality else near
+        return again if again.is_beyond_doubt and again.quality > near.quality else near
 
     def _look(
         self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap

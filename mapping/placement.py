@@ -66,7 +66,7 @@ def place(
     sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
     coarse_first: bool,
 ) -> Placed:  # fmt: skip
-    """Lay a scan on the map from where it is expected.
+    """Lay a scan on the map from where it is expected; where it does not fit there, by way of coarser cells.
 
     Args:
         sampled: the points.
@@ -74,17 +74,13 @@ def place(
         last: the scan before.
         local_map: what is laid on.
         config: how.
-        coarse_first: whether to begin with coarser cells.
+        coarse_first: whether to begin with coarser cells at once.
     """
-    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
-    refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
-    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
-        refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
-    if refined is None:
-        return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
-    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
-    fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
-    return Placed(refined, fit, fit.status(config.tracking))
+    placed = _place_once(sampled, prediction, last, local_map, config, coarse_first)
+    if coarse_first or placed.status is Status.OK:
+        return placed
+    again = _place_once(sampled, prediction, last, local_map, config, coarse_first=True)
+    return again if again.fit.inlier_share > placed.fit.inlier_share else placed
 
 
 def place_patiently(
@@ -94,7 +90,7 @@ def place_patiently(
     refinement = config.refinement
     patience = {name: max(steps, getattr(refinement, name)) for name, steps in _PATIENCE.items()}
     patient = config.model_copy(update={"refinement": refinement.model_copy(update=patience)})
-    return place(sampled, prediction, last, local_map, patient, coarse_first=True)
+    return _place_once(sampled, prediction, last, local_map, patient, coarse_first=True)
 
 
 def search(
@@ -152,6 +148,21 @@ def _apart_m(one: Placed, other: Placed) -> float:
     assert one.refined is not None
     assert other.refined is not None
     return float(np.linalg.norm(one.refined.T_world_lidar[:3, 3] - other.refined.T_world_lidar[:3, 3]))
+
+
+def _place_once(
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
+    coarse_first: bool,
+) -> Placed:  # fmt: skip
+    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
+    refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
+    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
+        refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
+    if refined is None:
+        return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
+    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
+    fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
+    return Placed(refined, fit, fit.status(config.tracking))
 
 
 def _with_own_motion(
