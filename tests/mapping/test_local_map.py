@@ -52,6 +52,31 @@ def distances(points: FloatArray, matches: Matches) -> FloatArray:
     return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
 
 
+def test_a_wall_pulls_nobody_who_looks_at_its_back(rng: np.random.Generator) -> None:
+    """What is seen from the other side of a thin wall is its other side."""
+    wall = np.column_stack([np.full(20_000, 2.0), rng.uniform(-3.0, 3.0, (20_000, 2))])
+    local_map, asked = map_of(wall), np.column_stack([np.full(200, 2.1), rng.uniform(-2.0, 2.0, (200, 2))])
+    behind = HERE.copy()
+    behind[0, 3] = 4.0
+    assert len(local_map.match_planes(asked, HERE)) == len(asked)
+    assert len(local_map.match_planes(asked, behind)) == 0
+
+
+def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng: np.random.Generator) -> None:
+    """Whichever was seen first, and though both lie in the same cells of the coarser grids."""
+    sides = [np.column_stack([np.full(20_000, x), rng.uniform(-3.0, 3.0, (20_000, 2))]) for x in (1.95, 2.05)]
+    local_map = LocalMap(0.07, 100.0)
+    for wall, sensor_x in zip(sides, (0.0, 4.0), strict=True):
+        sensor = np.array([sensor_x, 0.0, 0.0])
+        local_map.add(wall, rng.uniform(-0.3, 0.3, len(wall)), NO_EDGES, sensor)
+    for wall, sensor_x in zip(sides, (0.0, 4.0), strict=True):
+        T_world_lidar = make_transform(np.eye(3), np.array([sensor_x, 0.0, 0.0]))
+        asked = wall[np.abs(wall[:, 1:]).max(axis=1) < 2.0]
+        matches = local_map.match_planes(asked, T_world_lidar)
+        assert len(np.unique(matches.index)) > 0.95 * len(asked)
+        assert distances(asked, matches).max() < 0.005
+
+
 def test_points_on_walls_meet_the_walls(rng: np.random.Generator) -> None:
     local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
     matches = local_map.match_planes(asked, HERE)
