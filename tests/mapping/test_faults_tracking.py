@@ -13,6 +13,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.faults import (
     Cover,
     Faulty,
@@ -193,6 +194,29 @@ def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded, 3)
+
+
+@pytest.mark.parametrize("first", [128, 155])
+def test_a_sudden_turn_on_the_spot_is_followed(first: int) -> None:
+    """From rest to 180 deg/s within three scans, and from there to the other way round, told by nobody."""
+    world = build_world("hall", 0)
+    motion = motion_along_route("tracked-harsh", world, 0)
+    mount = mount_pose("upright", motion.sensor_height_m)
+    simulation = Simulation(world, light("os1-64"), motion, mount, 300)
+    recorded = Faulty(tuple(simulation.scans(first, first + 30)), _part(simulation, first, 30), np.zeros(30, bool), 0)
+    turns = np.rad2deg(rotation_angle(recorded.truth.relative_motions()))
+    assert np.abs(np.diff(turns)).max() > 7.0
+    mapper = Mapper(MappingConfig())
+    results = process(mapper, recorded, 0)
+    metres, degrees = errors(results, recorded, 0)
+    assert {result.status for result in results} == {Status.OK}
+    assert metres.max() < 0.05
+    assert degrees.max() < 1.5
+
+
+def _part(simulation: Simulation, first: int, count: int) -> Trajectory:
+    truth = simulation.ground_truth
+    return Trajectory(truth.stamps[first : first + count], truth.T_world_lidar[first : first + count])
 
 
 def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> Faulty:
