@@ -18,7 +18,7 @@ from mapping.doubt import Doubt
 from mapping.earlier_maps import EarlierMaps
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
-from mapping.placement import Placed, place, place_patiently, search, search_everywhere
+from mapping.placement import Placed, place, place_surprised, search, search_everywhere
 from mapping.prediction import Carrier, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
@@ -211,7 +211,7 @@ class Mapper:
         if not self._doubt.lies_badly(near.status, near.quality):
             return near
         anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config)
-        again = place_patiently(sampled, anyhow, last, local_map, self._config)
+        again = place_surprised(sampled, anyhow, last, local_map, self._config)
         return again if again.is_beyond_doubt and again.quality > near.quality else near
 
     def _look(
