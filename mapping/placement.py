@@ -34,7 +34,8 @@ _ELSEWHERE_CELLS = 4.0
 _DRAWN_RANGES = 3.0
 _DRAWN_CELLS = 4.0
 _PLACES = 24
-# Changes of the rate of turning that are tried, rad/s.
+# Changes of the rate of turning that are tried on a scan that lies badly, rad/s: from full speed one way round to full
+# speed the other way between two sweeps.
 _TURNS = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
 _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
@@ -102,7 +103,8 @@ def place_surprised(
     if config.continuous_time and sweep.plane_times is not None:
         up = T_world_lidar[:3, :3].T @ local_map.vertical()
         velocities = prediction.velocity + np.outer(_TURNS, np.concatenate([up, np.zeros(3)]))
-        starts.append(best_velocity(sweep.planes, sweep.plane_times, velocities, T_world_lidar, local_map))
+        turned = best_velocity(sweep.planes, sweep.plane_times, velocities, T_world_lidar, local_map)
+        starts += [] if np.array_equal(turned, prediction.velocity) else [turned]
     tried = [
         _place_patiently(sampled, replace(prediction, velocity=velocity), last, local_map, config)
         for velocity in starts

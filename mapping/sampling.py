@@ -125,8 +125,8 @@ class Sampler:
             points=points,
             elevations=np.arcsin(points[:, 2] / ranges),
             times=None if times is None else times.take(kept),
-            # Were they the last of the sweep, they would lie on the same side of every tree, and each scan would be laid
-            # a little turned on the one before: a sensor that stands still would turn.
+            # Were they the last of the sweep, they would lie on the same side of every tree, and each scan would be
+            # laid a little turned on the one before: a sensor that stands still would turn.
             keys=_thin_to(central_per_cell(points, _KEY_SPACING * cell_m), self._config.keypoints),
             edges=scan.points.take(edges, axis=0),
             edge_times=None if times is None else times.take(edges),
