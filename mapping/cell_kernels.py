@@ -134,8 +134,17 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
 
 
 @compiled
+def write_views(points: FloatArray, sensor: FloatArray, views: Floats) -> None:
+    """Write the unit directions (N, 3) from points (N, 3) to where they were seen from (3,)."""
+    for n in range(len(points)):
+        x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
+        scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        views[n, 0], views[n, 1], views[n, 2] = x * scale, y * scale, z * scale
+
+
+@compiled
 def add_moments(
-    points: FloatArray, elevations: FloatArray, views: FloatArray, keys: Keys, rows: Rows, cell_m: float,
+    points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,
     grid_keys: Keys, sums: Floats,
 ) -> None:  # fmt: skip
     """Add points (N, 3), seen at angles (N,) from directions (N, 3), to the sums of their cells, unless these have
@@ -167,9 +176,9 @@ def add_moments(
         cell[9] += z * z
         cell[10] += elevation
         cell[11] += elevation * elevation
-        cell[12] += np.float32(views[n, 0])
-        cell[13] += np.float32(views[n, 1])
-        cell[14] += np.float32(views[n, 2])
+        cell[12] += views[n, 0]
+        cell[13] += views[n, 1]
+        cell[14] += views[n, 2]
 
 
 @compiled

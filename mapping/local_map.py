@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Saved, State
+from mapping.cell_kernels import write_views
 from mapping.match_kernels import Bodies, Pulls, pull_to_bodies, pull_to_planes
 from mapping.patches import PatchTable
 from mapping.surfel_grid import SurfelGrid
@@ -177,11 +178,11 @@ class LocalMap:
         return other
 
 
-def _views(points: FloatArray, sensor: FloatArray) -> FloatArray:
+def _views(points: FloatArray, sensor: FloatArray) -> NDArray[np.float32]:
     """Unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
-    towards = sensor - points
-    distances = np.sqrt(np.einsum("ij,ij->i", towards, towards))
-    return np.asarray(towards / np.maximum(distances, 1e-9)[:, None], dtype=np.float64)
+    views = np.empty((len(points), 3), dtype=np.float32)
+    write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
+    return views
 
 
 def _room_for(count: int) -> Pulls:

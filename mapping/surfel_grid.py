@@ -64,7 +64,7 @@ class SurfelGrid:
         grid._table.rebuild(grid._keys)
         return grid
 
-    def add(self, points: FloatArray, elevations: FloatArray, views: FloatArray) -> None:
+    def add(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
         """Add points (N, 3) of the world.
 
         Args:
@@ -78,7 +78,7 @@ class SurfelGrid:
         keys = point_keys(points, self.cell_m)
         rows = self._table.insert(keys)
         self._reserve(len(self._table))
-        seen = np.ascontiguousarray(elevations), np.ascontiguousarray(views)
+        seen = np.ascontiguousarray(elevations), np.ascontiguousarray(views, dtype=np.float32)
         kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
 
     def look_up(self, points: FloatArray) -> Rows:
