@@ -210,6 +210,8 @@ class Mapper:
         near = place(sampled, prediction, last, local_map, self._config, coarse_first)
         if not self._doubt.lies_badly(near.status, near.quality):
             return near
+        if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
+            return near
         anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config)
         again = place_surprised(sampled, anyhow, last, local_map, self._config)
         return again if again.is_beyond_doubt and again.quality > near.quality else near
