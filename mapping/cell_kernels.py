@@ -1,8 +1,9 @@
 """The loops over points and cells behind `VoxelTable` and `SurfelGrid`, compiled.
 
 Tables are open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows` (2^bits,)
-int32. A cell's sums are (12,) float32: points, first and second moments about the cell's centre in units of the cell
-(x, y, z, xx, xy, xz, yy, yz, zz), and first and second moment of the elevation they were seen at.
+int32. A cell's sums are (15,) float32: points, first and second moments about the cell's centre in units of the cell
+(x, y, z, xx, xy, xz, yy, yz, zz), first and second moment of the elevation they were seen at, and the sum of the
+directions (x, y, z) that they were seen from.
 """
 
 import math
@@ -44,7 +45,7 @@ class Cells(NamedTuple):
         bits: the table has two to the power of these slots.
         table_keys, table_rows: the hash table.
         keys: (M,) of the cells, by row.
-        sums: (M, 12) of their points' moments.
+        sums: (M, 15) of their points' moments.
     """
 
     cell_m: float
@@ -133,10 +134,21 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
 
 
 @compiled
+def write_views(points: FloatArray, sensor: FloatArray, views: Floats) -> None:
+    """Write the unit directions (N, 3) from points (N, 3) to where they were seen from (3,)."""
+    for n in range(len(points)):
+        x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
+        scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        views[n, 0], views[n, 1], views[n, 2] = x * scale, y * scale, z * scale
+
+
+@compiled
 def add_moments(
-    points: FloatArray, elevations: FloatArray, keys: Keys, rows: Rows, cell_m: float, grid_keys: Keys, sums: Floats
-) -> None:
-    """Add points (N, 3), seen at angles (N,), to the sums of their cells, unless these have seen enough before."""
+    points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,
+    grid_keys: Keys, sums: Floats,
+) -> None:  # fmt: skip
+    """Add points (N, 3), seen at angles (N,) from directions (N, 3), to the sums of their cells, unless these have
+    seen enough before."""
     scale = 1.0 / cell_m
     growing = np.empty(len(rows), dtype=np.bool_)
     for n in range(len(rows)):
@@ -164,6 +176,9 @@ def add_moments(
         cell[9] += z * z
         cell[10] += elevation
         cell[11] += elevation * elevation
+        cell[12] += views[n, 0]
+        cell[13] += views[n, 1]
+        cell[14] += views[n, 2]
 
 
 @compiled
@@ -207,15 +222,22 @@ def middle_of(key: int) -> tuple[float, float, float]:
 
 @compiled
 def gather(row: int, cells: Cells, total: FloatArray) -> None:
-    """Write the sums (12,) of a cell and the 26 around it, weighted, about its own centre."""
+    """Write the sums (15,) of a cell and the 26 around it, weighted, about its own centre.
+
+    What was seen from the other side is another surface: a thin wall has two.
+    """
     total[:] = 0.0
+    own = cells.sums[row]
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
                 key = cells.keys[row] + i * STRIDE_X + j * STRIDE_Y + k
                 other = _find_one(key, cells.bits, cells.table_keys, cells.table_rows)
-                if other != ABSENT:
-                    _add_shifted(cells.sums[other], i, j, k, total)
+                if other == ABSENT:
+                    continue
+                sums = cells.sums[other]
+                if own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14] >= 0.0:
+                    _add_shifted(sums, i, j, k, total)
 
 
 @compiled
@@ -234,4 +256,5 @@ def _add_shifted(sums: Floats, i: int, j: int, k: int, total: FloatArray) -> Non
     total[8] += weight * (sums[8] + j * z + k * y + j * k * n)
     total[9] += weight * (sums[9] + 2 * k * z + k * k * n)
     total[10] += weight * sums[10]
-    total[11] += weight * sums[11]
+    for column in range(11, 15):
+        total[column] += weight * sums[column]

@@ -10,6 +10,10 @@ _CONFIRMED_BY = 3
 # Looking all over the map takes a second or two: it is done at these lost scans in a row, and at every so manieth.
 _LOOKS_AT = (1, 2, 4, 8, 13)
 _LOOKS_EVERY = 20
+# Scans that lie on the map by less than this share of what was usual lately lie badly; what is usual follows the
+# latest ones by this part.
+_AS_USUAL = 0.9
+_FOLLOWING = 0.2
 
 
 class Doubt:
@@ -25,6 +29,7 @@ class Doubt:
         self.is_astray = False
         self._was_degraded = False
         self._to_confirm = 0
+        self._usual = 0.0
 
     def state(self) -> State:
         """All of it."""
@@ -33,6 +38,7 @@ class Doubt:
             "is_astray": self.is_astray,
             "was_degraded": self._was_degraded,
             "to_confirm": self._to_confirm,
+            "usual": self._usual,
         }
 
     def restore(self, saved: Saved) -> None:
@@ -41,10 +47,15 @@ class Doubt:
         self.is_astray = saved.flag("is_astray")
         self._was_degraded = saved.flag("was_degraded")
         self._to_confirm = saved.integer("to_confirm")
+        self._usual = saved.number("usual")
 
     def is_surprised(self, interval_s: float) -> bool:
         """Whether a scan, so long after the last one, need not be near where it is expected."""
         return self.is_astray or interval_s > _GAP_S
+
+    def lies_badly(self, status: Status, quality: float) -> bool:
+        """Whether a scan lies on the map worse than scans did lately, though it may be good enough to be believed."""
+        return status is not Status.OK or quality < _AS_USUAL * self._usual
 
     @property
     def looks_around(self) -> bool:
@@ -73,12 +84,14 @@ class Doubt:
 
     def began_anew(self) -> None:
         """Scans are held against another map from now on."""
-        self.lost_in_a_row = 0
+        self.lost_in_a_row, self._usual = 0, 0.0
 
-    def laid(self, status: Status, found: bool) -> None:
-        """A scan lies on the map, where it was expected or where it was found."""
+    def laid(self, status: Status, found: bool, quality: float) -> None:
+        """A scan lies on the map so well, where it was expected or where it was found."""
         self.lost_in_a_row, self.is_astray = 0, False
         self._was_degraded = status is Status.DEGRADED
+        if status is Status.OK:
+            self._usual += _FOLLOWING * (quality - self._usual)
         if found:
             self._to_confirm = _CONFIRMED_BY
         elif self._to_confirm and status is Status.OK:

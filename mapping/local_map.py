@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Saved, State
+from mapping.cell_kernels import write_views
 from mapping.match_kernels import Bodies, Pulls, pull_to_bodies, pull_to_planes
 from mapping.patches import PatchTable
 from mapping.surfel_grid import SurfelGrid
@@ -114,9 +115,10 @@ class LocalMap:
             edges: (E, 3) points on edges, in the world.
             sensor: (3,) where they were seen from.
         """
+        views = _views(planes, sensor)
         for grid in self._planes:
-            grid.add(planes, elevations)
-        self._lines.add(edges, np.zeros(len(edges)))
+            grid.add(planes, elevations, views)
+        self._lines.add(edges, np.zeros(len(edges)), np.zeros((len(edges), 3)))  # both sides of an edge are the edge
         if self._centre is None:
             self._centre = sensor
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
@@ -178,11 +180,18 @@ class LocalMap:
         """The same map in cells of another size, made of the surfaces in the finest of these."""
         other = LocalMap(cell_m, self._radius_m)
         other._centre, other._scans = self._centre, self._scans
-        points, elevations = self._planes[0].samples()
+        samples = self._planes[0].samples()
         for grid in other._planes:
-            grid.add(points, elevations)
+            grid.add(*samples)
         other._lines.add(*self._lines.samples())
         return other
+
+
+def _views(points: FloatArray, sensor: FloatArray) -> NDArray[np.float32]:
+    """Unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
+    views = np.empty((len(points), 3), dtype=np.float32)
+    write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
+    return views
 
 
 def _room_for(count: int) -> Pulls:

@@ -18,7 +18,7 @@ from mapping.doubt import Doubt
 from mapping.earlier_maps import EarlierMaps
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
-from mapping.placement import Placed, place, search, search_everywhere
+from mapping.placement import Placed, place, place_surprised, search, search_everywhere
 from mapping.prediction import Carrier, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
@@ -125,7 +125,7 @@ class Mapper:
             mapped = self._lay_second(sampled, prior, prediction, last, self._first, self._map)
             self._first = None
         else:
-            mapped = self._lay(sampled, prediction, last, self._map)
+            mapped = self._lay(sampled, prior, prediction, last, self._map)
         self._state = mapped.state
         return mapped
 
@@ -150,7 +150,7 @@ class Mapper:
         does not.
         """
         carrier = self._carrier
-        mapped = self._lay(sampled, prediction, last, local_map)
+        mapped = self._lay(sampled, prior, prediction, last, local_map)
         if sampled.stamp <= last.stamp:  # no time went by, and no velocity shows
             return mapped
         for _ in range(_BEGINNINGS):
@@ -161,7 +161,7 @@ class Mapper:
             self._carrier, self._has_velocity = carrier, False
             prediction = predict(last, sampled.stamp, prior, carrier, self._config)
             assert self._map is not None
-            mapped = self._lay(sampled, prediction, last, self._map)
+            mapped = self._lay(sampled, prior, prediction, last, self._map)
         return mapped
 
     def _begin_again(self, first: SampledScan, last: State, curr: State) -> State:
@@ -178,24 +178,43 @@ class Mapper:
         self._add(first, last.T_world_lidar, last.velocity, self._map)
         return last
 
-    def _lay(self, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap) -> MappedScan:
+    def _lay(
+        self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
+    ) -> MappedScan:
         """Register a scan to the map; when it fits nowhere near, search; when it fits nowhere, keep it out."""
         if sampled.cell_m != local_map.cell_m:
             local_map = self._map = local_map.resized(sampled.cell_m)
         if self._is_blind(sampled):
             return self._see_nothing(sampled, prediction)
-        coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
-        near = place(sampled, prediction, last, local_map, self._config, coarse_first)
+        near = self._place_near(sampled, prior, prediction, last, local_map)
         placed = self._look(near, sampled, prediction, last, local_map)
         if placed is None:
             return self._miss(sampled, prediction, near.fit)
         assert placed.refined is not None
-        self._doubt.laid(placed.status, found=placed is not near)
+        self._doubt.laid(placed.status, placed is not near, placed.quality)
         interval_s = sampled.stamp - last.stamp
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
         self._has_velocity = True
         return self._accept(sampled, prediction, last, placed, placed.refined, found=placed is not near)
+
+    def _place_near(
+        self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
+    ) -> Placed:
+        """A scan laid on the map from where it is expected; when it lies badly, as if the carrier could do anything.
+
+        A motion that nobody expected bends the sweep, and what is in reach of the expected one fits halfway: with the
+        velocity that comes of it, the next scan would be expected farther off still.
+        """
+        coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
+        near = place(sampled, prediction, last, local_map, self._config, coarse_first)
+        if not self._doubt.lies_badly(near.status, near.quality):
+            return near
+        if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
+            return near
+        anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config)
+        again = place_surprised(sampled, anyhow, last, local_map, self._config)
+        return again if again.is_beyond_doubt and again.quality > near.quality else near
 
     def _look(
         self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap

@@ -68,8 +68,10 @@ def pull_to_planes(
             x, y, z = points[n, 0] - sensor[0], points[n, 1] - sensor[1], points[n, 2] - sensor[2]
             distance = math.sqrt(x * x + y * y + z * z)
             several_rings = p[12] * distance > _LEAST_HEIGHT_M
-            faced = abs(x * p[3] + y * p[4] + z * p[5]) > _LEAST_SINE * distance
-            if p[14] > 0.0 and (several_rings or faced):
+            along = x * p[3] + y * p[4] + z * p[5]
+            faced = abs(along) > _LEAST_SINE * distance
+            behind = along > _LEAST_SINE * distance
+            if p[14] > 0.0 and not behind and (several_rings or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
                 _write(pulls, count, n, p[0:3], p[3], p[4], p[5], p[9], tilt)
                 count += 1

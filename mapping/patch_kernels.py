@@ -34,7 +34,7 @@ def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: 
         patches: (M, 16), written.
         counts: (M,) how many points the cells had when they were last looked at, written.
     """
-    total, covariance, values = np.empty(12), np.empty(6), np.empty(3)
+    total, covariance, values = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):
         row = rows[n]
         if row < 0 or counts[row] * _GROWTH > cells.sums[row, 0]:
@@ -51,6 +51,8 @@ def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: 
         patch = patches[row]
         patch[0], patch[1], patch[2] = (i + x) * cells.cell_m, (j + y) * cells.cell_m, (k + z) * cells.cell_m
         write_eigenvector(covariance, values[0], patch[3:6])
+        if patch[3] * total[12] + patch[4] * total[13] + patch[5] * total[14] < 0.0:  # towards where it was seen from
+            patch[3], patch[4], patch[5] = -patch[3], -patch[4], -patch[5]
         write_eigenvector(covariance, values[2], patch[6:9])
         for axis in range(3):
             patch[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m

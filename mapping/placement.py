@@ -1,4 +1,4 @@
-"""Laying one scan on the map: from its prediction, again from coarser cells, and at last from anywhere."""
+"""Laying one scan on the map: from its prediction, again and patiently, and at last from anywhere."""
 
 from dataclasses import dataclass, replace
 
@@ -12,7 +12,7 @@ from mapping.fit import Fit, measure_fit
 from mapping.floorplan import Floorplan
 from mapping.local_map import LocalMap
 from mapping.prediction import Prediction, State
-from mapping.recovery import best_starts, start_poses
+from mapping.recovery import best_starts, best_velocity, start_poses
 from mapping.refinement import Refined, Sweep, compensated, refine
 from mapping.sampling import SampledScan
 
@@ -34,6 +34,9 @@ _ELSEWHERE_CELLS = 4.0
 _DRAWN_RANGES = 3.0
 _DRAWN_CELLS = 4.0
 _PLACES = 24
+# Changes of the rate of turning that are tried on a scan that lies badly, rad/s: from full speed one way round to full
+# speed the other way between two sweeps.
+_TURNS = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
 _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
 
@@ -83,6 +86,41 @@ def place(
     return again if again.fit.inlier_share > placed.fit.inlier_share else placed
 
 
+def place_surprised(
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
+) -> Placed:
+    """Lay a scan on the map from where it is expected, though it may turn any way; patiently, by way of coarser cells.
+
+    Args:
+        sampled: the points.
+        prediction: where the scan is expected, of a carrier that anything is believed of.
+        last: the scan before.
+        local_map: what is laid on.
+        config: how.
+    """
+    sweep, T_world_lidar = sampled.sweep, prediction.T_world_lidar
+    starts = [prediction.velocity]
+    if config.continuous_time and sweep.plane_times is not None:
+        up = T_world_lidar[:3, :3].T @ local_map.vertical()
+        velocities = prediction.velocity + np.outer(_TURNS, np.concatenate([up, np.zeros(3)]))
+        turned = best_velocity(sweep.planes, sweep.plane_times, velocities, T_world_lidar, local_map)
+        starts += [] if np.array_equal(turned, prediction.velocity) else [turned]
+    tried = [
+        _place_patiently(sampled, replace(prediction, velocity=velocity), last, local_map, config)
+        for velocity in starts
+    ]
+    return max(tried, key=lambda placed: placed.quality)
+
+
+def _place_patiently(
+    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
+) -> Placed:
+    refinement = config.refinement
+    patience = {name: max(steps, getattr(refinement, name)) for name, steps in _PATIENCE.items()}
+    patient = config.model_copy(update={"refinement": refinement.model_copy(update=patience)})
+    return _place_once(sampled, prediction, last, local_map, patient, coarse_first=True)
+
+
 def search(
     sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
 ) -> Placed | None:
@@ -127,11 +165,10 @@ def _from_starts(
     config: MappingConfig,
 ) -> list[Placed]:  # fmt: skip
     """What a scan comes to from each of the poses (K, 4, 4), where it comes to something that is ok."""
-    patient = config.model_copy(update={"refinement": config.refinement.model_copy(update=_PATIENCE)})
     tried = []
     for start in starts:
         free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
-        tried.append(_place_once(sampled, free, last, local_map, patient, coarse_first=True))
+        tried.append(_place_patiently(sampled, free, last, local_map, config))
     return [placed for placed in tried if placed.status is Status.OK]
 
 

@@ -19,6 +19,9 @@ _CAUTION = 4.0
 # What is known of a sensor before its first scans, and after it was lost.
 _ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
 _ASTRAY = np.array([np.deg2rad(20.0)] * 3 + [1.0] * 3)
+# An odometry's velocity is less certain than its motion over the time by this factor: of a carrier that shakes faster
+# than sweeps follow one another it tells a part only, again and again.
+_SHAKING = 2.0
 # No pose is better than this, whatever its residuals say.
 _LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 
@@ -95,6 +98,11 @@ class Carrier:
     translation: float = _USUAL[1]
 
     @classmethod
+    def wildest(cls) -> "Carrier":
+        """One that anything is believed of."""
+        return cls(*_WILDEST)
+
+    @classmethod
     def restored(cls, saved: Saved) -> "Carrier":
         """What was saved, which is all of it."""
         return cls(saved.number("rotation"), saved.number("translation"))
@@ -158,7 +166,7 @@ def predict(state: State, stamp: float, prior: Prior, carrier: Carrier, config: 
         T_world_lidar = T_world_lidar @ exp(step)
     if prior.velocity is not None and interval_s > 0.0:
         difference = prior.velocity - velocity
-        step, velocity_covariance = _fuse(velocity_covariance, difference, uncertainty / interval_s**2)
+        step, velocity_covariance = _fuse(velocity_covariance, difference, uncertainty * (_SHAKING / interval_s) ** 2)
         velocity = velocity + step
     return Prediction(T_world_lidar, velocity, pose_covariance, velocity_covariance)
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, transform_points
+from mapping.deskew import move
 from mapping.local_map import LocalMap
 
 # Points of the scan that each start is judged by, and how many starts are worth refining.
@@ -32,6 +33,16 @@ def best_starts(points: FloatArray, starts: FloatArray, local_map: LocalMap) -> 
     few = points[:: max(1, len(points) // _SCORED_POINTS)]
     scores = [_score(few, start, local_map) for start in starts]
     return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
+
+
+def best_velocity(
+    points: FloatArray, times: FloatArray, velocities: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap
+) -> FloatArray:
+    """Of velocities (K, 6) the one with which points (N, 3), measured at times (N,), lie nearest to the map."""
+    step = max(1, len(points) // _SCORED_POINTS)
+    few, when = points[::step], times[::step]
+    scores = [_score(move(few, when, velocity), T_world_lidar, local_map) for velocity in velocities]
+    return np.asarray(velocities[int(np.argmax(scores))], dtype=np.float64)
 
 
 def _score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> float:

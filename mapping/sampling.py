@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
-from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.thinning import central_per_cell, one_per_cell
 from mapping.config import MappingConfig
 from mapping.features import extract_features
 from mapping.refinement import Sweep
@@ -125,7 +125,9 @@ class Sampler:
             points=points,
             elevations=np.arcsin(points[:, 2] / ranges),
             times=None if times is None else times.take(kept),
-            keys=_thin_to(_any_per_cell(points, _KEY_SPACING * cell_m), self._config.keypoints),
+            # Were they the last of the sweep, they would lie on the same side of every tree, and each scan would be
+            # laid a little turned on the one before: a sensor that stands still would turn.
+            keys=_thin_to(central_per_cell(points, _KEY_SPACING * cell_m), self._config.keypoints),
             edges=scan.points.take(edges, axis=0),
             edge_times=None if times is None else times.take(edges),
         )
@@ -153,16 +155,6 @@ class Sampler:
             self._cell_range_m = self._range_m
         low, high = _CELL_BOUNDS_M
         return float(np.clip(self._cell_range_m / self._config.cells_per_range, low, high))
-
-
-def _any_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
-    """One point in nearly every occupied cell, indices ascending: any of them.
-
-    Of a tree in a cell the last point of the sweep is always that on the same side: each scan would be laid a little
-    turned on the one before, and a sensor that stands still would turn, by a tenth of a degree in ten scans.
-    """
-    shuffled = np.random.default_rng(len(points)).permutation(len(points))
-    return np.sort(shuffled[one_per_cell(points.take(shuffled, axis=0), cell_m)])
 
 
 def _thin_to(index: NDArray[np.intp], count: int) -> NDArray[np.intp]:

@@ -18,10 +18,10 @@ from mapping.patches import PATCH_COLUMNS, PatchTable
 from mapping.symmetric import SYMMETRIC
 from mapping.voxel_table import Rows, VoxelTable, cell_keys, key_cells, point_keys
 
-# Columns of a cell's sums: points, first and second moments about the cell's centre in units of the cell, and first
-# and second moment of the elevation they were seen at.
-_COUNT, _FIRST, _SECOND, _ELEVATION = 0, slice(1, 4), slice(4, 10), slice(10, 12)
-_COLUMNS = 12
+# Columns of a cell's sums: points, first and second moments about the cell's centre in units of the cell, first and
+# second moment of the elevation they were seen at, and the sum of the directions that they were seen from.
+_COUNT, _FIRST, _SECOND, _ELEVATION, _VIEW = 0, slice(1, 4), slice(4, 10), slice(10, 12), slice(12, 15)
+_COLUMNS = 15
 
 # A cell is handed on to another grid as so many points.
 _SAMPLES = 6
@@ -72,16 +72,22 @@ class SurfelGrid:
         grid._tidied = saved.integer("tidied")
         return grid
 
-    def add(self, points: FloatArray, elevations: FloatArray) -> None:
-        """Add points (N, 3) of the world, seen by the sensor at these angles (N,) above its own equator, radians."""
+    def add(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
+        """Add points (N, 3) of the world.
+
+        Args:
+            points: which.
+            elevations: (N,) angles above the sensor's own equator that they were seen at, radians.
+            views: (N, 3) unit, from the points to the sensor.
+        """
         if not len(points):
             return
         points = np.ascontiguousarray(points)
         keys = point_keys(points, self.cell_m)
         rows = self._table.insert(keys)
         self._reserve(len(self._table))
-        elevations = np.ascontiguousarray(elevations)
-        kernels.add_moments(points, elevations, keys, rows, self.cell_m, self._keys, self._sums)
+        seen = np.ascontiguousarray(elevations), np.ascontiguousarray(views, dtype=np.float32)
+        kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
 
     def look_up(self, points: FloatArray) -> Rows:
         """Rows (N,) of the cells that points (N, 3) of the world lie in, else of the nearest around; or `ABSENT`."""
@@ -104,9 +110,9 @@ class SurfelGrid:
         means = key_cells(self._keys[:count]) + 0.5 + self._sums[:count, _FIRST] / self._sums[:count, _COUNT, None]
         return np.asarray(means * self.cell_m, dtype=np.float64)
 
-    def samples(self) -> tuple[FloatArray, FloatArray]:
-        """Points (S, 3) of the world and their elevations (S,) with the moments of the cells: six a cell, two along
-        each axis of its own points, or the mean alone where it has fewer than six."""
+    def samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Points (S, 3) of the world, their elevations (S,) and views (S, 3) with the moments of the cells: six a cell,
+        two along each axis of its own points, or the mean alone where it has fewer than six."""
         count = len(self._table)
         sums = self._sums[:count].astype(np.float64)
         counts = sums[:, _COUNT]
@@ -125,7 +131,8 @@ class SurfelGrid:
         points = (key_cells(self._keys[:count]) + 0.5 + mean)[:, None] + offsets
         several = np.ones((count, _SAMPLES), dtype=np.bool_)
         several[counts < _SAMPLES, 1:] = False
-        return points[several] * self.cell_m, elevations[several]
+        views = np.repeat((sums[:, _VIEW] / counts[:, None])[:, None], _SAMPLES, axis=1)
+        return points[several] * self.cell_m, elevations[several], views[several]
 
     def forget_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the cells farther than `radius_m` from `centre` (3,)."""

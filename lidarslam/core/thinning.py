@@ -29,12 +29,40 @@ def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
         points: (N, 3).
         cell_m: edge of a cell.
     """
-    if not hasattr(_room, "last_comer"):
-        _room.last_comer = np.empty(_SLOTS, dtype=np.int32)
     kept = np.empty(len(points), dtype=np.intp)
+    slots = _slots_of(np.ascontiguousarray(points), cell_m)
+    return kept[: _last_comers(slots, _slot_values(), kept)]
+
+
+def central_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
+    """Indices, ascending, of one point in nearly every occupied cell of a grid: the nearest to the mean of the cell's.
+
+    That is on the same part of a surface whichever way the sensor goes round, which the last comer is not. The hash is
+    that of `one_per_cell`; where two cells meet in one slot they count as one.
+
+    Args:
+        points: (N, 3), finite.
+        cell_m: edge of a cell.
+    """
+    points = np.ascontiguousarray(points)
+    kept = np.empty(len(points), dtype=np.intp)
+    slots = _slots_of(points, cell_m)
+    sums = np.empty((len(points), 4), dtype=np.float32)
+    return np.sort(kept[: _most_central(points, slots, _slot_values(), sums, kept)])
+
+
+def _slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
     slots = np.empty(len(points), dtype=np.int32)
-    _write_slots(np.ascontiguousarray(points), np.float32(1.0 / cell_m), slots)
-    return kept[: _last_comers(slots, _room.last_comer, kept)]
+    _write_slots(points, np.float32(1.0 / cell_m), slots)
+    return slots
+
+
+def _slot_values() -> NDArray[np.int32]:
+    """This thread's slots, with whatever is in them."""
+    if not hasattr(_room, "values"):
+        _room.values = np.empty(_SLOTS, dtype=np.int32)
+    values: NDArray[np.int32] = _room.values
+    return values
 
 
 @compiled
@@ -63,4 +91,45 @@ def _last_comers(slots: NDArray[np.int32], last_comer: NDArray[np.int32], kept: 
         if last_comer[slots[n]] == n:
             kept[count] = n
             count += 1
+    return count
+
+
+@compiled
+def _most_central(
+    points: FloatArray, slots: NDArray[np.int32], cells: NDArray[np.int32], sums: NDArray[np.float32],
+    nearest: NDArray[np.intp],
+) -> int:  # fmt: skip
+    """Write which points (N, 3) are the nearest to the means of those in their slots (N,); return how many.
+
+    Args:
+        points, slots: which.
+        cells: of all slots, written: the number of the cell in it.
+        sums: (N, 4) room for sums of coordinates and how many they are of, by cell.
+        nearest: (N,) written, by cell.
+    """
+    count = 0
+    for n in range(len(slots)):
+        cell = cells[slots[n]]
+        # A number that was left here by an earlier scan points to a cell of another slot, or to none.
+        if cell < 0 or cell >= count or slots[nearest[cell]] != slots[n]:
+            cell = count
+            cells[slots[n]] = cell
+            nearest[cell] = n
+            sums[cell, :] = np.float32(0.0)
+            count += 1
+        for axis in range(3):
+            sums[cell, axis] += np.float32(points[n, axis])
+        sums[cell, 3] += np.float32(1.0)
+    for cell in range(count):
+        for axis in range(3):
+            sums[cell, axis] /= sums[cell, 3]
+        sums[cell, 3] = np.inf  # the least square of a distance so far
+    for n in range(len(slots)):
+        cell = cells[slots[n]]
+        squared = np.float32(0.0)
+        for axis in range(3):
+            squared += (np.float32(points[n, axis]) - sums[cell, axis]) ** 2
+        if squared < sums[cell, 3]:
+            sums[cell, 3] = squared
+            nearest[cell] = n
     return count

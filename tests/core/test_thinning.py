@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.thinning import central_per_cell, one_per_cell
 
 
 def by_arrays(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
@@ -45,3 +45,42 @@ def test_what_is_no_place_does_no_harm() -> None:
     with np.errstate(over="ignore"):
         assert 3 in one_per_cell(points, 0.1)
     assert len(one_per_cell(np.empty((0, 3)), 0.1)) == 0
+
+
+def slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
+    cells = np.floor(points.astype(np.float32) * np.float32(1.0 / cell_m)).astype(np.int32)
+    slots = (cells * np.array([73_856_093, 19_349_669, 83_492_791], dtype=np.int32)).sum(axis=1, dtype=np.int32)
+    return np.asarray(slots & ((1 << 20) - 1), dtype=np.int32)
+
+
+def assert_central(points: FloatArray, cell_m: float) -> None:
+    """One in each slot, and no other in it is nearer to the mean of all."""
+    kept, slots = central_per_cell(points, cell_m), slots_of(points, cell_m)
+    assert (np.diff(kept) > 0).all()
+    np.testing.assert_array_equal(np.sort(slots[kept]), np.unique(slots))
+    for n in kept:
+        together = points[slots == slots[n]]
+        off = np.linalg.norm(together - together.mean(axis=0), axis=1)
+        assert np.linalg.norm(points[n] - together.mean(axis=0)) <= off.min() + 1e-5
+
+
+@pytest.mark.parametrize("cell_m", [0.7, 3.0, 100.0])
+def test_the_most_central_point_is_the_nearest_to_the_mean_of_its_cell(rng: np.random.Generator, cell_m: float) -> None:
+    points = rng.normal(0.0, 2.0, (2_000, 3))
+    assert_central(points, cell_m)
+    assert_central(points[::7], cell_m)  # the slots of the scan before are still there
+    one_per_cell(points, cell_m)  # and of other uses
+    assert_central(points[::3], cell_m)
+
+
+def test_the_most_central_points_are_the_same_whichever_way_the_sensor_goes_round(rng: np.random.Generator) -> None:
+    points = rng.uniform(-3.0, 3.0, (30_000, 3))
+    forwards, backwards = central_per_cell(points, 0.7), len(points) - 1 - central_per_cell(points[::-1], 0.7)
+    assert len(forwards) == len(backwards)
+    assert len(np.intersect1d(forwards, backwards)) > 0.98 * len(forwards)  # a few cells at the border have two points
+    last = len(points) - 1 - one_per_cell(points[::-1], 0.7)
+    assert len(np.intersect1d(one_per_cell(points, 0.7), last)) < 0.1 * len(last)
+
+
+def test_there_is_nothing_central_in_nothing() -> None:
+    assert len(central_per_cell(np.empty((0, 3)), 0.1)) == 0

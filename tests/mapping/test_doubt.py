@@ -13,7 +13,7 @@ def test_after_a_lost_scan_it_is_surprised_until_one_is_laid() -> None:
     doubt = Doubt()
     doubt.missed()
     assert doubt.is_surprised(0.1)
-    doubt.laid(Status.OK, found=False)
+    doubt.laid(Status.OK, False, 0.8)
     assert not doubt.is_surprised(0.1)
 
 
@@ -38,24 +38,54 @@ def test_looking_everywhere_becomes_rare() -> None:
 
 def test_found_again_is_confirmed_by_three_scans() -> None:
     doubt = Doubt()
-    doubt.laid(Status.OK, found=True)
+    doubt.laid(Status.OK, True, 0.8)
     unconfirmed = []
     for _ in range(4):
         unconfirmed.append(doubt.is_unconfirmed)
-        doubt.laid(Status.OK, found=False)
+        doubt.laid(Status.OK, False, 0.8)
     assert unconfirmed == [True, True, True, False]
 
 
 def test_scans_that_lie_badly_confirm_nothing() -> None:
     doubt = Doubt()
-    doubt.laid(Status.OK, found=True)
+    doubt.laid(Status.OK, True, 0.8)
     for _ in range(10):
-        doubt.laid(Status.DEGRADED, found=False)
+        doubt.laid(Status.DEGRADED, False, 0.8)
     assert doubt.is_unconfirmed
 
 
 def test_the_second_degraded_scan_is_reason_to_look_around() -> None:
     doubt = Doubt()
     assert not doubt.looks_around
-    doubt.laid(Status.DEGRADED, found=False)
+    doubt.laid(Status.DEGRADED, False, 0.8)
     assert doubt.looks_around
+
+
+def settled() -> Doubt:
+    doubt = Doubt()
+    for _ in range(30):
+        doubt.laid(Status.OK, False, 0.8)
+    return doubt
+
+
+def test_a_scan_lies_badly_beside_what_is_usual() -> None:
+    assert not settled().lies_badly(Status.OK, 0.75)
+    assert settled().lies_badly(Status.OK, 0.7)
+    assert settled().lies_badly(Status.DEGRADED, 0.8)
+    assert not Doubt().lies_badly(Status.OK, 0.1), "nothing is usual yet"
+
+
+def test_what_is_usual_follows_a_scene_that_is_harder_but_not_scans_that_are_not_believed() -> None:
+    doubt = settled()
+    for _ in range(30):
+        doubt.laid(Status.DEGRADED, False, 0.3)
+    assert doubt.lies_badly(Status.OK, 0.7)
+    for _ in range(30):
+        doubt.laid(Status.OK, False, 0.6)
+    assert not doubt.lies_badly(Status.OK, 0.6)
+
+
+def test_in_a_map_begun_anew_nothing_is_usual_yet() -> None:
+    doubt = settled()
+    doubt.began_anew()
+    assert not doubt.lies_badly(Status.OK, 0.2)

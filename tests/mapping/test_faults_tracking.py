@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.faults import (
     Cover,
     Faulty,
@@ -193,6 +194,28 @@ def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded, 3)
+
+
+@pytest.mark.parametrize(("acceleration_deg", "rate_deg"), [(600.0, 180.0), (1500.0, 250.0)])
+def test_sudden_turns_on_the_spot_are_followed(acceleration_deg: float, rate_deg: float) -> None:
+    """After four seconds of rest as fast as that one way round, then the other; nothing tells but the scans."""
+    world = build_world("hall", 0)
+    route = motion_along_route("tracked", world, 0)
+    times = np.arange(0.0, 6.0, 0.02)
+    rates = np.clip(acceleration_deg * (times - 4.03), 0.0, rate_deg)
+    rates -= np.clip(2.0 * acceleration_deg * (times - 4.83), 0.0, 2.0 * rate_deg)
+    turn = np.zeros((len(times), 6))
+    turn[1:, 2] = np.deg2rad(np.cumsum(0.01 * (rates[1:] + rates[:-1])))
+    T_world_first = make_transform(np.eye(3), [0.0, 0.0, route.sensor_height_m]) @ route.pose_at(np.zeros(1))[0]
+    motion = motion_along(Trajectory(times, T_world_first @ exp(turn)), world, on_ground=False)
+    simulation = Simulation(world, light("os1-64"), motion, mount_pose("upright", 0.0), 58)
+    recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, np.zeros(58, dtype=np.bool_), 0)
+    results = process(Mapper(MappingConfig()), recorded, 0)
+    metres, degrees = errors(results, recorded, 0)
+    assert {result.status for result in results} == {Status.OK}
+    assert metres.max() < 0.05
+    assert degrees.max() < 2.0
+    assert degrees[-5:].max() < 0.3
 
 
 def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> Faulty:

@@ -53,6 +53,30 @@ def distances(points: FloatArray, matches: Matches) -> FloatArray:
     return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
 
 
+def test_a_wall_pulls_nobody_who_looks_at_its_back(rng: np.random.Generator) -> None:
+    """What is seen from the other side of a thin wall is its other side."""
+    wall = np.column_stack([np.full(20_000, 2.0), rng.uniform(-3.0, 3.0, (20_000, 2))])
+    local_map, asked = map_of(wall), np.column_stack([np.full(200, 2.1), rng.uniform(-2.0, 2.0, (200, 2))])
+    behind = HERE.copy()
+    behind[0, 3] = 4.0
+    assert len(local_map.match_planes(asked, HERE)) == len(asked)
+    assert len(local_map.match_planes(asked, behind)) == 0
+
+
+def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng: np.random.Generator) -> None:
+    """Though they lie in neighbouring cells, and in the same one of the coarser grids; seen more across than along."""
+    sides = [np.column_stack([np.full(20_000, x), rng.uniform(-1.3, 1.3, (20_000, 2))]) for x in (1.93, 2.02)]
+    sensors = [np.array([x, 0.0, 0.0]) for x in (0.0, 4.0)]
+    local_map = LocalMap(0.07, 100.0)
+    for wall, sensor in zip(sides, sensors, strict=True):
+        local_map.add(wall, rng.uniform(-0.3, 0.3, len(wall)), NO_EDGES, sensor)
+    for wall, sensor in zip(sides, sensors, strict=True):
+        asked = wall[np.abs(wall[:, 1:]).max(axis=1) < 1.0]
+        matches = local_map.match_planes(asked, make_transform(np.eye(3), sensor))
+        assert len(np.unique(matches.index)) > 0.95 * len(asked)
+        assert distances(asked, matches).max() < 0.005
+
+
 def test_points_on_walls_meet_the_walls(rng: np.random.Generator) -> None:
     local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
     matches = local_map.match_planes(asked, HERE)

@@ -164,14 +164,15 @@ def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through
     mapper._expected_error_m, mapper._scans_in_map, mapper._has_velocity = 0.125, 7, True
     assert mapper._map is not None
     mapper._earlier.set_aside(mapper._map, 9)
-    mapper._doubt.laid(Status.DEGRADED, found=True)
+    mapper._doubt.laid(Status.OK, found=False, quality=0.75)
+    mapper._doubt.laid(Status.DEGRADED, found=True, quality=0.5)
     mapper._doubt.missed()
     restored.restore(through_disk(mapper.state()))
     assert set(vars(mapper)) == {
         "_config", "_sampler", "_map", "_state", "_carrier", "_expected_error_m", "_doubt", "_earlier",
         "_scans_in_map", "_first", "_has_velocity",
     }  # fmt: skip
-    assert set(vars(mapper._doubt)) == {"lost_in_a_row", "is_astray", "_was_degraded", "_to_confirm"}
+    assert set(vars(mapper._doubt)) == {"lost_in_a_row", "is_astray", "_was_degraded", "_to_confirm", "_usual"}
     assert set(vars(mapper._earlier)) == {"_maps", "_scans_until_look", "_wait"}
     assert flat(restored.state()) == flat(mapper.state())
 

@@ -87,6 +87,14 @@ def test_velocities_are_believed_as_far_as_motions(sigma: float, followed: float
     np.testing.assert_allclose(prediction.velocity, VELOCITY + followed, atol=1e-3)
 
 
+def test_a_velocity_is_believed_less_than_the_motion_it_was_had_from() -> None:
+    """Twice the deviation: of a carrier that shakes from sweep to sweep the odometry tells a part only."""
+    sigma, widest = 1e-4, np.linalg.inv(predicted(Prior()).velocity_covariance)
+    prediction = predicted(Prior(velocity=VELOCITY, covariance=isotropic(sigma)), MappingConfig(prior_caution=1.0))
+    told = np.linalg.inv(prediction.velocity_covariance) - widest
+    np.testing.assert_allclose(np.diag(told), (2.0 * sigma / 0.1) ** -2, rtol=1e-6)
+
+
 def test_uncertainty_goes_along_with_the_sensor() -> None:
     """Half a metre along x of the last scan is along y of one that has turned by 90 degrees meanwhile."""
     turning = np.array([0.0, 0.0, 0.5 * np.pi / 0.1, 0.0, 0.0, 0.0])

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
+from mapping.deskew import move
 from mapping.local_map import LocalMap
-from mapping.recovery import best_starts, start_poses
+from mapping.recovery import best_starts, best_velocity, start_poses
 
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 
@@ -75,3 +76,20 @@ def test_the_right_yaw_is_found_in_an_l_shaped_room(
 def test_no_points_choose_no_start_in_particular(l_map: LocalMap) -> None:
     starts = start_poses(T_GIVEN, UP, 90.0)
     assert best_starts(np.empty((0, 3)), starts, l_map).shape[1:] == (4, 4)
+
+
+@pytest.mark.parametrize("true_deg", [-250.0, -50.0, 0.0, 200.0, 400.0])
+def test_the_rate_of_turning_that_bent_a_sweep_is_found(
+    rng: np.random.Generator, l_shaped_room: RoomPoints, l_map: LocalMap, true_deg: float
+) -> None:
+    """Points of the room as a sweep of 0.1 s sees them that turns so fast; the best of steps of 50 deg/s."""
+    velocities = np.zeros((17, 6))
+    velocities[:, 2] = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
+    true = np.zeros(6)
+    true[2] = np.deg2rad(true_deg)
+    points, times = l_shaped_room(rng, 3_000), rng.uniform(0.0, 0.1, 3_000 * 2)
+    times = np.resize(times, len(points))
+    T_lidar_moment = exp(true * times[:, None])
+    seen = np.einsum("nji,nj->ni", T_lidar_moment[:, :3, :3], points - T_lidar_moment[:, :3, 3])
+    np.testing.assert_allclose(move(seen, times, true), points, atol=1e-9)
+    np.testing.assert_allclose(best_velocity(seen, times, velocities, np.eye(4), l_map), true, atol=1e-12)

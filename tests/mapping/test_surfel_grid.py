@@ -25,8 +25,13 @@ def on_plane(
 
 def grid_of(points: FloatArray, elevations: FloatArray | None = None) -> SurfelGrid:
     grid = SurfelGrid(CELL)
-    grid.add(points, np.zeros(len(points)) if elevations is None else elevations)
+    grid.add(points, np.zeros(len(points)) if elevations is None else elevations, from_above(len(points)))
     return grid
+
+
+def from_above(count: int) -> FloatArray:
+    """Seen from high above (N, 3)."""
+    return np.tile([0.0, 0.0, 1.0], (count, 1))
 
 
 def cloud(rng: np.random.Generator, count: int = 5_000, half_size: float = 5.0) -> FloatArray:
@@ -61,7 +66,7 @@ def test_several_batches_make_what_one_makes(rng: np.random.Generator) -> None:
     points, elevations = cloud(rng, 20_000), rng.normal(size=20_000)
     at_once, in_parts = grid_of(points, elevations), SurfelGrid(CELL)
     for part in np.array_split(np.arange(len(points)), 7):
-        in_parts.add(points[part], elevations[part])
+        in_parts.add(points[part], elevations[part], from_above(len(part)))
     assert len(at_once) == len(in_parts)
     one = at_once.patches(at_once.look_up(points))
     other = in_parts.patches(in_parts.look_up(points))
@@ -88,6 +93,32 @@ def test_two_walls_beyond_each_others_neighbourhood_do_not_mix(rng: np.random.Ge
     points = np.column_stack([across, rng.uniform(-1, 1, (6_000, 2))])
     grid = grid_of(points)
     np.testing.assert_allclose(grid.patches(grid.look_up(points)).points[:, 0], across, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_side_of_a_thin_wall_is_a_plane_of_its_own_that_faces_who_saw_it(seed: int) -> None:
+    """The sides lie in neighbouring cells; together they would be one thick wall in the middle."""
+    rng = np.random.default_rng(seed)
+    count = 3_000
+    grid = SurfelGrid(CELL)
+    for x, side in ((0.45, -1.0), (0.6, 1.0)):
+        face = np.column_stack([np.full(count, x), rng.uniform(-1, 1, (count, 2))])
+        views = np.array([side, 0.0, 0.0]) * np.ones((count, 1)) + rng.uniform(-0.8, 0.8, (count, 3))
+        grid.add(face, np.zeros(count), views / np.linalg.norm(views, axis=1, keepdims=True))
+        patches = grid.patches(grid.look_up(face))
+        assert patches.is_plane.all()
+        np.testing.assert_allclose(patches.points[:, 0], x, atol=1e-5)
+        np.testing.assert_allclose(patches.normals[:, 0], side, atol=1e-5)
+
+
+def test_samples_of_cells_are_seen_from_where_their_points_were(rng: np.random.Generator) -> None:
+    wall = np.column_stack([np.full(5_000, 0.25), rng.uniform(-1, 1, (5_000, 2))])
+    grid, other = SurfelGrid(CELL), SurfelGrid(0.5 * CELL)
+    grid.add(wall, np.zeros(5_000), np.tile([-0.6, 0.8, 0.0], (5_000, 1)))
+    samples, elevations, views = grid.samples()
+    np.testing.assert_allclose(views, np.tile([-0.6, 0.8, 0.0], (len(samples), 1)), atol=1e-5)
+    other.add(samples, elevations, views)
+    assert other.patches(other.look_up(samples)).normals[:, 0].max() < -0.99
 
 
 def test_neighbours_count_less_than_the_cell_itself() -> None:
@@ -182,7 +213,7 @@ def test_goes_on_growing_after_forgetting(rng: np.random.Generator) -> None:
     grid = grid_of(points)
     grid.forget_beyond(np.zeros(3), 2.0)
     other = cloud(rng) + 50.0
-    grid.add(other, np.zeros(len(other)))
+    grid.add(other, np.zeros(len(other)), from_above(len(other)))
     fresh = grid_of(other)
     np.testing.assert_allclose(
         grid.patches(grid.look_up(other)).points, fresh.patches(fresh.look_up(other)).points, atol=1e-9
@@ -194,7 +225,7 @@ def test_a_cell_that_has_seen_enough_moves_no_more(rng: np.random.Generator) -> 
     grid = grid_of(wall)
     before = grid.patches(grid.look_up(wall)).values
     drifted = wall + np.array([0.1, 0.0, 0.0])
-    grid.add(drifted, np.zeros(len(wall)))
+    grid.add(drifted, np.zeros(len(wall)), from_above(len(wall)))
     np.testing.assert_array_equal(grid.patches(grid.look_up(wall)).values, before)
 
 
@@ -205,7 +236,7 @@ def test_a_cell_that_has_seen_little_still_moves(rng: np.random.Generator) -> No
     grid = grid_of(wall(0.2))
     asked = np.array([[0.2, 0.25, 0.25]])
     np.testing.assert_allclose(grid.patches(grid.look_up(asked)).points[:, 0], 0.2, atol=1e-6)
-    grid.add(wall(0.3), np.zeros(120))
+    grid.add(wall(0.3), np.zeros(120), from_above(120))
     moved = grid.patches(grid.look_up(asked)).points[0, 0]
     assert 0.23 < moved < 0.27
 
@@ -224,7 +255,7 @@ def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng: np.rand
     wall = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.array([0.25, 0.25, 0.45]), half_size=2.0)
     grid = grid_of(stray)
     assert not grid.patches(grid.look_up(stray)).is_plane.any()
-    grid.add(wall, np.zeros(len(wall)))
+    grid.add(wall, np.zeros(len(wall)), from_above(len(wall)))
     assert not grid.patches(grid.look_up(stray)).is_plane.any()
     grid._tidied = len(grid)  # so that no cell is forgotten
     grid.tidy()
@@ -253,7 +284,7 @@ def test_a_place_seen_again_and_again_takes_no_more_cells(rng: np.random.Generat
         grid, counts = SurfelGrid(0.1), []
         for scan in range(1, 4_001):
             points = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.zeros(3), half_size=1.0, count=300)
-            grid.add(points + rng.normal(0.0, 0.03, points.shape), np.zeros(len(points)))
+            grid.add(points + rng.normal(0.0, 0.03, points.shape), np.zeros(len(points)), from_above(len(points)))
             if tidied and scan % 250 == 0:
                 grid.tidy()
             if scan % 1_000 == 0:
