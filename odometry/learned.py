@@ -30,6 +30,8 @@ from odometry.retiming import Retimer
 from odometry.sweep_images import Imager, middle_offset_s
 from odometry.sweeps import LastMotion, SweepImages, SweepPairs
 
+# Where neither the images nor the network say anything a matrix still has an inverse.
+_LEAST_INFORMATION = 1e-6
 # What comes on top of what the residuals say, radians and metres, so that about 90, 98 and 99.5 % of errors lie within
 # one, two and three standard deviations: they have longer tails than a normal distribution's.
 _LEAST_SIGMA = np.array([np.deg2rad(0.05)] * 3 + [0.003] * 3)
@@ -99,7 +101,7 @@ class LearnedOdometry:
         self._config = config
         self._last: _Sweep | None = None
         self._way = Retimer()
-        self._covariance: FloatArray | None = None  # (6, 6) of the motion before
+        self._last_covariance: FloatArray | None = None  # (6, 6) of the motion before, for a change from the left
 
     def estimate(self, scan: Scan) -> Motion:
         """The motion since the last scan that had points."""
@@ -115,7 +117,7 @@ class LearnedOdometry:
             "last": last,
             "imager": self._imager.state(),
             "way": self._way.state(),
-            "covariance": self._covariance,
+            "covariance": self._last_covariance,
         }
 
     def restore(self, saved: Saved) -> None:
@@ -123,7 +125,7 @@ class LearnedOdometry:
         self._last = saved.optional("last", lambda last: _Sweep.restored(last, self._config.device))
         self._imager.restore(saved.part("imager"))
         self._way.restore(saved.part("way"))
-        self._covariance = saved.optional_array("covariance", (6, 6))
+        self._last_covariance = saved.optional_array("covariance", (6, 6))
 
     def close(self) -> None:
         """Nothing is held."""
@@ -153,10 +155,11 @@ class LearnedOdometry:
             self._forget()
             return Motion(np.eye(4), 0, f"the scan does not fit the last one: {_misfit(matched, explained)}")
         bend = _array(aligned.bend[0])
-        self._covariance = _covariance(T_prev_curr, laid.information, bend * interval_s)
+        self._last_covariance = np.linalg.inv(laid.information + _LEAST_INFORMATION * np.eye(6))
+        covariance = _covariance(T_prev_curr, self._last_covariance, bend * interval_s)
         stamps = (last.stamp, sweep.stamp)
         motion = self._way.between_stamps(T_prev_curr, bend, (last.middle, sweep.middle), stamps)
-        return Motion(motion, matched, covariance=self._covariance, degenerate=laid.degeneracy.names)
+        return Motion(motion, matched, covariance=covariance, degenerate=laid.degeneracy.names)
 
     def _align(self, guess: Estimate, last: _Sweep, sweep: _Sweep, interval_s: float) -> _Laid:
         """From the network's guess, or going on as before, or further afield."""
@@ -191,16 +194,17 @@ class LearnedOdometry:
     def _expected(self, interval_s: float) -> Expected | None:
         """The motion that goes on as before; None where nothing is known of that."""
         last = self._way.last
-        if last is None or self._covariance is None:
+        if last is None or self._last_covariance is None:
             return None
         changes = [self._config.changing_rad_s2] * 3 + [self._config.changing_m_s2] * 3
         new = np.diag((np.array(changes) * interval_s**2) ** 2)
-        return Expected(exp(last.velocity * interval_s), (interval_s / last.interval_s) ** 2 * self._covariance + new)
+        scale = (interval_s / last.interval_s) ** 2
+        return Expected(exp(last.velocity * interval_s), scale * self._last_covariance + new)
 
     def _forget(self) -> None:
         """The way on is not known."""
         self._way.forget()
-        self._covariance = None
+        self._last_covariance = None
 
 
 def _array(values: Tensor) -> FloatArray:
@@ -217,13 +221,12 @@ def _misfit(matched: int, explained: float) -> str:
     return f"{matched} points do, which is {100.0 * explained:.0f} % of what it says of one direction"
 
 
-def _covariance(T_prev_curr: FloatArray, information: FloatArray, bent: FloatArray) -> FloatArray:
+def _covariance(T_prev_curr: FloatArray, left: FloatArray, bent: FloatArray) -> FloatArray:
     """(6, 6) of the error `xi` in T_true = T_prev_curr @ exp(xi), rotation first.
 
-    The information is that of a change from the left. To its inverse comes a part of the change of motion (6,) within
-    a pair of sweeps, which is taken as even.
+    `left` is that of a change from the left. To it comes a part of the change of motion (6,) within a pair of sweeps,
+    which is taken as even.
     """
-    left = np.linalg.inv(information + 1e-6 * np.eye(6))
     A = adjoint(inverse(T_prev_curr))
     covariance = A @ left @ A.T + np.diag(_LEAST_SIGMA**2)
     covariance[3:, 3:] += np.eye(3) * (_HELD_BACK * np.linalg.norm(T_prev_curr[:3, 3])) ** 2

@@ -29,8 +29,8 @@ class SweepImages:
         return len(self.points)
 
     def median_range_m(self) -> float:
-        """Of all points, roughly; 0 when there are none."""
-        ranges = self.points[..., ::4, ::8].norm(dim=1)
+        """Of all points; 0 when there are none."""
+        ranges = self.points.norm(dim=1)
         seen = ranges[ranges > 0.0]
         return float(seen.median()) if len(seen) else 0.0
 
