@@ -24,8 +24,9 @@ _LEAST_HEIGHT = math.radians(1.0)
 # Whether there are beams all over a row is told by fourths of it: most hold a tenth of the mean number of points.
 _FOURTHS, _FILLED_OF_MEAN, _MOST = 4, 0.1, 0.6
 _AT_CENTRE, _EVERYWHERE = 0.3, NO_GAPS
-_EVERY = 2
-_MOST_VIEWS = 512
+# Short recordings need a view of every second scan; of longer ones every fourth is enough, and costs half.
+_EVERY, _EVERY_LATER = 2, 4
+_MANY_VIEWS, _MOST_VIEWS = 64, 512
 # A view says nothing where a pixel is wider than so many voxels, but for what is near all the same.
 _PIXEL_OF_VOXEL = 3.0
 _LEAST_REACH_M = 5.0
@@ -60,7 +61,9 @@ class PlacedViews:
 
 
 class Views:
-    """Range images of every k-th scan in the map, at most 512 and 6 MB of them: k doubles when there would be more.
+    """Range images of every k-th scan in the map, at most 512 and 6 MB of them.
+
+    k doubles when there would be more, and as long as it is less than 4, when there would be more than 64.
 
     Args:
         every: k at first.
@@ -115,7 +118,7 @@ class Views:
         draw(np.ascontiguousarray(points), self._grid, image)
         self._numbers.append(number)
         self._images.append(image.astype(np.float16))
-        if len(self) > _MOST_VIEWS:
+        if len(self) > (_MOST_VIEWS if self._every >= _EVERY_LATER else _MANY_VIEWS):
             self._every *= 2
             self._numbers, self._images = self._numbers[::2], self._images[::2]
 

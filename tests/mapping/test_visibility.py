@@ -232,6 +232,13 @@ def test_views_are_of_every_second_scan_and_where_these_are_in_the_end() -> None
     np.testing.assert_array_equal(views.placed(poses[:21]).T_world_lidar[:, 0, 3], np.arange(1.0, 21.0, 4.0))
 
 
+def test_of_a_longer_way_views_are_of_every_fourth_scan() -> None:
+    views, poses = Views(), exp(np.arange(1000.0)[:, None] * [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    for number in range(1000):
+        views.add(at(10.0), number)
+    np.testing.assert_allclose(views.placed(poses).T_world_lidar[:, 0, 3], np.arange(0.0, 1000.0, 4.0))
+
+
 def test_views_are_bounded_however_long_the_way() -> None:
     views = Views(every=1)
     for number in range(2100):
