@@ -1,7 +1,7 @@
 """What has moved away, by what was seen through later or before: a map keeps the trails of all that passed otherwise.
 
-Now and then a scan leaves a small range image. Where several of them saw farther than a point of the map, and hardly
-any saw something there, the point is of something that passed. After Pomerleau et al., "Long-term 3D map maintenance in
+Now and then a scan leaves a small range image. Where several of them saw farther than a point of the map, and no more
+saw something there, the point is of something that passed. After Pomerleau et al., "Long-term 3D map maintenance in
 dynamic environments" (ICRA 2014), and Kim and Kim, "Remove, then revert" (IROS 2020); but with the benefit of the doubt
 for what stands.
 """
