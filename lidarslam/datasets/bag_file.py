@@ -256,7 +256,9 @@ class BagFile:
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         """With the header's stamp and frame, which stand at fixed places; looking there spares decoding the message."""
         damage = None
-        if not isinstance(raw, bytes) or len(raw) < _SHORTEST_MESSAGE:
+        if not isinstance(raw, bytes):  # a database holds whatever stands in its rows
+            damage = "a message that is no bytes"
+        elif len(raw) < _SHORTEST_MESSAGE:
             damage = f"a message of {len(raw)} bytes, too few for its header"
         elif self._ros2 and raw[0] != 0:
             damage = (

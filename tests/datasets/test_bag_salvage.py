@@ -12,6 +12,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.bag_database import DatabaseWalk
 from lidarslam.datasets.bag_file import BagFile
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
@@ -169,11 +170,20 @@ def test_a_record_that_claims_to_be_endless_is_not_read(write_drive):
     assert "a record of 1,000,000,000,000 bytes" in recording.warnings[0]
 
 
-def test_a_database_whose_rows_are_no_messages(write_drive):
+@pytest.mark.parametrize("data", ["text", 100, 4 * 10**12, 0.5])
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_database_whose_rows_are_no_messages(write_drive, data, indexed):
+    """A number must not become as many zero bytes."""
     file, _, points = write_drive("db3")
     with closing(sqlite3.connect(file)) as database, database:
-        database.execute("UPDATE messages SET data = 'text' WHERE id = 4")
-    assert_all_but(open_recording(file), points, [3], "1 scans were left out: they could not be read; the first: ")
+        database.execute("UPDATE messages SET data = ? WHERE id = 4", (data,))
+    if indexed:
+        told = f"1 scans were left out: they could not be read; the first: {file}: a message that is no bytes"
+        assert_all_but(open_recording(file), points, [3], told)
+        return
+    walk = DatabaseWalk(file, lambda *_: b"")
+    assert len(list(walk.messages())) == 5
+    assert walk.damage == f"a row of it is no message (its data are of type {type(data).__name__})"
 
 
 def assert_all_but(recording, points, missing, *warnings):
