@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.bag_salvage import Place, Salvage, messages_from
+from lidarslam.datasets.bag_salvage import Chunk, Place, Salvage, messages_from
 from lidarslam.datasets.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
 from lidarslam.datasets.point_cloud2 import DecodedCloud, PointCloud2Message, decode_point_cloud2
 from lidarslam.datasets.recording import Topic
@@ -134,46 +134,58 @@ class BagFile:
             yield from self._salvaged(self._salvage, topic)
             return
         with self._opened() as reader:
-            last = None
+            last_ns, repeated = -1, 0
             try:
                 for message in self._stream(reader, topic, None):
                     yield message
-                    last = message
+                    repeated = repeated + 1 if message.record_ns == last_ns else 1
+                    last_ns = message.record_ns
                 return
             except InputError as error:
                 damage = error
-            places = self._places(reader, -1 if last is None else last.record_ns)
+            places = self._places(reader, topic, last_ns)
             if places is None:
                 raise damage
             on_damage(str(damage))
+            is_empty = not repeated
             for message in self._behind(places, topic, on_damage):
-                if last is None or message.record_ns > last.record_ns:
-                    yield message
-                    last = message
-            if last is None:
+                if message.record_ns < last_ns:
+                    continue
+                if message.record_ns == last_ns and repeated:  # had already
+                    repeated -= 1
+                    continue
+                yield message
+                is_empty = False
+            if is_empty:
                 raise damage
 
-    def _places(self, reader: RosbagReader, after_ns: int) -> list[Place] | None:
-        """Where there are messages recorded after a time; None in files that cannot be read without rosbags."""
+    def _places(self, reader: RosbagReader, topic: Topic, since_ns: int) -> list[Place] | None:
+        """Where there are messages recorded since a time; None in files that cannot be read without rosbags."""
         if isinstance(reader, Rosbag1Reader):
-            chunks = sorted(chunk.pos for chunk in reader.chunk_infos if chunk.end_time - 1 > after_ns)
-            return [Place(self.path, ".bag", _named(reader.connections), chunks)]
-        if reader.compression_mode:
+            storages: list[Any] = [reader]
+        elif reader.compression_mode:
             return None
-        storages: list[Any] = getattr(reader.storage, "storages", None) or [reader.storage]
+        else:
+            storages = getattr(reader.storage, "storages", None) or [reader.storage]
         places = []
         for storage in storages:
-            infos = [chunk for chunk in getattr(storage, "chunks", ()) if chunk.message_end_time > after_ns]
-            chunks = sorted(chunk.chunk_start_offset for chunk in infos)
-            if infos or not getattr(storage, "chunks", ()):
-                places.append(Place(storage.path, storage.path.suffix, _named(storage.connections), chunks))
+            suffix = storage.path.suffix if self._ros2 else ".bag"
+            chunks = _chunks(storage, _of_topic(storage.connections, topic), since_ns)
+            places.append(Place(storage.path, suffix, _named(storage.connections), chunks))
         return places
 
     def _behind(self, places: list[Place], topic: Topic, on_damage: Callable[[str], None]) -> Iterator[BagMessage]:
+        """What is at places that are read because of damage there; the first that is met is that one, and known."""
+        met: list[str] = []
+
+        def meet(damage: str) -> None:
+            if met:
+                on_damage(damage)
+            met.append(damage)
+
         for place in places:
-            for message in messages_from(place, _expand, on_damage):
-                if (message.topic, message.message_type) == (topic.name, topic.message_type):
-                    yield self._message(message.record_ns, message.raw, topic)
+            for message in messages_from(place, (topic.name, topic.message_type), _expand, meet):
+                yield self._message(message.record_ns, message.raw, topic)
 
     def _salvaged(self, salvage: Salvage, topic: Topic) -> Iterator[BagMessage]:
         with closing(salvage.messages(topic.name, topic.message_type)) as messages:
@@ -236,12 +248,7 @@ class BagFile:
             reader.close()
 
     def _stream(self, reader: RosbagReader, topic: Topic, start_ns: int | None) -> Iterator[BagMessage]:
-        connections: Sequence[Connection] = [
-            connection
-            for connection in reader.connections
-            if (connection.topic, connection.msgtype) == (topic.name, topic.message_type)
-        ]
-        source = reader.messages(connections, start=start_ns)
+        source = reader.messages(_of_topic(reader.connections, topic), start=start_ns)
         count = 0
         while True:
             with self._damage(f"reading stopped after {count} messages of {topic.name}"):
@@ -298,6 +305,29 @@ class BagFile:
 
 def _named(connections: Sequence[Connection]) -> dict[int, tuple[str, str]]:
     return {connection.id: (connection.topic, connection.msgtype) for connection in connections}
+
+
+def _of_topic(connections: Sequence[Connection], topic: Topic) -> list[Connection]:
+    return [one for one in connections if (one.topic, one.msgtype) == (topic.name, topic.message_type)]
+
+
+def _chunks(storage: Any, connections: Sequence[Connection], since_ns: int) -> list[Chunk] | None:
+    """Those with messages of these connections recorded since a time, by the index; None where there is none."""
+    if isinstance(storage, Rosbag1Reader):
+        starts: dict[int, int] = {}
+        for connection in connections:
+            for entry in storage.indexes[connection.id]:
+                if entry.time >= since_ns:
+                    starts[entry.chunk_pos] = min(entry.time, starts.get(entry.chunk_pos, entry.time))
+        return [Chunk(start_ns, begin) for begin, start_ns in starts.items()]
+    infos = getattr(storage, "chunks", None)
+    if not infos:
+        return None
+    return [
+        Chunk(info.message_start_time, info.chunk_start_offset)
+        for info in infos
+        if info.message_end_time >= since_ns and any(info.channel_count.get(one.id) for one in connections)
+    ]
 
 
 @cache

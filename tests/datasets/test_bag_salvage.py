@@ -21,18 +21,19 @@ STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
 
 
+def stamp_ns(index):
+    return STAMP_NS + index * PERIOD_NS
+
+
 @pytest.fixture
 def write_drive(make_bag_kit, make_sweep):
     """Write a bag of velodyne scans of 2 000 points; gives the storage file, the folder or file, and the points."""
 
-    def write(kind, count=6, width=125, kit=None, **options):
+    def write(kind, count=6, width=125, kit=None, order=None, recorded_ns=stamp_ns, **options):
         kit = kit or make_bag_kit(kind)
-        sweeps = [make_sweep("velodyne", STAMP_NS + i * PERIOD_NS, height=16, width=width) for i in range(count)]
-        clouds = [
-            (STAMP_NS + i * PERIOD_NS, kit.cloud(sweep.records, STAMP_NS + i * PERIOD_NS))
-            for i, sweep in enumerate(sweeps)
-        ]
-        path = kit.write({"/points": clouds, "/imu": "sensor_msgs/msg/Imu"}, **options)
+        sweeps = [make_sweep("velodyne", stamp_ns(i), height=16, width=width) for i in range(count)]
+        clouds = [(recorded_ns(i), kit.cloud(sweeps[i].records, stamp_ns(i))) for i in order or range(count)]
+        path = kit.write({"/points": clouds, "/imu": "sensor_msgs/msg/Imu"}, in_order=order is None, **options)
         return kit.storage_file(path), path, [sweep.points for sweep in sweeps]
 
     return write
@@ -275,6 +276,38 @@ def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive,
     )
     assert_all_but(recording, points, lost, *told)
     assert recording.describe().duration_s > 0.0
+
+
+@pytest.mark.parametrize(
+    ("order", "damaged"),
+    [([0, 1, 6, 7, 2, 3, 4, 5, 8, 9], 0), ([0, 3, 1, 2, 4, 7, 5, 6, 8, 9], 2)],
+    ids=["apart", "overlapping"],
+)
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_chunks_that_do_not_lie_in_order_of_time_are_all_read(write_drive, kind, order, damaged):
+    """Recorders write them late, and messages into the wrong one; two scans fill a chunk."""
+    file, _, points = write_drive(kind, count=10, width=1500, order=order)
+    chunks = chunks_of(file)
+    assert len(chunks) == 5
+    begin, length = chunks[damaged]
+    overwrite(file, begin, bytes(length))
+    assert_all_but(
+        open_recording(file),
+        points,
+        order[2 * damaged : 2 * damaged + 2],
+        "1 damaged places in the bag were passed over",
+        "2 scans are missing that the index lists",
+    )
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
+    """Around a damaged chunk, too: the first half before it, and the second behind it."""
+    file, _, points = write_drive(kind, **BIG, recorded_ns=lambda i: STAMP_NS + PERIOD_NS * (i > 1))
+    begin, length = chunks_of(file)[2]
+    overwrite(file, begin, bytes(length))
+    told = ("1 damaged places", "2 scans are missing")
+    assert_all_but(open_recording(file), points, [4, 5], *told)
 
 
 def test_a_folder_of_several_files_is_read_past_a_damaged_chunk(write_drive):
