@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2.reader import zstd
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.bag_database import DatabaseWalk
 from lidarslam.datasets.bag_file import BagFile
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 
@@ -29,12 +32,13 @@ def stamp_ns(index):
 def write_drive(make_bag_kit, make_sweep):
     """Write a bag of velodyne scans of 2 000 points; gives the storage file, the folder or file, and the points."""
 
-    def write(kind, count=6, width=125, kit=None, order=None, recorded_ns=stamp_ns, **options):
+    def write(kind, count=6, width=125, kit=None, order=None, recorded_ns=stamp_ns, first=0, **options):
         kit = kit or make_bag_kit(kind)
-        sweeps = [make_sweep("velodyne", stamp_ns(i), height=16, width=width) for i in range(count)]
-        clouds = [(recorded_ns(i), kit.cloud(sweeps[i].records, stamp_ns(i))) for i in order or range(count)]
+        numbers = range(first, first + count)
+        sweeps = {i: make_sweep("velodyne", stamp_ns(i), height=16, width=width) for i in numbers}
+        clouds = [(recorded_ns(i), kit.cloud(sweeps[i].records, stamp_ns(i))) for i in order or numbers]
         path = kit.write({"/points": clouds, "/imu": "sensor_msgs/msg/Imu"}, in_order=order is None, **options)
-        return kit.storage_file(path), path, [sweep.points for sweep in sweeps]
+        return kit.storage_file(path), path, [sweep.points for sweep in sweeps.values()]
 
     return write
 
@@ -306,21 +310,94 @@ def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
     file, _, points = write_drive(kind, **BIG, recorded_ns=lambda i: STAMP_NS + PERIOD_NS * (i > 1))
     begin, length = chunks_of(file)[2]
     overwrite(file, begin, bytes(length))
-    told = ("1 damaged places", "2 scans are missing")
-    assert_all_but(open_recording(file), points, [4, 5], *told)
+    assert_all_but(open_recording(file), points, [4, 5], "1 damaged places", "2 scans are missing")
 
 
-def test_a_folder_of_several_files_is_read_past_a_damaged_chunk(write_drive):
-    file, folder, _ = write_drive("mcap", **BIG)
-    begin, length = chunks_of(file)[1]
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_damaged_chunk_is_counted_once_for_each_topic(make_bag_kit, make_sweep, kind):
+    """Whichever chunk it is that each topic is gone on with."""
+    kit = make_bag_kit(kind)
+    clouds = [(stamp_ns(i), kit.cloud(make_sweep("velodyne", stamp_ns(i), 16, 1500).records, stamp_ns(i)))
+              for i in range(8)]  # fmt: skip
+    front, rear = clouds[0:3] + clouds[4:7:2], clouds[3:8:2]
+    file = kit.storage_file(kit.write({"/front": front, "/rear": rear}))
+    begin, length = chunks_of(file)[2]  # scans 4 and 5
     overwrite(file, begin, bytes(length))
+    for topic, times in (("/front", [0, 1, 2, 6]), ("/rear", [3, 7])):
+        faults = Faults()
+        scans = list(open_recording(file, ReaderConfig(topic=topic)).scans(faults=faults))
+        assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in times]
+        assert [warning.split(";")[0] for warning in faults.warnings()] == [
+            "1 damaged places in the bag were passed over",
+            "1 scans are missing that the index lists",
+        ]
+
+
+def join(folder, file, later):
+    """Put another storage file of as many scans, 8, behind that of a folder."""
+    shutil.copy(later, folder / f"later{file.suffix}")
     metadata = folder / "metadata.yaml"
-    shutil.copy(file, folder / "again.mcap")
-    metadata.write_text(metadata.read_text().replace(f"- {file.name}\n", f"- {file.name}\n  - again.mcap\n", 1))
+    text = metadata.read_text()
+    text = text.replace(f"- {file.name}\n", f"- {file.name}\n  - later{file.suffix}\n", 1)
+    metadata.write_text(text.replace("message_count: 8\n", "message_count: 16\n"))
+
+
+def test_every_damaged_chunk_in_a_folder_of_several_files_is_counted(write_drive):
+    file, folder, _ = write_drive("mcap", **BIG)
+    later, _, _ = write_drive("mcap", **BIG, name="later", first=8)
+    for storage in (file, later):
+        begin, length = chunks_of(storage)[1]
+        overwrite(storage, begin, bytes(length))
+    join(folder, file, later)
     faults = Faults()
     scans = list(open_recording(folder).scans(faults=faults))
-    assert len(scans) == 6
-    assert any("damaged places" in warning for warning in faults.warnings())
+    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, 4, 5, 6, 7, 8, 9, 12, 13, 14, 15)]
+    told = f"2 damaged places in the bag were passed over; the first: {folder}: reading stopped after 2 messages"
+    assert any(warning.startswith(told) for warning in faults.warnings())
+
+
+@pytest.mark.parametrize("damaged", [0, 2, 5])
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_damaged_message_that_was_compressed_by_itself_costs_no_other(write_drive, kind, damaged):
+    """The first ones are those that what is learnt of the recording is learnt from."""
+    _, folder, points = write_drive(kind, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
+    file = folder / f"drive.{kind}"
+    if kind == "db3":
+        with closing(sqlite3.connect(file)) as database, database:
+            (data,) = database.execute("SELECT data FROM messages WHERE id = ?", (damaged + 1,)).fetchone()
+            data = data[:4] + b"\xff" * 40 + data[44:]
+            database.execute("UPDATE messages SET data = ? WHERE id = ?", (data, damaged + 1))
+    else:
+        data, magic = file.read_bytes(), b"\x28\xb5\x2f\xfd"
+        places = [at for at in range(len(data)) if data.startswith(magic, at)]
+        assert len(places) == 6
+        overwrite(file, places[damaged] + 4, b"\xff" * 40)
+    recording = open_recording(folder)
+    told = f"1 scans were left out: they could not be read; the first: {folder}: a compressed message is damaged ("
+    assert_all_but(recording, points, [damaged], told)
+    assert recording.describe().first_stamp == stamp_ns(damaged == 0) / 10**9
+
+
+def test_a_damaged_chunk_of_compressed_messages_costs_no_other(write_drive):
+    file, folder, points = write_drive("mcap", **BIG, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
+    begin, length = chunks_of(file)[1]
+    overwrite(file, begin, bytes(length))
+    assert_all_but(open_recording(folder), points, [3, 4, 5], "1 damaged places", "3 scans are missing")
+
+
+def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
+    """And how to get at what lies before the damage."""
+    _, folder, points = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
+    (file,) = folder.glob("*.zstd")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"cannot be opened .*`zstd -dc \S+\.zstd > \S+\.mcap` and give") as caught:
+        open_recording(folder)
+    assert "\n" not in str(caught.value)
+    half = file.with_suffix("")
+    half.write_bytes(zstd.ZstdDecompressor().decompress(file.read_bytes()))  # as zstd -d does
+    recording = open_recording(half)
+    assert len(recording) in (2, 3)
+    assert_first_scans(recording, points, len(recording))
 
 
 def test_a_damaged_page_of_a_database_costs_its_rows(write_drive):
