@@ -284,7 +284,7 @@ def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive,
 
 @pytest.mark.parametrize(
     ("order", "damaged"),
-    [([0, 1, 6, 7, 2, 3, 4, 5, 8, 9], 0), ([0, 3, 1, 2, 4, 7, 5, 6, 8, 9], 2)],
+    [([0, 1, 6, 7, 2, 3, 4, 5, 8, 9], 0), ([0, 3, 1, 2, 4, 7, 5, 6, 8, 9], 0)],
     ids=["apart", "overlapping"],
 )
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
@@ -345,13 +345,13 @@ def join(folder, file, later):
 def test_every_damaged_chunk_in_a_folder_of_several_files_is_counted(write_drive):
     file, folder, _ = write_drive("mcap", **BIG)
     later, _, _ = write_drive("mcap", **BIG, name="later", first=8)
-    for storage in (file, later):
-        begin, length = chunks_of(storage)[1]
+    for storage, chunk in ((file, 1), (later, 0)):
+        begin, length = chunks_of(storage)[chunk]
         overwrite(storage, begin, bytes(length))
     join(folder, file, later)
     faults = Faults()
     scans = list(open_recording(folder).scans(faults=faults))
-    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, 4, 5, 6, 7, 8, 9, 12, 13, 14, 15)]
+    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(4, 8), *range(10, 16))]
     told = f"2 damaged places in the bag were passed over; the first: {folder}: reading stopped after 2 messages"
     assert any(warning.startswith(told) for warning in faults.warnings())
 
