@@ -87,7 +87,10 @@ def messages_from(
     """
     walk = _WALKS[place.suffix](place.path, expand)
     if place.chunks is None:
-        yield from (message for message in walk.messages() if (message.topic, message.message_type) == named)
+        try:
+            yield from (message for message in walk.messages() if (message.topic, message.message_type) == named)
+        except Exception as error:  # not even its beginning makes sense
+            walk.damaged("it cannot be read", error)
         if walk.damage is not None:
             on_damage(walk.damage)
         return

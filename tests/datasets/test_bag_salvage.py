@@ -16,6 +16,7 @@ from rosbags.rosbag2.reader import zstd
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.bag_database import DatabaseWalk
 from lidarslam.datasets.bag_file import BagFile
+from lidarslam.datasets.bag_salvage import Place, messages_from
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
@@ -354,6 +355,16 @@ def test_every_damaged_chunk_in_a_folder_of_several_files_is_counted(write_drive
     assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(4, 8), *range(10, 16))]
     told = f"2 damaged places in the bag were passed over; the first: {folder}: reading stopped after 2 messages"
     assert any(warning.startswith(told) for warning in faults.warnings())
+
+
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_a_file_that_went_bad_since_its_index_was_read_is_told(tmp_path, suffix):
+    file = tmp_path / f"drive{suffix}"
+    file.write_bytes(bytes(5000))
+    told = []
+    assert not list(messages_from(Place(file, suffix, {}, None), ("/points", "any"), lambda *_: b"", told.append))
+    assert len(told) == 1
+    assert told[0].startswith("it cannot be read (")
 
 
 @pytest.mark.parametrize("damaged", [0, 2, 5])
