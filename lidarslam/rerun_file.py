@@ -1,5 +1,6 @@
 """A file that Rerun writes through a pipe: its own writer may never end once the disk is full."""
 
+import contextlib
 import os
 import threading
 from pathlib import Path
@@ -48,16 +49,19 @@ class PipedFile:
         return not self._thread.is_alive()
 
     def _follow(self) -> None:
-        with self._file as file:
-            while piece := os.read(self._outlet, _PIECE):
-                if self.failure is not None:
-                    continue
-                try:
-                    _write_all(file.fileno(), piece)
-                except OSError as error:
-                    self.failure = error
-                    file.truncate(0)
-        os.close(self._outlet)
+        try:
+            with self._file as file:
+                while piece := os.read(self._outlet, _PIECE):
+                    if self.failure is not None:
+                        continue
+                    try:
+                        _write_all(file.fileno(), piece)
+                    except OSError as error:
+                        self.failure = error
+                        with contextlib.suppress(OSError):  # a failing disk, or no file on one
+                            file.truncate(0)
+        finally:  # a writer that nobody reads waits for ever
+            os.close(self._outlet)
 
 
 def _write_all(handle: int, piece: bytes) -> None:

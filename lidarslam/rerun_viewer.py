@@ -184,9 +184,14 @@ def _send_to(
     sinks: Sequence[rr.GrpcSink | rr.GrpcServerSink],
     blueprint: rrb.Blueprint | None = None,
 ) -> None:
-    """Send a recording into a file and wherever else."""
+    """Send a recording into a file and wherever else; the file is finished when that fails."""
     files = [] if file is None else [rr.FileSink(file.entrance)]
-    recording.set_sinks(*files, *sinks, default_blueprint=blueprint)
+    try:
+        recording.set_sinks(*files, *sinks, default_blueprint=blueprint)
+    except BaseException:
+        if file is not None:
+            file.finish()
+        raise
     if file is not None:
         file.let_go()
 

@@ -170,10 +170,10 @@ def remove_run(path: Path) -> None:
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
     present = [name for name in FILES if (path / name).exists()]
-    if (path / ABOUT).exists():  # whatever lies beside it is of that run, its description may be missing yet
+    if (path / ABOUT).exists():  # whatever lies beside it is of that run or merge, be its description missing
         if not overwrite and not resume:
             raise OutputError(
-                f"{path}: holds a run that did not finish; go on with it by --resume, or replace it with --overwrite"
+                f"{path}: holds what did not finish; replace it with --overwrite, or go on with a run by --resume"
             )
         return [*present, *([] if resume else [ABOUT])]
     if not present or resume:

@@ -26,7 +26,9 @@ class DatabaseWalk(Walk):
                     yield held
                     held = None
                 try:
-                    message = SalvagedMessage(*topics[topic], int(record_ns), bytes(raw))
+                    if not isinstance(raw, bytes):  # of a number, bytes() makes as many zeros
+                        raise TypeError(f"its data are of type {type(raw).__name__}")
+                    message = SalvagedMessage(*topics[topic], int(record_ns), raw)
                 except (KeyError, TypeError, ValueError) as error:
                     self.damaged("a row of it is no message", error)
                     continue
@@ -42,7 +44,7 @@ class DatabaseWalk(Walk):
         (page,), (pages,) = struct.unpack_from(">H", header, 16), struct.unpack_from(">I", header, 28)
         return bool(self._path.stat().st_size < pages * (65536 if page == 1 else page))
 
-    def _rows(self, database: sqlite3.Connection) -> Iterator[tuple[int, int, bytes]]:
+    def _rows(self, database: sqlite3.Connection) -> Iterator[tuple[int, int, object]]:
         """Past pages that are damaged, row by row, as far as the table goes."""
         done, last, lost = -1, None, 0
         first: tuple[int, sqlite3.Error] | None = None

@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.bag_salvage import Place, Salvage, messages_from
+from lidarslam.datasets.bag_salvage import Chunk, Place, Salvage, messages_from
 from lidarslam.datasets.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
 from lidarslam.datasets.point_cloud2 import DecodedCloud, PointCloud2Message, decode_point_cloud2
 from lidarslam.datasets.recording import Topic
@@ -76,6 +76,7 @@ class BagFile:
         self.path = path
         self._ros2 = path.is_dir() or not is_rosbag1(path)
         self._salvage: Salvage | None = None
+        self._messages_are_compressed = False
         self.damage: str | None = None
         try:
             counts = self._read_index()
@@ -86,6 +87,7 @@ class BagFile:
     def _read_index(self) -> dict[tuple[str, str], int]:
         counts: dict[tuple[str, str], int] = {}
         with self._opened() as reader, self._damage("its index cannot be read"):
+            self._messages_are_compressed = getattr(reader, "compression_mode", None) == "message"
             for connection in reader.connections:
                 key = (connection.topic, connection.msgtype)
                 counts[key] = counts.get(key, 0) + connection.msgcount
@@ -133,47 +135,58 @@ class BagFile:
         if self._salvage is not None:
             yield from self._salvaged(self._salvage, topic)
             return
+        number, first = 0, None
+
+        def meet(damage: str) -> None:
+            nonlocal first
+            first = first or damage
+            on_damage(damage)
+
         with self._opened() as reader:
-            last = None
-            try:
-                for message in self._stream(reader, topic, None):
+            for storage in _storages(reader):
+                for message in self._past_damage(storage, topic, number, meet):
+                    number += 1
                     yield message
-                    last = message
-                return
-            except InputError as error:
-                damage = error
-            places = self._places(reader, -1 if last is None else last.record_ns)
-            if places is None:
-                raise damage
-            on_damage(str(damage))
-            for message in self._behind(places, topic, on_damage):
-                if last is None or message.record_ns > last.record_ns:
-                    yield message
-                    last = message
-            if last is None:
-                raise damage
+        if first is not None and not number:
+            raise InputError(first)
 
-    def _places(self, reader: RosbagReader, after_ns: int) -> list[Place] | None:
-        """Where there are messages recorded after a time; None in files that cannot be read without rosbags."""
-        if isinstance(reader, Rosbag1Reader):
-            chunks = sorted(chunk.pos for chunk in reader.chunk_infos if chunk.end_time - 1 > after_ns)
-            return [Place(self.path, ".bag", _named(reader.connections), chunks)]
-        if reader.compression_mode:
-            return None
-        storages: list[Any] = getattr(reader.storage, "storages", None) or [reader.storage]
-        places = []
-        for storage in storages:
-            infos = [chunk for chunk in getattr(storage, "chunks", ()) if chunk.message_end_time > after_ns]
-            chunks = sorted(chunk.chunk_start_offset for chunk in infos)
-            if infos or not getattr(storage, "chunks", ()):
-                places.append(Place(storage.path, storage.path.suffix, _named(storage.connections), chunks))
-        return places
+    def _past_damage(
+        self, storage: Any, topic: Topic, before: int, on_damage: Callable[[str], None]
+    ) -> Iterator[BagMessage]:
+        """Those in one file; `before` is how many there were in those before it."""
+        last_ns, repeated = -1, 0
+        try:
+            for message in self._stream(storage, topic, None, before):
+                yield message
+                repeated = repeated + 1 if message.record_ns == last_ns else 1
+                last_ns = message.record_ns
+            return
+        except InputError as error:
+            on_damage(str(error))
+        for message in self._behind(storage, topic, last_ns, on_damage):
+            if message.record_ns < last_ns:
+                continue
+            if message.record_ns == last_ns and repeated:  # had already
+                repeated -= 1
+                continue
+            yield message
 
-    def _behind(self, places: list[Place], topic: Topic, on_damage: Callable[[str], None]) -> Iterator[BagMessage]:
-        for place in places:
-            for message in messages_from(place, _expand, on_damage):
-                if (message.topic, message.message_type) == (topic.name, topic.message_type):
-                    yield self._message(message.record_ns, message.raw, topic)
+    def _behind(
+        self, storage: Any, topic: Topic, since_ns: int, on_damage: Callable[[str], None]
+    ) -> Iterator[BagMessage]:
+        """What is left since the time of some damage, which is the first that is met again, and was told."""
+        met: list[str] = []
+
+        def meet(damage: str) -> None:
+            if met:
+                on_damage(damage)
+            met.append(damage)
+
+        suffix = storage.path.suffix if self._ros2 else ".bag"
+        chunks = _chunks(storage, _of_topic(storage.connections, topic), since_ns)
+        place = Place(storage.path, suffix, _named(storage.connections), chunks)
+        for message in messages_from(place, (topic.name, topic.message_type), _expand, meet):
+            yield self._message(message.record_ns, message.raw, topic)
 
     def _salvaged(self, salvage: Salvage, topic: Topic) -> Iterator[BagMessage]:
         with closing(salvage.messages(topic.name, topic.message_type)) as messages:
@@ -202,8 +215,9 @@ class BagFile:
             look_back_ns = _LAST_MESSAGES_NS
             while True:
                 last = None
-                for message in self._stream(reader, topic, end_ns - look_back_ns):
-                    last = message if message.damage is None else last
+                for storage in _storages(reader):
+                    for message in self._stream(storage, topic, end_ns - look_back_ns):
+                        last = message if message.damage is None else last
                 if last is not None or look_back_ns > length_ns:
                     return last
                 look_back_ns *= 8
@@ -235,14 +249,12 @@ class BagFile:
         finally:
             reader.close()
 
-    def _stream(self, reader: RosbagReader, topic: Topic, start_ns: int | None) -> Iterator[BagMessage]:
-        connections: Sequence[Connection] = [
-            connection
-            for connection in reader.connections
-            if (connection.topic, connection.msgtype) == (topic.name, topic.message_type)
-        ]
-        source = reader.messages(connections, start=start_ns)
-        count = 0
+    def _stream(self, storage: Any, topic: Topic, start_ns: int | None, count: int = 0) -> Iterator[BagMessage]:
+        """Those in one file by its index, since a time; `count` is how many there were before, for the error."""
+        connections = _of_topic(storage.connections, topic)
+        if not connections:  # another file of the folder has them
+            return
+        source = storage.messages(connections, start=start_ns)
         while True:
             with self._damage(f"reading stopped after {count} messages of {topic.name}"):
                 try:
@@ -256,13 +268,12 @@ class BagFile:
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         """With the header's stamp and frame, which stand at fixed places; looking there spares decoding the message."""
         damage = None
-        if not isinstance(raw, bytes) or len(raw) < _SHORTEST_MESSAGE:
-            damage = f"a message of {len(raw)} bytes, too few for its header"
-        elif self._ros2 and raw[0] != 0:
-            damage = (
-                "it is not plain CDR; if the bag's messages are compressed, give the rosbag2 folder with its"
-                " metadata.yaml instead of the file"
-            )
+        if self._messages_are_compressed:
+            try:
+                raw = _expand("zstd", raw, 0)
+            except Exception as error:  # codecs raise nearly anything
+                damage = f"a compressed message is damaged ({' '.join(str(error).split())})"
+        damage = damage or self._why_no_message(raw)
         if damage is not None:
             return BagMessage(record_ns, 0, "", topic.message_type, b"", f"{self.path}: {damage}")
         if self._ros2:
@@ -271,6 +282,18 @@ class BagFile:
             seconds, nanoseconds, characters = struct.unpack_from("<III", raw, 4)
         frame_id = raw[16 : 16 + min(characters, _LONGEST_FRAME_ID)].rstrip(b"\0").decode(errors="replace")
         return BagMessage(record_ns, int(seconds) * 10**9 + int(nanoseconds), frame_id, topic.message_type, raw)
+
+    def _why_no_message(self, raw: bytes) -> str | None:
+        if not isinstance(raw, bytes):  # a database holds whatever stands in its rows
+            return "a message that is no bytes"
+        if len(raw) < _SHORTEST_MESSAGE:
+            return f"a message of {len(raw)} bytes, too few for its header"
+        if self._ros2 and raw[0] != 0:
+            return (
+                "it is not plain CDR; if the bag's messages are compressed, give the rosbag2 folder with its"
+                " metadata.yaml instead of the file"
+            )
+        return None
 
     @contextmanager
     def _damage(self, what: str) -> Iterator[None]:
@@ -285,6 +308,9 @@ class BagFile:
 
     def _remedy(self) -> str:
         if self.path.is_dir():
+            whole = next(iter(sorted(self.path.glob("*.zstd"))), None)
+            if whole is not None:  # so much of it is a file by itself, which is read as far as it goes
+                return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files instead of the folder"
         suffix = self.path.suffix if self._ros2 else ".bag"
         return {
@@ -296,6 +322,36 @@ class BagFile:
 
 def _named(connections: Sequence[Connection]) -> dict[int, tuple[str, str]]:
     return {connection.id: (connection.topic, connection.msgtype) for connection in connections}
+
+
+def _storages(reader: RosbagReader) -> list[Any]:
+    """What reads the single files of a bag: all have a path, connections and messages, and those of MCAP chunks."""
+    if isinstance(reader, Rosbag1Reader):
+        return [reader]
+    return getattr(reader.storage, "storages", None) or [reader.storage]
+
+
+def _of_topic(connections: Sequence[Connection], topic: Topic) -> list[Connection]:
+    return [one for one in connections if (one.topic, one.msgtype) == (topic.name, topic.message_type)]
+
+
+def _chunks(storage: Any, connections: Sequence[Connection], since_ns: int) -> list[Chunk] | None:
+    """Those with messages of these connections recorded since a time, by the index; None where there is none."""
+    if isinstance(storage, Rosbag1Reader):
+        starts: dict[int, int] = {}
+        for connection in connections:
+            for entry in storage.indexes[connection.id]:
+                if entry.time >= since_ns:
+                    starts[entry.chunk_pos] = min(entry.time, starts.get(entry.chunk_pos, entry.time))
+        return [Chunk(start_ns, begin) for begin, start_ns in starts.items()]
+    infos = getattr(storage, "chunks", None)
+    if not infos:
+        return None
+    return [
+        Chunk(info.message_start_time, info.chunk_start_offset)
+        for info in infos
+        if info.message_end_time >= since_ns and any(info.channel_count.get(one.id) for one in connections)
+    ]
 
 
 @cache

@@ -4,15 +4,21 @@ A recorder that was killed, or a copy that was cut short, leaves no index, and h
 an index, and the bag is damaged in the midst, it says where the chunks behind the damage are.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 from lidarslam.datasets.bag_database import DatabaseWalk
 from lidarslam.datasets.bag_walks import Expand, McapWalk, Rosbag1Walk, SalvagedMessage, Walk
 
 _WALKS: dict[str, type[Walk]] = {".bag": Rosbag1Walk, ".mcap": McapWalk, ".db3": DatabaseWalk}
+
+# Where all chunks of a bag overlap in time, order is not worth holding more of it in memory.
+_MOST_HELD = 100
 
 
 class Salvage:
@@ -43,6 +49,18 @@ class Salvage:
                 yield message
 
 
+class Chunk(NamedTuple):
+    """A chunk that the index knows; the earlier is the smaller.
+
+    Attributes:
+        start_ns: when its first message was recorded, or earlier, nanoseconds.
+        begin: where it begins, bytes.
+    """
+
+    start_ns: int
+    begin: int
+
+
 @dataclass(frozen=True)
 class Place:
     """Where to go on in a file whose index is known.
@@ -50,32 +68,57 @@ class Place:
     Attributes:
         path, suffix: the file, and which kind it is.
         connections: topic and type of each number that messages carry.
-        chunks: where they begin, bytes; none where the file has none.
+        chunks: those to read; None where the file has none and is read whole.
     """
 
     path: Path
     suffix: str
     connections: Mapping[int, tuple[str, str]]
-    chunks: Sequence[int]
+    chunks: Sequence[Chunk] | None
 
 
-def messages_from(place: Place, expand: Expand, on_damage: Callable[[str], None]) -> Iterator[SalvagedMessage]:
-    """The messages in the chunks of a place, or of its whole file where that has none, without those that are damaged.
+def messages_from(
+    place: Place, named: tuple[str, str], expand: Expand, on_damage: Callable[[str], None]
+) -> Iterator[SalvagedMessage]:
+    """The messages of one topic and type at a place, without those that are damaged.
 
-    Damage is told, but for that of the first chunk: whoever goes on from there knows of it.
+    Those in chunks come in the order they were recorded, as an index would give them: recorders may write chunks in
+    another. All damage is told, once for each chunk.
     """
     walk = _WALKS[place.suffix](place.path, expand)
-    if not place.chunks:
-        yield from walk.messages()
+    if place.chunks is None:
+        try:
+            yield from (message for message in walk.messages() if (message.topic, message.message_type) == named)
+        except Exception as error:  # not even its beginning makes sense
+            walk.damaged("it cannot be read", error)
+        if walk.damage is not None:
+            on_damage(walk.damage)
         return
     walk.know(place.connections)
     with place.path.open("rb") as file:
-        for number, chunk in enumerate(place.chunks):
+
+        def read(chunk: Chunk) -> Iterator[SalvagedMessage]:
             walk.damage = None
-            file.seek(chunk)
+            file.seek(chunk.begin)
             try:
-                yield from walk.record(file, whole=True)
+                for message in walk.record(file, whole=True):
+                    if (message.topic, message.message_type) == named:
+                        yield message
             except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
                 walk.damaged("it cannot be read", error)
-            if walk.damage is not None and number:
-                on_damage(f"the chunk at byte {chunk:,}: {walk.damage}")
+            if walk.damage is not None:
+                on_damage(f"the chunk at byte {chunk.begin:,}: {walk.damage}")
+
+        yield from _in_order(sorted(place.chunks), read)
+
+
+def _in_order(chunks: Sequence[Chunk], read: Callable[[Chunk], Iterator[SalvagedMessage]]) -> Iterator[SalvagedMessage]:
+    """What is in chunks, merged by time; chunks are read when one of their messages may be the next."""
+    unread, numbers = deque(chunks), count()
+    held: list[tuple[int, int, SalvagedMessage]] = []
+    while unread or held:
+        while unread and (not held or (unread[0].start_ns <= held[0][0] and len(held) < _MOST_HELD)):
+            for message in read(unread.popleft()):
+                heappush(held, (message.record_ns, next(numbers), message))
+        if held:
+            yield heappop(held)[-1]

@@ -225,6 +225,7 @@ class BagKit:
         name: str = "drive",
         definitions: bool = True,
         extra: Callable[[Any], None] | None = None,
+        in_order: bool = True,
         **options: Any,
     ) -> Path:
         """Write a bag of `topic: [(record stamp in ns, message), ...]`; a topic of no messages takes a type's name."""
@@ -249,7 +250,7 @@ class BagKit:
                     pending += [(record_ns, connection, message) for record_ns, message in messages]
             if extra is not None:
                 extra(writer)
-            for record_ns, connection, message in sorted(pending, key=lambda row: row[0]):
+            for record_ns, connection, message in sorted(pending, key=lambda row: row[0]) if in_order else pending:
                 writer.write(connection, record_ns, self.serialize(message))
         return path
 

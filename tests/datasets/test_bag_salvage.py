@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2.reader import zstd
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.bag_database import DatabaseWalk
 from lidarslam.datasets.bag_file import BagFile
+from lidarslam.datasets.bag_salvage import Place, messages_from
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 
@@ -20,19 +25,21 @@ STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
 
 
+def stamp_ns(index):
+    return STAMP_NS + index * PERIOD_NS
+
+
 @pytest.fixture
 def write_drive(make_bag_kit, make_sweep):
     """Write a bag of velodyne scans of 2 000 points; gives the storage file, the folder or file, and the points."""
 
-    def write(kind, count=6, width=125, kit=None, **options):
+    def write(kind, count=6, width=125, kit=None, order=None, recorded_ns=stamp_ns, first=0, **options):
         kit = kit or make_bag_kit(kind)
-        sweeps = [make_sweep("velodyne", STAMP_NS + i * PERIOD_NS, height=16, width=width) for i in range(count)]
-        clouds = [
-            (STAMP_NS + i * PERIOD_NS, kit.cloud(sweep.records, STAMP_NS + i * PERIOD_NS))
-            for i, sweep in enumerate(sweeps)
-        ]
-        path = kit.write({"/points": clouds, "/imu": "sensor_msgs/msg/Imu"}, **options)
-        return kit.storage_file(path), path, [sweep.points for sweep in sweeps]
+        numbers = range(first, first + count)
+        sweeps = {i: make_sweep("velodyne", stamp_ns(i), height=16, width=width) for i in numbers}
+        clouds = [(recorded_ns(i), kit.cloud(sweeps[i].records, stamp_ns(i))) for i in order or numbers]
+        path = kit.write({"/points": clouds, "/imu": "sensor_msgs/msg/Imu"}, in_order=order is None, **options)
+        return kit.storage_file(path), path, [sweep.points for sweep in sweeps.values()]
 
     return write
 
@@ -169,11 +176,20 @@ def test_a_record_that_claims_to_be_endless_is_not_read(write_drive):
     assert "a record of 1,000,000,000,000 bytes" in recording.warnings[0]
 
 
-def test_a_database_whose_rows_are_no_messages(write_drive):
+@pytest.mark.parametrize("data", ["text", 100, 4 * 10**12, 0.5])
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_database_whose_rows_are_no_messages(write_drive, data, indexed):
+    """A number must not become as many zero bytes."""
     file, _, points = write_drive("db3")
     with closing(sqlite3.connect(file)) as database, database:
-        database.execute("UPDATE messages SET data = 'text' WHERE id = 4")
-    assert_all_but(open_recording(file), points, [3], "1 scans were left out: they could not be read; the first: ")
+        database.execute("UPDATE messages SET data = ? WHERE id = 4", (data,))
+    if indexed:
+        told = f"1 scans were left out: they could not be read; the first: {file}: a message that is no bytes"
+        assert_all_but(open_recording(file), points, [3], told)
+        return
+    walk = DatabaseWalk(file, lambda *_: b"")
+    assert len(list(walk.messages())) == 5
+    assert walk.damage == f"a row of it is no message (its data are of type {type(data).__name__})"
 
 
 def assert_all_but(recording, points, missing, *warnings):
@@ -267,17 +283,132 @@ def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive,
     assert recording.describe().duration_s > 0.0
 
 
-def test_a_folder_of_several_files_is_read_past_a_damaged_chunk(write_drive):
-    file, folder, _ = write_drive("mcap", **BIG)
-    begin, length = chunks_of(file)[1]
+@pytest.mark.parametrize(
+    ("order", "damaged"),
+    [([0, 1, 6, 7, 2, 3, 4, 5, 8, 9], 0), ([0, 3, 1, 2, 4, 7, 5, 6, 8, 9], 0)],
+    ids=["apart", "overlapping"],
+)
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_chunks_that_do_not_lie_in_order_of_time_are_all_read(write_drive, kind, order, damaged):
+    """Recorders write them late, and messages into the wrong one; two scans fill a chunk."""
+    file, _, points = write_drive(kind, count=10, width=1500, order=order)
+    chunks = chunks_of(file)
+    assert len(chunks) == 5
+    begin, length = chunks[damaged]
     overwrite(file, begin, bytes(length))
+    assert_all_but(
+        open_recording(file),
+        points,
+        order[2 * damaged : 2 * damaged + 2],
+        "1 damaged places in the bag were passed over",
+        "2 scans are missing that the index lists",
+    )
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
+    """Around a damaged chunk, too: the first half before it, and the second behind it."""
+    file, _, points = write_drive(kind, **BIG, recorded_ns=lambda i: STAMP_NS + PERIOD_NS * (i > 1))
+    begin, length = chunks_of(file)[2]
+    overwrite(file, begin, bytes(length))
+    assert_all_but(open_recording(file), points, [4, 5], "1 damaged places", "2 scans are missing")
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_damaged_chunk_is_counted_once_for_each_topic(make_bag_kit, make_sweep, kind):
+    """Whichever chunk it is that each topic is gone on with."""
+    kit = make_bag_kit(kind)
+    clouds = [(stamp_ns(i), kit.cloud(make_sweep("velodyne", stamp_ns(i), 16, 1500).records, stamp_ns(i)))
+              for i in range(8)]  # fmt: skip
+    front, rear = clouds[0:3] + clouds[4:7:2], clouds[3:8:2]
+    file = kit.storage_file(kit.write({"/front": front, "/rear": rear}))
+    begin, length = chunks_of(file)[2]  # scans 4 and 5
+    overwrite(file, begin, bytes(length))
+    for topic, times in (("/front", [0, 1, 2, 6]), ("/rear", [3, 7])):
+        faults = Faults()
+        scans = list(open_recording(file, ReaderConfig(topic=topic)).scans(faults=faults))
+        assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in times]
+        assert [warning.split(";")[0] for warning in faults.warnings()] == [
+            "1 damaged places in the bag were passed over",
+            "1 scans are missing that the index lists",
+        ]
+
+
+def join(folder, file, later):
+    """Put another storage file of as many scans, 8, behind that of a folder."""
+    shutil.copy(later, folder / f"later{file.suffix}")
     metadata = folder / "metadata.yaml"
-    shutil.copy(file, folder / "again.mcap")
-    metadata.write_text(metadata.read_text().replace(f"- {file.name}\n", f"- {file.name}\n  - again.mcap\n", 1))
+    text = metadata.read_text()
+    text = text.replace(f"- {file.name}\n", f"- {file.name}\n  - later{file.suffix}\n", 1)
+    metadata.write_text(text.replace("message_count: 8\n", "message_count: 16\n"))
+
+
+def test_every_damaged_chunk_in_a_folder_of_several_files_is_counted(write_drive):
+    file, folder, _ = write_drive("mcap", **BIG)
+    later, _, _ = write_drive("mcap", **BIG, name="later", first=8)
+    for storage, chunk in ((file, 1), (later, 0)):
+        begin, length = chunks_of(storage)[chunk]
+        overwrite(storage, begin, bytes(length))
+    join(folder, file, later)
     faults = Faults()
     scans = list(open_recording(folder).scans(faults=faults))
-    assert len(scans) == 6
-    assert any("damaged places" in warning for warning in faults.warnings())
+    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(4, 8), *range(10, 16))]
+    told = f"2 damaged places in the bag were passed over; the first: {folder}: reading stopped after 2 messages"
+    assert any(warning.startswith(told) for warning in faults.warnings())
+
+
+@pytest.mark.parametrize("suffix", [".db3", ".mcap"])
+def test_a_file_that_went_bad_since_its_index_was_read_is_told(tmp_path, suffix):
+    file = tmp_path / f"drive{suffix}"
+    file.write_bytes(bytes(5000))
+    told = []
+    assert not list(messages_from(Place(file, suffix, {}, None), ("/points", "any"), lambda *_: b"", told.append))
+    assert len(told) == 1
+    assert told[0].startswith("it cannot be read (")
+
+
+@pytest.mark.parametrize("damaged", [0, 2, 5])
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_damaged_message_that_was_compressed_by_itself_costs_no_other(write_drive, kind, damaged):
+    """The first ones are those that what is learnt of the recording is learnt from."""
+    _, folder, points = write_drive(kind, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
+    file = folder / f"drive.{kind}"
+    if kind == "db3":
+        with closing(sqlite3.connect(file)) as database, database:
+            (data,) = database.execute("SELECT data FROM messages WHERE id = ?", (damaged + 1,)).fetchone()
+            data = data[:4] + b"\xff" * 40 + data[44:]
+            database.execute("UPDATE messages SET data = ? WHERE id = ?", (data, damaged + 1))
+    else:
+        data, magic = file.read_bytes(), b"\x28\xb5\x2f\xfd"
+        places = [at for at in range(len(data)) if data.startswith(magic, at)]
+        assert len(places) == 6
+        overwrite(file, places[damaged] + 4, b"\xff" * 40)
+    recording = open_recording(folder)
+    told = f"1 scans were left out: they could not be read; the first: {folder}: a compressed message is damaged ("
+    assert_all_but(recording, points, [damaged], told)
+    assert recording.describe().first_stamp == stamp_ns(damaged == 0) / 10**9
+
+
+def test_a_damaged_chunk_of_compressed_messages_costs_no_other(write_drive):
+    file, folder, points = write_drive("mcap", **BIG, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
+    begin, length = chunks_of(file)[1]
+    overwrite(file, begin, bytes(length))
+    assert_all_but(open_recording(folder), points, [3, 4, 5], "1 damaged places", "3 scans are missing")
+
+
+def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
+    """And how to get at what lies before the damage."""
+    _, folder, points = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
+    (file,) = folder.glob("*.zstd")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"cannot be opened .*`zstd -dc \S+\.zstd > \S+\.mcap` and give") as caught:
+        open_recording(folder)
+    assert "\n" not in str(caught.value)
+    half = file.with_suffix("")
+    half.write_bytes(zstd.ZstdDecompressor().decompress(file.read_bytes()))  # as zstd -d does
+    recording = open_recording(half)
+    assert len(recording) in (2, 3)
+    assert_first_scans(recording, points, len(recording))
 
 
 def test_a_damaged_page_of_a_database_costs_its_rows(write_drive):

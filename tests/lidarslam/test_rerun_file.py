@@ -1,6 +1,8 @@
 """A file that is filled through a pipe, whole or empty."""
 
+import errno
 import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -45,9 +47,48 @@ def test_a_write_that_fails_empties_the_file_and_swallows_the_rest(
     assert (tmp_path / "file").stat().st_size == 0
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_file_that_cannot_even_be_emptied_holds_no_writer() -> None:
+    """As on a disk that fails."""
+    file = PipedFile(Path("/dev/full"))
+
+    def write() -> None:
+        with file.entrance.open("wb") as entrance:
+            opened.set()
+            entrance.write(bytes(1_000_000))
+
+    opened = threading.Event()
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    assert opened.wait(10.0)
+    file.let_go()
+    writer.join(10.0)
+    assert not writer.is_alive()
+    assert file.finish()
+    assert file.failure is not None
+    assert file.failure.errno == errno.ENOSPC
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_pipe_that_nobody_reads_any_more_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever ends the reading, the other writer is told instead of waiting."""
+
+    def run_out(_handle: int, _piece: bytes) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("lidarslam.rerun_file._write_all", run_out)
+    file = PipedFile(tmp_path / "file")
+    with file.entrance.open("wb", buffering=0) as entrance:
+        entrance.write(b"piece")
+        assert file.finish()
+        with pytest.raises(BrokenPipeError):
+            entrance.write(b"another")
+
+
 def test_a_writer_that_never_lets_go_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lidarslam.rerun_file._LAST_PIECES_S", 0.1)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb"):
         assert not file.finish()
+    monkeypatch.undo()  # what follows is waited for, however busy the machine is
     assert file.finish()

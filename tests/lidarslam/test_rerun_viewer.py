@@ -3,6 +3,7 @@
 import resource
 import signal
 import socket
+import threading
 import time
 from pathlib import Path
 from urllib.request import urlopen
@@ -114,6 +115,7 @@ def test_a_recording_that_cannot_be_begun_gets_one_line(tmp_path: Path, monkeypa
     with pytest.raises(OutputError, match=r"cannot be begun \(.*\); leave --rerun out") as caught:
         RerunViewer("run", ViewerConfig(), tmp_path / "recording.rrd")
     assert "\n" not in str(caught.value)
+    assert not any(thread.name == "recording" for thread in threading.enumerate())  # its file is finished
 
 
 def test_no_display_gets_one_line(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -491,7 +491,7 @@ def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(
     arguments = whole("constant velocity").arguments
     ended = run(source, killed, *arguments)
     assert ended.status == 1
-    assert "did not finish; go on with it by --resume, or replace it with --overwrite" in ended.said
+    assert "holds what did not finish; replace it with --overwrite, or go on with a run by --resume" in ended.said
     for command in (["evaluate", str(killed)], ["view", str(killed)], ["view", str(killed), "--picture", "x.png"]):
         result = CliRunner().invoke(main, command)
         assert result.exit_code == 1

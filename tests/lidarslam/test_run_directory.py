@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lidarslam.core.errors import OutputError
-from lidarslam.run_directory import CONFIG, MAP_PLY, METRICS, SUMMARY, RunDirectory
+from lidarslam.run_directory import ABOUT, CONFIG, MAP_PLY, METRICS, SUMMARY, RunDirectory
 
 
 def names(path: Path) -> list[str]:
@@ -54,6 +54,18 @@ def test_an_earlier_run_survives_a_failed_attempt_to_replace_it(earlier: Path) -
     with pytest.raises(RuntimeError), RunDirectory.create(earlier, overwrite=True):
         raise RuntimeError
     assert names(earlier) == [CONFIG, METRICS, "notes.txt"]
+
+
+def test_what_did_not_finish_is_not_called_a_run(tmp_path: Path) -> None:
+    """It may be a merge, which nothing resumes."""
+    (tmp_path / ABOUT).parent.mkdir()
+    (tmp_path / ABOUT).write_text("{}")
+    said = "holds what did not finish; replace it with --overwrite, or go on with a run by --resume$"
+    with pytest.raises(OutputError, match=said), RunDirectory.create(tmp_path):
+        pass
+    with RunDirectory.create(tmp_path, overwrite=True):
+        pass
+    assert not (tmp_path / ABOUT).exists()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
