@@ -12,6 +12,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory_io import parse_numbers
 from lidarslam.datasets.scan_files import numbered_scans
 
+_POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
 _COLUMNS = 30
 _POSITION_ACCURACY_COLUMN = 23
@@ -36,13 +37,15 @@ def read_oxts(folder: Path) -> OxtsPoses:
     """Read `oxts/data` of a drive.
 
     Raises:
-        InputError: there is no file or one does not hold 30 numbers.
+        InputError: there is no file, or one does not hold 30 numbers that begin with a latitude.
     """
     files, numbers = numbered_scans(folder, ".txt")
     tables = [parse_numbers(path, _COLUMNS) for path in files]
     for path, table in zip(files, tables, strict=True):
         if len(table) != 1 or not np.isfinite(table[0, :6]).all():
             raise InputError(f"{path}: expected one line of {_COLUMNS} numbers, got {len(table)}; copy the file again")
+        if not abs(table[0, 0]) < _POLE_DEG:
+            raise InputError(f"{path}: begins with {table[0, 0]:g}, which is no latitude in degrees; copy the file again")
     rows = np.concatenate(tables)
     return OxtsPoses(numbers, oxts_poses(rows), rows[:, _POSITION_ACCURACY_COLUMN])
 

@@ -28,7 +28,8 @@ class ValueSpread:
 def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
     """The spread of integer or float values (N,), NaN left out; None when all, or all but a few, are alike."""
     whole = values.dtype.kind in "iu"
-    numbers = values.reshape(-1).astype(np.int64 if whole else np.float64)
+    with np.errstate(invalid="ignore"):  # damaged bytes may be a NaN of the signalling kind
+        numbers = values.reshape(-1).astype(np.int64 if whole else np.float64)
     numbers = numbers[np.isfinite(numbers)]
     set_times = numbers[numbers != 0]
     # Among clock readings a zero is a missing return; among relative times it is a time.
