@@ -45,7 +45,7 @@ def read_oxts(folder: Path) -> OxtsPoses:
         if len(table) != 1 or not np.isfinite(table[0, :6]).all():
             raise InputError(f"{path}: expected one line of {_COLUMNS} numbers, got {len(table)}; copy the file again")
         if not abs(table[0, 0]) < _POLE_DEG:
-            raise InputError(f"{path}: begins with {table[0, 0]:g}, which is no latitude in degrees; copy the file again")
+            raise InputError(f"{path}: begins with {table[0, 0]:g}, which is no latitude; copy the file again")
     rows = np.concatenate(tables)
     return OxtsPoses(numbers, oxts_poses(rows), rows[:, _POSITION_ACCURACY_COLUMN])
 
