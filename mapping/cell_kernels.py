@@ -23,6 +23,7 @@ ABSENT = -1
 EMPTY = -1
 # Three signed cell coordinates share one 64-bit key. It is linear in them: a neighbour's key is the cell's plus a
 # constant. 21 bits reach 52 km at cells of 5 cm; what is farther counts as lying there.
+# The 64th bit, the sign, says that it is the cell's other side: of a thin wall, what is seen from behind.
 BITS = 21
 OFFSET = 1 << (BITS - 1)
 STRIDE_X, STRIDE_Y = 1 << (2 * BITS), 1 << BITS
@@ -30,6 +31,7 @@ ORIGIN = OFFSET * (STRIDE_X + STRIDE_Y + 1)
 # Fibonacci hashing: the multiplier is 2^64 over the golden ratio.
 _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
 _ABOVE_BITS = 3
+OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 
 # Weight of a neighbour's points in a patch, by how many coordinates it differs in: near ones decide.
 _NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
@@ -45,6 +47,7 @@ class Cells(NamedTuple):
         bits: the table has two to the power of these slots.
         table_keys, table_rows: the hash table.
         keys: (M,) of the cells, by row.
+        others: (M,) the row of each cell's other side, or `ABSENT`.
         sums: (M, 15) of their points' moments.
     """
 
@@ -53,18 +56,25 @@ class Cells(NamedTuple):
     table_keys: Keys
     table_rows: Rows
     keys: Keys
+    others: Rows
     sums: Floats
 
 
 @compiled
 def cell_of(coordinate: float) -> int:
-    """The cell along one axis."""
-    return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 1))
+    """The cell along one axis; never the last one, so that no key is `EMPTY`."""
+    return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 2))
 
 
 @compiled
 def key_of(i: int, j: int, k: int) -> int:
     return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
+
+
+@compiled
+def other_side(key: int) -> int:
+    """The key of a cell's other side."""
+    return int(key | OTHER_SIDE)
 
 
 @compiled
@@ -75,7 +85,7 @@ def _home(key: int, bits: int) -> int:
 
 
 @compiled
-def _find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
+def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
     slot = _home(key, bits)
     while table_keys[slot] != EMPTY:
         if table_keys[slot] == key:
@@ -88,7 +98,7 @@ def _find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
 def find(keys: Keys, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows) -> None:
     """Write the rows (N,) of keys (N,), `ABSENT` where there is none."""
     for n in range(len(keys)):
-        rows[n] = _find_one(keys[n], bits, table_keys, table_rows)
+        rows[n] = find_one(keys[n], bits, table_keys, table_rows)
 
 
 @compiled
@@ -131,6 +141,17 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
     scale = 1.0 / cell_m
     for n in range(len(points)):
         keys[n] = key_of(cell_of(points[n, 0] * scale), cell_of(points[n, 1] * scale), cell_of(points[n, 2] * scale))
+
+
+@compiled
+def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows, others: Rows) -> None:
+    """Write, for those of the keys (N,) in rows (N,) that are other sides, which rows belong together, (M,)."""
+    for n in range(len(keys)):
+        if keys[n] < 0 and others[rows[n]] == ABSENT:
+            first = find_one(keys[n] & FIRST_SIDE, bits, table_keys, table_rows)
+            others[rows[n]] = first
+            if first != ABSENT:
+                others[first] = rows[n]
 
 
 @compiled
@@ -188,7 +209,7 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     for n in range(len(points)):
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         i, j, k = cell_of(x), cell_of(y), cell_of(z)
-        row = _find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+        row = find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
         rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
 
 
@@ -199,7 +220,7 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
-                row = _find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                row = find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
                 if row == ABSENT:
                     continue
                 count = cells.sums[row, 0]
@@ -231,13 +252,31 @@ def gather(row: int, cells: Cells, total: FloatArray) -> None:
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
-                key = cells.keys[row] + i * STRIDE_X + j * STRIDE_Y + k
-                other = _find_one(key, cells.bits, cells.table_keys, cells.table_rows)
+                key = (cells.keys[row] & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k
+                other = find_one(key, cells.bits, cells.table_keys, cells.table_rows)
                 if other == ABSENT:
                     continue
+                if cells.others[other] != ABSENT:
+                    other = row if i == j == k == 0 else _same_side(own, other, cells)
                 sums = cells.sums[other]
                 if own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14] >= 0.0:
                     _add_shifted(sums, i, j, k, total)
+
+
+@compiled
+def _same_side(own: Floats, row: int, cells: Cells) -> int:
+    """Of both sides of a cell, the one that was rather seen from where a cell with these sums (15,) was."""
+    other = cells.others[row]
+    if _view_cosine(own, cells.sums[other]) > _view_cosine(own, cells.sums[row]):
+        return int(other)
+    return row
+
+
+@compiled
+def _view_cosine(own: Floats, sums: Floats) -> float:
+    """The cosine between the directions that two cells were seen from, times the length of the first one."""
+    length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
+    return (own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9)
 
 
 @compiled

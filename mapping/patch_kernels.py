@@ -34,32 +34,42 @@ def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: 
         patches: (M, 16), written.
         counts: (M,) how many points the cells had when they were last looked at, written.
     """
-    total, covariance, values = np.empty(15), np.empty(6), np.empty(3)
+    room = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):
-        row = rows[n]
-        if row < 0 or counts[row] * _GROWTH > cells.sums[row, 0]:
-            continue
-        counts[row] = cells.sums[row, 0]
-        gather(row, cells, total)
-        count, x, y, z = total[0], total[1] / total[0], total[2] / total[0], total[3] / total[0]
-        covariance[0], covariance[1], covariance[2] = -x * x, -x * y, -x * z
-        covariance[3], covariance[4], covariance[5] = -y * y, -y * z, -z * z
-        for column in range(6):
-            covariance[column] += total[4 + column] / count
-        write_eigenvalues(covariance, values)
-        i, j, k = middle_of(cells.keys[row])
-        patch = patches[row]
-        patch[0], patch[1], patch[2] = (i + x) * cells.cell_m, (j + y) * cells.cell_m, (k + z) * cells.cell_m
-        write_eigenvector(covariance, values[0], patch[3:6])
-        if patch[3] * total[12] + patch[4] * total[13] + patch[5] * total[14] < 0.0:  # towards where it was seen from
-            patch[3], patch[4], patch[5] = -patch[3], -patch[4], -patch[5]
-        write_eigenvector(covariance, values[2], patch[6:9])
-        for axis in range(3):
-            patch[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m
-        elevation = total[10] / count
-        patch[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0))
-        patch[13] = count
-        _judge(patch)
+        if rows[n] >= 0:
+            refresh_one(rows[n], cells, patches, counts, room)
+
+
+@compiled
+def refresh_one(
+    row: int, cells: Cells, patches: FloatArray, counts: NDArray[np.float32],
+    room: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:  # fmt: skip
+    """Do so for the cell in one row, in room for 15, 6 and 3 numbers."""
+    if counts[row] * _GROWTH > cells.sums[row, 0]:
+        return
+    total, covariance, values = room
+    counts[row] = cells.sums[row, 0]
+    gather(row, cells, total)
+    count, x, y, z = total[0], total[1] / total[0], total[2] / total[0], total[3] / total[0]
+    covariance[0], covariance[1], covariance[2] = -x * x, -x * y, -x * z
+    covariance[3], covariance[4], covariance[5] = -y * y, -y * z, -z * z
+    for column in range(6):
+        covariance[column] += total[4 + column] / count
+    write_eigenvalues(covariance, values)
+    i, j, k = middle_of(cells.keys[row])
+    patch = patches[row]
+    patch[0], patch[1], patch[2] = (i + x) * cells.cell_m, (j + y) * cells.cell_m, (k + z) * cells.cell_m
+    write_eigenvector(covariance, values[0], patch[3:6])
+    if patch[3] * total[12] + patch[4] * total[13] + patch[5] * total[14] < 0.0:  # towards where it was seen from
+        patch[3], patch[4], patch[5] = -patch[3], -patch[4], -patch[5]
+    write_eigenvector(covariance, values[2], patch[6:9])
+    for axis in range(3):
+        patch[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m
+    elevation = total[10] / count
+    patch[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0))
+    patch[13] = count
+    _judge(patch)
 
 
 @compiled
