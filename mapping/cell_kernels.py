@@ -33,8 +33,6 @@ _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
 _ABOVE_BITS = 3
 OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 
-# Weight of a neighbour's points in a patch, by how many coordinates it differs in: near ones decide.
-_NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
 # A cell that has seen so many points knows its surface; it is left as it is, and drift does not smear it.
 _MOST_POINTS = 60.0
 
@@ -69,6 +67,12 @@ def cell_of(coordinate: float) -> int:
 @compiled
 def key_of(i: int, j: int, k: int) -> int:
     return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
+
+
+@compiled
+def neighbour_key(key: int, i: int, j: int, k: int) -> int:
+    """The key of the cell so many cells away from a cell, or from its other side."""
+    return int((key & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k)
 
 
 @compiled
@@ -239,61 +243,3 @@ def middle_of(key: int) -> tuple[float, float, float]:
     mask = (1 << BITS) - 1
     i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
     return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5
-
-
-@compiled
-def gather(row: int, cells: Cells, total: FloatArray) -> None:
-    """Write the sums (15,) of a cell and the 26 around it, weighted, about its own centre.
-
-    What was seen from the other side is another surface: a thin wall has two.
-    """
-    total[:] = 0.0
-    own = cells.sums[row]
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                key = (cells.keys[row] & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k
-                other = find_one(key, cells.bits, cells.table_keys, cells.table_rows)
-                if other == ABSENT:
-                    continue
-                if cells.others[other] != ABSENT:
-                    other = row if i == j == k == 0 else _same_side(own, other, cells)
-                sums = cells.sums[other]
-                if own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14] >= 0.0:
-                    _add_shifted(sums, i, j, k, total)
-
-
-@compiled
-def _same_side(own: Floats, row: int, cells: Cells) -> int:
-    """Of both sides of a cell, the one that was rather seen from where a cell with these sums (15,) was."""
-    other = cells.others[row]
-    if _view_cosine(own, cells.sums[other]) > _view_cosine(own, cells.sums[row]):
-        return int(other)
-    return row
-
-
-@compiled
-def _view_cosine(own: Floats, sums: Floats) -> float:
-    """The cosine between the directions that two cells were seen from, times the length of the first one."""
-    length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
-    return (own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9)
-
-
-@compiled
-def _add_shifted(sums: Floats, i: int, j: int, k: int, total: FloatArray) -> None:
-    """Add moments about the centre of a cell so many cells away to moments about the own centre."""
-    weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]
-    n, x, y, z = np.float64(sums[0]), np.float64(sums[1]), np.float64(sums[2]), np.float64(sums[3])
-    total[0] += weight * n
-    total[1] += weight * (x + i * n)
-    total[2] += weight * (y + j * n)
-    total[3] += weight * (z + k * n)
-    total[4] += weight * (sums[4] + 2 * i * x + i * i * n)
-    total[5] += weight * (sums[5] + i * y + j * x + i * j * n)
-    total[6] += weight * (sums[6] + i * z + k * x + i * k * n)
-    total[7] += weight * (sums[7] + 2 * j * y + j * j * n)
-    total[8] += weight * (sums[8] + j * z + k * y + j * k * n)
-    total[9] += weight * (sums[9] + 2 * k * z + k * k * n)
-    total[10] += weight * sums[10]
-    for column in range(11, 15):
-        total[column] += weight * sums[column]

@@ -14,8 +14,7 @@ from lidarslam.core.geometry import FloatArray
 from mapping.cell_kernels import Cells, find_one, other_side
 from mapping.patch_kernels import refresh_one
 
-_ABSENT = -1
-# A plane is seen from behind from this far beyond it, as a sine: from where it pulls nobody, in `mapping.match_kernels`.
+# A plane is seen from behind from this far beyond it, as a sine: whence it pulls nobody, in `mapping.match_kernels`.
 _LEAST_SINE = 0.17
 # So it is not, when it is seen from much the same direction as the cell was: less than 26 degrees apart.
 _SAME_VIEW = 0.9
@@ -32,11 +31,11 @@ def choose_sides(
     room = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(keys)):
         row = find_one(keys[n], cells.bits, cells.table_keys, cells.table_rows)
-        if row == _ABSENT:
+        if row < 0:
             continue
         x, y, z = float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
         other = cells.others[row]
-        if other != _ABSENT:
+        if other >= 0:
             refresh_one(row, cells, patches, counts, room)
             refresh_one(other, cells, patches, counts, room)
             if _facing(other, x, y, z, cells, patches) > _facing(row, x, y, z, cells, patches):
@@ -61,7 +60,7 @@ def turn_to_sensor(
     room = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):
         row = rows[n]
-        if row < 0 or cells.others[row] == _ABSENT:
+        if row < 0 or cells.others[row] < 0:
             continue
         other = cells.others[row]
         refresh_one(row, cells, patches, counts, room)

@@ -97,7 +97,7 @@ class SurfelGrid:
         kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
 
     def add_samples(self, points: FloatArray, elevations: FloatArray, views: FloatArray) -> None:
-        """Add what another grid's `samples` are: unlike a scan's, points (N, 3) of one cell may be of both its sides."""
+        """Add the `samples` of another grid; unlike a scan's, those (N, 3) in one cell may be of both its sides."""
         _, first, cell = np.unique(point_keys(points, self.cell_m), return_index=True, return_inverse=True)
         like_first = np.einsum("ij,ij->i", views, views[first[cell]]) >= 0.0
         for part in (like_first, ~like_first):
