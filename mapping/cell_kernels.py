@@ -76,12 +76,6 @@ def neighbour_key(key: int, i: int, j: int, k: int) -> int:
 
 
 @compiled
-def other_side(key: int) -> int:
-    """The key of a cell's other side."""
-    return int(key | OTHER_SIDE)
-
-
-@compiled
 def _home(key: int, bits: int) -> int:
     """The slot where the search for a key begins; cells above one another share a line of the processor's cache."""
     column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER

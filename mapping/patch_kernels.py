@@ -38,8 +38,15 @@ def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: 
     """
     room = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):
-        if rows[n] >= 0:
-            refresh_one(rows[n], cells, patches, counts, room)
+        row = rows[n]
+        if row >= 0 and outdated(row, cells.sums, counts):
+            refresh_one(row, cells, patches, counts, room)
+
+
+@compiled
+def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -> bool:
+    """Whether the cell in a row has grown since it was last looked at."""
+    return bool(counts[row] * _GROWTH <= sums[row, 0])
 
 
 @compiled
@@ -47,9 +54,10 @@ def refresh_one(
     row: int, cells: Cells, patches: FloatArray, counts: NDArray[np.float32],
     room: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:  # fmt: skip
-    """Do so for the cell in one row, in room for 15, 6 and 3 numbers."""
-    if counts[row] * _GROWTH > cells.sums[row, 0]:
-        return
+    """Work out what the cell in one row shows, in room for 15, 6 and 3 numbers.
+
+    To call it costs something: call it for cells that are `outdated`.
+    """
     total, covariance, values = room
     counts[row] = cells.sums[row, 0]
     _gather(row, cells, total)

@@ -11,43 +11,43 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from mapping.cell_kernels import Cells, find_one, other_side
-from mapping.patch_kernels import refresh_one
+from mapping.cell_kernels import Cells
+from mapping.patch_kernels import outdated, refresh_one
 
 # A plane is seen from behind from this far beyond it, as a sine: whence it pulls nobody, in `mapping.match_kernels`.
 _LEAST_SINE = 0.17
-# So it is not, when it is seen from much the same direction as the cell was: less than 26 degrees apart.
-_SAME_VIEW = 0.9
+# So it is not, when it is seen from much the same direction as the cell was: the least squared cosine between them.
+_SAME_VIEW = 0.5
 
 
 @compiled
-def choose_sides(
-    views: NDArray[np.float32], cells: Cells, patches: FloatArray, counts: NDArray[np.float32], keys: NDArray[np.int64]
-) -> None:
-    """Change the keys (N,) of points, seen from directions (N, 3), that belong to their cells' other sides.
+def belong_to_others(
+    views: NDArray[np.float32], rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: NDArray[np.float32],
+    chosen: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Write which points (N,), seen from directions (N, 3), belong to the other sides of their cells, in rows (N,).
 
     What the cells show, (M, 16), is worked out where it must be; see `mapping.patch_kernels.refresh`.
     """
     room = np.empty(15), np.empty(6), np.empty(3)
-    for n in range(len(keys)):
-        row = find_one(keys[n], cells.bits, cells.table_keys, cells.table_rows)
-        if row < 0:
-            continue
+    for n in range(len(rows)):
+        row, chosen[n] = rows[n], False
         x, y, z = float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
         other = cells.others[row]
         if other >= 0:
-            refresh_one(row, cells, patches, counts, room)
-            refresh_one(other, cells, patches, counts, room)
-            if _facing(other, x, y, z, cells, patches) > _facing(row, x, y, z, cells, patches):
-                keys[n] = other_side(keys[n])
+            if outdated(row, cells.sums, counts):
+                refresh_one(row, cells, patches, counts, room)
+            if outdated(other, cells.sums, counts):
+                refresh_one(other, cells, patches, counts, room)
+            chosen[n] = _facing(other, x, y, z, cells, patches) > _facing(row, x, y, z, cells, patches)
             continue
-        length, sums = math.sqrt(x * x + y * y + z * z), cells.sums[row]
-        u, v, w = float(sums[12]), float(sums[13]), float(sums[14])
-        if x * u + y * v + z * w < _SAME_VIEW * length * math.sqrt(u * u + v * v + w * w):
-            refresh_one(row, cells, patches, counts, room)
+        u, v, w = float(cells.sums[row, 12]), float(cells.sums[row, 13]), float(cells.sums[row, 14])
+        along, squared = x * u + y * v + z * w, x * x + y * y + z * z
+        if along < 0.0 or along * along < _SAME_VIEW * squared * (u * u + v * v + w * w):
+            if outdated(row, cells.sums, counts):
+                refresh_one(row, cells, patches, counts, room)
             p = patches[row]
-            if p[14] > 0.0 and x * p[3] + y * p[4] + z * p[5] < -_LEAST_SINE * length:
-                keys[n] = other_side(keys[n])
+            chosen[n] = p[14] > 0.0 and x * p[3] + y * p[4] + z * p[5] < -_LEAST_SINE * math.sqrt(squared)
 
 
 @compiled
@@ -63,8 +63,10 @@ def turn_to_sensor(
         if row < 0 or cells.others[row] < 0:
             continue
         other = cells.others[row]
-        refresh_one(row, cells, patches, counts, room)
-        refresh_one(other, cells, patches, counts, room)
+        if outdated(row, cells.sums, counts):
+            refresh_one(row, cells, patches, counts, room)
+        if outdated(other, cells.sums, counts):
+            refresh_one(other, cells, patches, counts, room)
         x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
         if _facing(other, x, y, z, cells, patches) > _facing(row, x, y, z, cells, patches):
             rows[n] = other

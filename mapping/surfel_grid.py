@@ -17,7 +17,7 @@ from lidarslam.core.state import Saved, State
 from mapping import cell_kernels as kernels
 from mapping.patch_kernels import refresh
 from mapping.patches import PATCH_COLUMNS, PatchTable
-from mapping.side_kernels import choose_sides, turn_to_sensor
+from mapping.side_kernels import belong_to_others, turn_to_sensor
 from mapping.symmetric import SYMMETRIC
 from mapping.voxel_table import ABSENT, Rows, VoxelTable, cell_keys, key_cells, point_keys
 
@@ -89,10 +89,16 @@ class SurfelGrid:
         points = np.ascontiguousarray(points)
         views = np.ascontiguousarray(views, dtype=np.float32)
         keys = point_keys(points, self.cell_m)
-        choose_sides(views, self._cells(), self._patches, self._patch_counts, keys)
         rows = self._table.insert(keys)
         self._reserve(len(self._table))
-        kernels.link_sides(keys, rows, *self._table.slots, self._others)
+        behind = np.empty(len(points), dtype=np.bool_)
+        belong_to_others(views, rows, self._cells(), self._patches, self._patch_counts, behind)
+        turned = np.flatnonzero(behind)
+        if len(turned):
+            keys[turned] |= kernels.OTHER_SIDE
+            rows[turned] = self._table.insert(keys[turned])
+            self._reserve(len(self._table))
+            kernels.link_sides(keys[turned], rows[turned], *self._table.slots, self._others)
         seen = np.ascontiguousarray(elevations), views
         kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
 
