@@ -7,9 +7,10 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state import Saved
+from mapping.cell_kernels import OTHER_SIDE
 from mapping.local_map import LocalMap
 from mapping.surfel_grid import SurfelGrid
-from mapping.voxel_table import ABSENT, key_cells
+from mapping.voxel_table import VoxelTable, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005
@@ -168,13 +169,9 @@ def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng: np.rando
     assert len(grid) == len(cells)
 
 
-def test_both_sides_of_the_farthest_cell_are_held() -> None:
-    """Whose key is no other than that of a free slot, if it is not looked after."""
-    grid, corner = SurfelGrid(CELL), np.full((200, 3), 1e9)
-    corner[:, 1:] -= np.random.default_rng(0).uniform(0.0, 0.4, (200, 2))
-    grid.add(corner, np.zeros(200), np.tile([-1.0, -1.0, -1.0], (200, 1)))
-    grid.add(corner, np.zeros(200), np.tile([1.0, 1.0, 1.0], (200, 1)))
-    assert (grid.look_up(corner, np.full(3, 2e9)) != ABSENT).all()
-    held = len(grid)
-    grid.add(corner, np.zeros(200), np.tile([1.0, 1.0, 1.0], (200, 1)))
-    assert len(grid) == held
+def test_the_other_side_of_the_farthest_cell_is_no_free_slot() -> None:
+    table, keys = VoxelTable(), point_keys(np.full((1, 3), 1e12), CELL) | OTHER_SIDE
+    table.insert(keys)
+    table.insert(keys)
+    assert len(table) == 1
+    assert table.find(keys).tolist() == [0]
