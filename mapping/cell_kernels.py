@@ -23,6 +23,7 @@ ABSENT = -1
 EMPTY = -1
 # Three signed cell coordinates share one 64-bit key. It is linear in them: a neighbour's key is the cell's plus a
 # constant. 21 bits reach 52 km at cells of 5 cm; what is farther counts as lying there.
+# The 64th bit, the sign, says that it is the cell's other side: of a thin wall, what is seen from behind.
 BITS = 21
 OFFSET = 1 << (BITS - 1)
 STRIDE_X, STRIDE_Y = 1 << (2 * BITS), 1 << BITS
@@ -30,9 +31,8 @@ ORIGIN = OFFSET * (STRIDE_X + STRIDE_Y + 1)
 # Fibonacci hashing: the multiplier is 2^64 over the golden ratio.
 _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
 _ABOVE_BITS = 3
+OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 
-# Weight of a neighbour's points in a patch, by how many coordinates it differs in: near ones decide.
-_NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
 # A cell that has seen so many points knows its surface; it is left as it is, and drift does not smear it.
 _MOST_POINTS = 60.0
 
@@ -45,6 +45,7 @@ class Cells(NamedTuple):
         bits: the table has two to the power of these slots.
         table_keys, table_rows: the hash table.
         keys: (M,) of the cells, by row.
+        others: (M,) the row of each cell's other side, or `ABSENT`.
         sums: (M, 15) of their points' moments.
     """
 
@@ -53,18 +54,25 @@ class Cells(NamedTuple):
     table_keys: Keys
     table_rows: Rows
     keys: Keys
+    others: Rows
     sums: Floats
 
 
 @compiled
 def cell_of(coordinate: float) -> int:
-    """The cell along one axis."""
-    return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 1))
+    """The cell along one axis; never the last one, so that no key is `EMPTY`."""
+    return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 2))
 
 
 @compiled
 def key_of(i: int, j: int, k: int) -> int:
     return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
+
+
+@compiled
+def neighbour_key(key: int, i: int, j: int, k: int) -> int:
+    """The key of the cell so many cells away from a cell, or from its other side."""
+    return int((key & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k)
 
 
 @compiled
@@ -75,7 +83,7 @@ def _home(key: int, bits: int) -> int:
 
 
 @compiled
-def _find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
+def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
     slot = _home(key, bits)
     while table_keys[slot] != EMPTY:
         if table_keys[slot] == key:
@@ -88,7 +96,7 @@ def _find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
 def find(keys: Keys, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows) -> None:
     """Write the rows (N,) of keys (N,), `ABSENT` where there is none."""
     for n in range(len(keys)):
-        rows[n] = _find_one(keys[n], bits, table_keys, table_rows)
+        rows[n] = find_one(keys[n], bits, table_keys, table_rows)
 
 
 @compiled
@@ -131,6 +139,17 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
     scale = 1.0 / cell_m
     for n in range(len(points)):
         keys[n] = key_of(cell_of(points[n, 0] * scale), cell_of(points[n, 1] * scale), cell_of(points[n, 2] * scale))
+
+
+@compiled
+def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows, others: Rows) -> None:
+    """Write, for those of the keys (N,) in rows (N,) that are other sides, which rows belong together, (M,)."""
+    for n in range(len(keys)):
+        if keys[n] < 0 and others[rows[n]] == ABSENT:
+            first = find_one(keys[n] & FIRST_SIDE, bits, table_keys, table_rows)
+            others[rows[n]] = first
+            if first != ABSENT:
+                others[first] = rows[n]
 
 
 @compiled
@@ -188,7 +207,7 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     for n in range(len(points)):
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         i, j, k = cell_of(x), cell_of(y), cell_of(z)
-        row = _find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
+        row = find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
         rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
 
 
@@ -199,7 +218,7 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
-                row = _find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                row = find_one(key_of(a, b, c), cells.bits, cells.table_keys, cells.table_rows)
                 if row == ABSENT:
                     continue
                 count = cells.sums[row, 0]
@@ -218,43 +237,3 @@ def middle_of(key: int) -> tuple[float, float, float]:
     mask = (1 << BITS) - 1
     i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
     return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5
-
-
-@compiled
-def gather(row: int, cells: Cells, total: FloatArray) -> None:
-    """Write the sums (15,) of a cell and the 26 around it, weighted, about its own centre.
-
-    What was seen from the other side is another surface: a thin wall has two.
-    """
-    total[:] = 0.0
-    own = cells.sums[row]
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                key = cells.keys[row] + i * STRIDE_X + j * STRIDE_Y + k
-                other = _find_one(key, cells.bits, cells.table_keys, cells.table_rows)
-                if other == ABSENT:
-                    continue
-                sums = cells.sums[other]
-                if own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14] >= 0.0:
-                    _add_shifted(sums, i, j, k, total)
-
-
-@compiled
-def _add_shifted(sums: Floats, i: int, j: int, k: int, total: FloatArray) -> None:
-    """Add moments about the centre of a cell so many cells away to moments about the own centre."""
-    weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]
-    n, x, y, z = np.float64(sums[0]), np.float64(sums[1]), np.float64(sums[2]), np.float64(sums[3])
-    total[0] += weight * n
-    total[1] += weight * (x + i * n)
-    total[2] += weight * (y + j * n)
-    total[3] += weight * (z + k * n)
-    total[4] += weight * (sums[4] + 2 * i * x + i * i * n)
-    total[5] += weight * (sums[5] + i * y + j * x + i * j * n)
-    total[6] += weight * (sums[6] + i * z + k * x + i * k * n)
-    total[7] += weight * (sums[7] + 2 * j * y + j * j * n)
-    total[8] += weight * (sums[8] + j * z + k * y + j * k * n)
-    total[9] += weight * (sums[9] + 2 * k * z + k * k * n)
-    total[10] += weight * sums[10]
-    for column in range(11, 15):
-        total[column] += weight * sums[column]

@@ -138,11 +138,11 @@ class LocalMap:
         points = np.ascontiguousarray(points)
         pulls, count = _room_for(3 * len(points)), 0
         waiting, bodies = np.arange(len(points)), None
+        sensor = np.array(T_world_lidar[:3, 3])
         for grid in self._planes[first_level:]:
-            rows = grid.look_up(points.take(waiting, axis=0))
+            rows = grid.look_up(points.take(waiting, axis=0), sensor)
             patches = grid.all_patches(rows)
             room = Bodies(np.empty(len(waiting), dtype=np.intp), np.empty(len(waiting), dtype=np.int32))
-            sensor = np.array(T_world_lidar[:3, 3])
             count, left, others = pull_to_planes(points, waiting, rows, patches, sensor, pulls, count, room)
             waiting = waiting[:left]
             if bodies is None:  # what is no plane in the finest grid, and in no other
@@ -182,7 +182,7 @@ class LocalMap:
         other._centre, other._scans = self._centre, self._scans
         samples = self._planes[0].samples()
         for grid in other._planes:
-            grid.add(*samples)
+            grid.add_samples(*samples)
         other._lines.add(*self._lines.samples())
         return other
 

@@ -3,6 +3,8 @@
 A cell keeps the sums of its points' moments, so that adding a scan touches only the cells it falls into. What a cell
 shows of the surface comes from its own sums and those of its 26 neighbours: patches overlap, and no wall is cut at a
 cell's border. It is worked out when the cell is looked up, and again when the cell has grown.
+
+A cell has another side where the plane it shows was seen from behind: cells of their own, in the same place.
 """
 
 from typing import Any
@@ -15,8 +17,9 @@ from lidarslam.core.state import Saved, State
 from mapping import cell_kernels as kernels
 from mapping.patch_kernels import refresh
 from mapping.patches import PATCH_COLUMNS, PatchTable
+from mapping.side_kernels import belong_to_others, turn_to_sensor
 from mapping.symmetric import SYMMETRIC
-from mapping.voxel_table import Rows, VoxelTable, cell_keys, key_cells, point_keys
+from mapping.voxel_table import ABSENT, Rows, VoxelTable, cell_keys, key_cells, point_keys
 
 # Columns of a cell's sums: points, first and second moments about the cell's centre in units of the cell, first and
 # second moment of the elevation they were seen at, and the sum of the directions that they were seen from.
@@ -39,6 +42,7 @@ class SurfelGrid:
         self.cell_m = cell_m
         self._table = VoxelTable()
         self._keys = np.zeros(0, dtype=np.int64)
+        self._others = np.zeros(0, dtype=np.int32)
         self._sums = np.zeros((0, _COLUMNS), dtype=np.float32)
         self._patches = np.zeros((0, PATCH_COLUMNS))
         self._patch_counts = np.zeros(0, dtype=np.float32)
@@ -68,7 +72,7 @@ class SurfelGrid:
         grid._sums = saved.array("sums", (count, _COLUMNS), np.float32)
         grid._patches = saved.array("patches", (count, PATCH_COLUMNS))
         grid._patch_counts = saved.array("patch_counts", (count,), np.float32)
-        grid._table.rebuild(grid._keys)
+        grid._index()
         grid._tidied = saved.integer("tidied")
         return grid
 
@@ -83,16 +87,38 @@ class SurfelGrid:
         if not len(points):
             return
         points = np.ascontiguousarray(points)
+        views = np.ascontiguousarray(views, dtype=np.float32)
         keys = point_keys(points, self.cell_m)
         rows = self._table.insert(keys)
         self._reserve(len(self._table))
-        seen = np.ascontiguousarray(elevations), np.ascontiguousarray(views, dtype=np.float32)
+        behind = np.empty(len(points), dtype=np.bool_)
+        belong_to_others(views, rows, self._cells(), self._patches, self._patch_counts, behind)
+        turned = np.flatnonzero(behind)
+        if len(turned):
+            keys[turned] |= kernels.OTHER_SIDE
+            rows[turned] = self._table.insert(keys[turned])
+            self._reserve(len(self._table))
+            kernels.link_sides(keys[turned], rows[turned], *self._table.slots, self._others)
+        seen = np.ascontiguousarray(elevations), views
         kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
 
-    def look_up(self, points: FloatArray) -> Rows:
-        """Rows (N,) of the cells that points (N, 3) of the world lie in, else of the nearest around; or `ABSENT`."""
-        rows = np.empty(len(points), dtype=np.int32)
-        kernels.look_up(np.ascontiguousarray(points), self._cells(), rows)
+    def add_samples(self, points: FloatArray, elevations: FloatArray, views: FloatArray) -> None:
+        """Add the `samples` of another grid; unlike a scan's, those (N, 3) in one cell may be of both its sides."""
+        _, first, cell = np.unique(point_keys(points, self.cell_m), return_index=True, return_inverse=True)
+        like_first = np.einsum("ij,ij->i", views, views[first[cell]]) >= 0.0
+        for part in (like_first, ~like_first):
+            self.add(points[part], elevations[part], views[part])
+
+    def look_up(self, points: FloatArray, sensor: FloatArray | None = None) -> Rows:
+        """Rows (N,) of the cells that points (N, 3) of the world lie in, else of the nearest around; or `ABSENT`.
+
+        Of a cell with two sides, the one that faces a sensor (3,) that sees the points, or without it the first.
+        """
+        points, rows = np.ascontiguousarray(points), np.empty(len(points), dtype=np.int32)
+        kernels.look_up(points, self._cells(), rows)
+        if sensor is not None:
+            sensor = np.ascontiguousarray(sensor)
+            turn_to_sensor(points, sensor, self._cells(), self._patches, self._patch_counts, rows)
         return rows
 
     def patches(self, rows: Rows) -> PatchTable:
@@ -164,16 +190,27 @@ class SurfelGrid:
         self._sums = self._sums[kept]
         self._patches = self._patches[kept]
         self._patch_counts = self._patch_counts[kept]
+        self._index()
+
+    def _index(self) -> None:
+        """Find cells, and their other sides, by their keys; another side without the first one becomes the first."""
+        first = self._keys & kernels.FIRST_SIDE
+        lone = (self._keys < 0) & ~np.isin(first, self._keys)
+        self._keys[lone] = first[lone]
         self._table.rebuild(self._keys)
+        self._others = np.full(len(self._keys), ABSENT, dtype=np.int32)
+        rows = np.arange(len(self._keys), dtype=np.int32)
+        kernels.link_sides(self._keys, rows, *self._table.slots, self._others)
 
     def _cells(self) -> kernels.Cells:
-        return kernels.Cells(self.cell_m, *self._table.slots, self._keys, self._sums)
+        return kernels.Cells(self.cell_m, *self._table.slots, self._keys, self._others, self._sums)
 
     def _reserve(self, count: int) -> None:
         if count <= len(self._keys):
             return
         capacity = max(4096, 2 * count)
         self._keys = _extended(self._keys, capacity)
+        self._others = _extended(self._others, capacity, ABSENT)
         self._sums = _extended(self._sums, capacity)
         self._patches = _extended(self._patches, capacity)
         self._patch_counts = _extended(self._patch_counts, capacity)
@@ -185,7 +222,7 @@ def _spread(counts: FloatArray, moments: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(moments[:, 1] / counts - mean * mean, 0.0))
 
 
-def _extended(values: NDArray[Any], capacity: int) -> NDArray[Any]:
-    out = np.zeros((capacity, *values.shape[1:]), dtype=values.dtype)
+def _extended(values: NDArray[Any], capacity: int, value: int = 0) -> NDArray[Any]:
+    out = np.full((capacity, *values.shape[1:]), value, dtype=values.dtype)
     out[: len(values)] = values
     return out
