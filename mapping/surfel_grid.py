@@ -194,10 +194,13 @@ class SurfelGrid:
 
     def _index(self) -> None:
         """Find cells, and their other sides, by their keys; another side without the first one becomes the first."""
-        first = self._keys & kernels.FIRST_SIDE
-        lone = (self._keys < 0) & ~np.isin(first, self._keys)
-        self._keys[lone] = first[lone]
         self._table.rebuild(self._keys)
+        others = np.flatnonzero(self._keys < 0)
+        first = self._keys[others] & kernels.FIRST_SIDE
+        is_lone = self._table.find(first) == ABSENT
+        if is_lone.any():
+            self._keys[others[is_lone]] = first[is_lone]
+            self._table.rebuild(self._keys)
         self._others = np.full(len(self._keys), ABSENT, dtype=np.int32)
         rows = np.arange(len(self._keys), dtype=np.int32)
         kernels.link_sides(self._keys, rows, *self._table.slots, self._others)
@@ -210,7 +213,9 @@ class SurfelGrid:
             return
         capacity = max(4096, 2 * count)
         self._keys = _extended(self._keys, capacity)
-        self._others = _extended(self._others, capacity, ABSENT)
+        others = np.full(capacity, ABSENT, dtype=np.int32)
+        others[: len(self._others)] = self._others
+        self._others = others
         self._sums = _extended(self._sums, capacity)
         self._patches = _extended(self._patches, capacity)
         self._patch_counts = _extended(self._patch_counts, capacity)
@@ -222,7 +227,7 @@ def _spread(counts: FloatArray, moments: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(moments[:, 1] / counts - mean * mean, 0.0))
 
 
-def _extended(values: NDArray[Any], capacity: int, value: int = 0) -> NDArray[Any]:
-    out = np.full((capacity, *values.shape[1:]), value, dtype=values.dtype)
+def _extended(values: NDArray[Any], capacity: int) -> NDArray[Any]:
+    out = np.zeros((capacity, *values.shape[1:]), dtype=values.dtype)
     out[: len(values)] = values
     return out
