@@ -44,7 +44,8 @@ def belong_to_others(
         u, v, w = float(cells.sums[row, 12]), float(cells.sums[row, 13]), float(cells.sums[row, 14])
         along, squared = x * u + y * v + z * w, x * x + y * y + z * z
         if along < 0.0 or along * along < _SAME_VIEW * squared * (u * u + v * v + w * w):
-            if outdated(row, cells.sums, counts):
+            # A plane that has grown since is still the same plane; what was none may have become one.
+            if not patches[row, 14] > 0.0 and outdated(row, cells.sums, counts):
                 refresh_one(row, cells, patches, counts, room)
             p = patches[row]
             chosen[n] = p[14] > 0.0 and x * p[3] + y * p[4] + z * p[5] < -_LEAST_SINE * math.sqrt(squared)
