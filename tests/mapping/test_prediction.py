@@ -81,7 +81,7 @@ def test_an_odometry_that_does_not_say_is_believed_as_configured() -> None:
 
 
 @pytest.mark.parametrize(("sigma", "followed"), [(1e-6, 1.0), (1e4, 0.0)])
-def test_velocities_are_believed_as_far_as_motions(sigma: float, followed: float) -> None:
+def test_velocities_are_believed_as_far_as_their_covariance_says(sigma: float, followed: float) -> None:
     faster = VELOCITY + 1.0
     prediction = predicted(Prior(velocity=faster, covariance=isotropic(sigma)))
     np.testing.assert_allclose(prediction.velocity, VELOCITY + followed, atol=1e-3)
