@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy
+from lidarslam.core.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray
 
 # Share of all pulls that must be felt along a direction. A corridor's noisy walls are felt along it as well: what the
@@ -28,7 +28,7 @@ def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray,
     total = float(weights.sum())
     if total <= 0.0:
         return Degeneracy(np.eye(6), lever_m)
-    scaled = jacobian / np.array([lever_m] * 3 + [1.0] * 3)
+    scaled = jacobian / lever_scale(lever_m)
     shares, axes = np.linalg.eigh((scaled * weights[:, None]).T @ scaled / total)
     noise = float(weights @ tilt**2) / total
     return Degeneracy(axes[:, shares < max(_LEAST_SHARE, _NOISE_FACTOR * noise)].T, lever_m)

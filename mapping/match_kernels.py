@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
+from mapping.patch_kernels import is_steep
 
 Rows = NDArray[np.int32]
 
 # A single ring bent around a corner spans a plane too, the one of its own rays. A plane that holds the rays it was seen
-# by, being seen at a flatter angle than asin of the first, counts only when the rays differ in height by the second.
-_LEAST_SINE = 0.17
+# by, being seen at a flat angle, counts only when the rays differ so much in height.
 _LEAST_HEIGHT_M = 0.05
 _FEWEST_POINTS = 6
 _MOST_ACROSS = 0.5
@@ -69,8 +69,7 @@ def pull_to_planes(
             distance = math.sqrt(x * x + y * y + z * z)
             several_rings = p[12] * distance > _LEAST_HEIGHT_M
             along = x * p[3] + y * p[4] + z * p[5]
-            faced = abs(along) > _LEAST_SINE * distance
-            behind = along > _LEAST_SINE * distance
+            faced, behind = is_steep(-along, distance), is_steep(along, distance)
             if p[14] > 0.0 and not behind and (several_rings or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
                 _write(pulls, count, n, p[0:3], p[3], p[4], p[5], p[9], tilt)

@@ -19,6 +19,8 @@ _GROWTH = np.float32(1.3)
 _NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
 # Fewer points show nothing.
 _FEWEST_POINTS = 6
+# A surface is seen from one side at no flatter an angle than asin of this; between, from neither.
+_LEAST_SINE = 0.17
 # Spreads are standard deviations along the principal axes. A plane is thin beside its width, and no line; a line is
 # long beside its width: LOAM asks for a largest eigenvalue of three times the next.
 _MOST_THICKNESS = 0.4
@@ -41,6 +43,12 @@ def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: 
         row = rows[n]
         if row >= 0 and outdated(row, cells.sums, counts):
             refresh_one(row, cells, patches, counts, room)
+
+
+@compiled
+def is_steep(along: float, distance: float) -> bool:
+    """Whether a ray of this length goes along a plane's normal, so far along it, at no flat angle to the plane."""
+    return along > _LEAST_SINE * distance
 
 
 @compiled

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 from mapping.cell_kernels import Cells
-from mapping.patch_kernels import outdated, refresh_one
+from mapping.patch_kernels import is_steep, outdated, refresh_one
 
-# A plane is seen from behind from this far beyond it, as a sine: whence it pulls nobody, in `mapping.match_kernels`.
-_LEAST_SINE = 0.17
-# So it is not, when it is seen from much the same direction as the cell was: the least squared cosine between them.
+# A plane is not seen from behind when it is seen from much the same direction as the cell was: the least squared cosine
+# between them.
 _SAME_VIEW = 0.5
 
 
@@ -48,7 +47,7 @@ def belong_to_others(
             if not patches[row, 14] > 0.0 and outdated(row, cells.sums, counts):
                 refresh_one(row, cells, patches, counts, room)
             p = patches[row]
-            chosen[n] = p[14] > 0.0 and x * p[3] + y * p[4] + z * p[5] < -_LEAST_SINE * math.sqrt(squared)
+            chosen[n] = p[14] > 0.0 and is_steep(-(x * p[3] + y * p[4] + z * p[5]), math.sqrt(squared))
 
 
 @compiled

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy
+from lidarslam.core.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from odometry.sweeps import SweepImages
 
@@ -42,7 +42,7 @@ def find_degeneracy(information: FloatArray, count: int, lever_m: float) -> Dege
         count: of the pairs.
         lever_m: typical distance of the points.
     """
-    scale = np.array([lever_m] * 3 + [1.0] * 3)
+    scale = lever_scale(lever_m)
     shares, axes = np.linalg.eigh(information / np.outer(scale, scale) / max(count, 1))
     return Degeneracy(np.ascontiguousarray(axes[:, shares < _LEAST_SHARE].T), lever_m)
 
@@ -56,10 +56,9 @@ def left_open(information: FloatArray, count: int, images: SweepImages) -> Degen
         information, count: as in `find_degeneracy`.
         images: of the one sweep (B = 1).
     """
-    lever_m = images.median_range_m()
     if images.share_with_normal() < _MOST:
-        return Degeneracy(np.empty((0, 6)), lever_m)
-    return find_degeneracy(information, count, lever_m)
+        return Degeneracy(np.empty((0, 6)), 1.0)
+    return find_degeneracy(information, count, images.median_range_m())
 
 
 def gone_on(T_prev_curr: FloatArray, expected: FloatArray, degeneracy: Degeneracy) -> FloatArray:
@@ -75,7 +74,6 @@ def holding(degeneracy: Degeneracy) -> FloatArray:
 
 def joined_information(seen: FloatArray, expected: FloatArray, degeneracy: Degeneracy) -> FloatArray:
     """Information (6, 6): along the open directions that of an expectation with this covariance, else what is seen."""
-    scale = np.array([degeneracy.lever_m] * 3 + [1.0] * 3)
-    D = degeneracy.directions * scale
+    D = degeneracy.rows
     across = np.eye(6) - degeneracy.part_along()
     return np.asarray(across.T @ seen @ across + D.T @ np.linalg.solve(D @ expected @ D.T, D), dtype=np.float64)

@@ -1,17 +1,11 @@
 """`lidarslam info`: what a recording holds."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from lidarslam.commands.options import (
-    SOURCE,
-    CommandWithExample,
-    config_options,
-    reader_options,
-    resolve,
-    warn_of_ignored,
-)
+from lidarslam.commands.options import SOURCE, CommandWithExample, config_options, reader_options, take_config
 from lidarslam.commands.terminal import say
 
 
@@ -19,17 +13,9 @@ from lidarslam.commands.terminal import say
 @SOURCE
 @reader_options
 @config_options
-def info(
-    source: Path,
-    reader: str | None,
-    topic: str | None,
-    sequence: str | None,
-    config_file: Path | None,
-    settings: tuple[str, ...],
-) -> None:
+def info(source: Path, **options: Any) -> None:
     """Say what a recording holds, and what was inferred about it."""
     from lidarslam.info import describe_source
 
-    config = resolve(config_file, settings, name=reader, topic=topic, sequence=sequence)
-    warn_of_ignored(source, config.reader.name, topic, sequence)
+    config = take_config(options, options.pop("settings"), source)
     say(describe_source(source, config.reader))

@@ -12,8 +12,7 @@ from lidarslam.commands.options import (
     method_settings,
     odometry_options,
     reader_options,
-    resolve,
-    warn_of_ignored,
+    take_config,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 
@@ -42,10 +41,7 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
     settings = method_settings(
         options.pop("odometry"), options.pop("weights"), None, None, None, options.pop("settings")
     )
-    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
-    config = resolve(options.pop("config_file"), settings, **reader)
-    for source in sources:
-        warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    config = take_config(options, settings, *sources)
     outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:

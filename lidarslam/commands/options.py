@@ -115,7 +115,20 @@ def resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str |
     return load_config(config_file, [*settings, *reader_settings(**reader)])
 
 
-def warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
+def take_config(options: dict[str, Any], settings: tuple[str, ...], *sources: Path) -> Any:
+    """The configuration for these sources, its options taken out of a command's; what they have no use for is told.
+
+    Raises:
+        ConfigError, InputError: a file or a setting is not what it should be, or nothing reads a source.
+    """
+    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
+    config = resolve(options.pop("config_file"), settings, **reader)
+    for source in sources:
+        _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    return config
+
+
+def _warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
     """Say which of the reader's options the source has no use for.
 
     Raises:

@@ -14,9 +14,8 @@ from lidarslam.commands.options import (
     method_settings,
     odometry_options,
     reader_options,
-    resolve,
     scan_options,
-    warn_of_ignored,
+    take_config,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 
@@ -74,9 +73,7 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
         options.pop("pose_graph"),
         options.pop("settings"),
     )
-    reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
-    config = resolve(options.pop("config_file"), settings, **reader)
-    warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+    config = take_config(options, settings, source)
     request = RunRequest(source, out, config, **options)
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished, nothing is left to do")

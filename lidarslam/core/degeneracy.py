@@ -9,6 +9,11 @@ from lidarslam.core.geometry import FloatArray
 _NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
+def lever_scale(lever_m: float) -> FloatArray:
+    """(6,) metres that each part of a motion counts for, rotation first, with rotations acting at a distance."""
+    return np.array([lever_m] * 3 + [1.0] * 3)
+
+
 @dataclass(frozen=True, eq=False)
 class Degeneracy:
     """Directions of motion that a scan says too little about.
@@ -35,13 +40,15 @@ class Degeneracy:
             axes.append(axis)
         return tuple(_NAMES[axis] for axis in sorted(axes))
 
+    @property
+    def rows(self) -> FloatArray:
+        """(D, 6): takes from a motion (rotation first, radians and metres) how far it goes along each, metres."""
+        return np.asarray(self.directions * lever_scale(self.lever_m), dtype=np.float64)
+
     def projector(self) -> FloatArray:
         """(6, 6): the part of a motion (rotation first, radians and metres), in metres, along the directions."""
-        D = self.directions.copy()
-        D[:, :3] *= self.lever_m
-        return np.asarray(D.T @ D, dtype=np.float64)
+        return np.asarray(self.rows.T @ self.rows, dtype=np.float64)
 
     def part_along(self) -> FloatArray:
         """(6, 6): takes from a motion (rotation first, radians and metres) its part along the directions."""
-        scale = np.array([self.lever_m] * 3 + [1.0] * 3)
-        return np.asarray(self.directions.T @ self.directions * (scale / scale[:, None]), dtype=np.float64)
+        return np.asarray(self.directions.T @ self.rows / lever_scale(self.lever_m)[:, None], dtype=np.float64)
