@@ -116,7 +116,7 @@ class Mapper:
         """Lay the next scan on the map, and add it."""
         sampled = self._sampler.sample(scan)
         last = self._state or State.first(scan.stamp, prior.velocity)
-        prediction = predict(last, scan.stamp, prior, self._carrier, self._config)
+        prediction = predict(last, scan.stamp, prior, self._carrier, self._config, sampled.seen_from_s)
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
             made_up = prior.velocity is None and sampled.times is not None and self._config.continuous_time
@@ -159,7 +159,7 @@ class Mapper:
                 break
             last = self._begin_again(first, last, mapped.state)
             self._carrier, self._has_velocity = carrier, False
-            prediction = predict(last, sampled.stamp, prior, carrier, self._config)
+            prediction = predict(last, sampled.stamp, prior, carrier, self._config, sampled.seen_from_s)
             assert self._map is not None
             mapped = self._lay(sampled, prior, prediction, last, self._map)
         return mapped
@@ -212,7 +212,7 @@ class Mapper:
             return near
         if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
             return near
-        anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config)
+        anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s)
         again = place_surprised(sampled, anyhow, last, local_map, self._config)
         return again if again.is_beyond_doubt and again.quality > near.quality else near
 

@@ -167,9 +167,15 @@ def _from_starts(
     """What a scan comes to from each of the poses (K, 4, 4), where it comes to something that is ok."""
     tried = []
     for start in starts:
-        free = replace(prediction, T_world_lidar=start, pose_covariance=_ANYWHERE)
+        free = replace(prediction, T_world_lidar=start, covariance=_anywhere(prediction))
         tried.append(_place_patiently(sampled, free, last, local_map, config))
     return [placed for placed in tried if placed.status is Status.OK]
+
+
+def _anywhere(prediction: Prediction) -> FloatArray:
+    covariance = np.zeros((12, 12))
+    covariance[:6, :6], covariance[6:, 6:] = _ANYWHERE, prediction.covariance[6:, 6:]
+    return covariance
 
 
 def _apart_m(one: Placed, other: Placed) -> float:

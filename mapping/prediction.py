@@ -22,6 +22,8 @@ _ASTRAY = np.array([np.deg2rad(20.0)] * 3 + [1.0] * 3)
 # An odometry's velocity is less certain than its motion over the time by this factor: of a carrier that shakes faster
 # than sweeps follow one another it tells a part only, again and again.
 _SHAKING = 2.0
+# Displacement within a sweep by which a constant velocity misses a changing one, per acceleration and square of time.
+_UNEVEN = 1.0 / 8.0
 # No pose is better than this, whatever its residuals say.
 _LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 
@@ -127,62 +129,119 @@ class Carrier:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where a scan is expected before it is held against the map.
+    """The state expected of a scan before it is registered.
 
     Attributes:
         T_world_lidar: (4, 4) at the stamp.
         velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        pose_covariance: (6, 6) rotation first, in the LiDAR frame.
-        velocity_covariance: (6, 6).
+        covariance: (12, 12) joint covariance of the errors of pose and velocity, as in `State`.
     """
 
     T_world_lidar: FloatArray
     velocity: FloatArray
-    pose_covariance: FloatArray
-    velocity_covariance: FloatArray
+    covariance: FloatArray
 
 
-def predict(state: State, stamp: float, prior: Prior, carrier: Carrier, config: MappingConfig) -> Prediction:
-    """Go on from the last scan's state with its velocity, and correct that by what the odometry says.
+def predict(
+    state: State, stamp: float, prior: Prior, carrier: Carrier, config: MappingConfig, seen_from_s: float = 0.0
+) -> Prediction:
+    """Propagate the last state to a stamp, and update it with the odometry's measurements.
 
-    A sweep's velocity was seen from its first point to its last. Where stamps stand at the start of sweeps, the next
-    pose lies at the end of what was seen, and needs no extrapolation: turns on the spot are no surprise.
+    The velocity is constant during a sweep and changes between two of them by white noise of the carrier's
+    acceleration. Sweeps follow one another without a gap, so pose and velocity are correlated: a velocity that
+    disagrees with the way between the poses is improbable, however well the sweep fits when bent by it.
+
+    Args:
+        state: of the last scan.
+        stamp: of the next one.
+        prior: the odometry's measurements.
+        carrier: accelerations to expect.
+        config: of an odometry without a covariance.
+        seen_from_s: from the first point of the next sweep to its stamp.
     """
     interval_s = stamp - state.stamp
-    T_moved = exp(state.velocity * interval_s)
-    F = np.eye(12)
-    F[:6, :6] = adjoint(inverse(T_moved))
-    F[:6, 6:] = interval_s * np.eye(6)
-    covariance = F @ state.covariance @ F.T
-    unseen_s = max(0.0, interval_s - state.seen_until_s)
-    drift = carrier.acceleration * (interval_s**2 / 8.0 + unseen_s * interval_s)
-    pose_covariance = covariance[:6, :6] + np.diag(drift**2 + _LEAST_SIGMA**2)
-    velocity_covariance = covariance[6:, 6:] + np.diag((carrier.acceleration * interval_s) ** 2)
-    T_world_lidar, velocity = state.T_world_lidar @ T_moved, state.velocity
+    joint = _Joint.of(state, interval_s, seen_from_s, carrier)
     uncertainty = _uncertainty(prior, config)
     if prior.T_prev_curr is not None:
-        error = log(inverse(T_world_lidar) @ state.T_world_lidar @ prior.T_prev_curr)
-        step, pose_covariance = _fuse(pose_covariance, error, uncertainty)
-        T_world_lidar = T_world_lidar @ exp(step)
+        joint = joint.measured_motion(prior.T_prev_curr, uncertainty)
     if prior.velocity is not None and interval_s > 0.0:
-        difference = prior.velocity - velocity
-        step, velocity_covariance = _fuse(velocity_covariance, difference, uncertainty * (_SHAKING / interval_s) ** 2)
-        velocity = velocity + step
-    return Prediction(T_world_lidar, velocity, pose_covariance, velocity_covariance)
+        joint = joint.measured_velocity(prior.velocity, uncertainty * (_SHAKING / interval_s) ** 2)
+    covariance = joint.covariance[12:, 12:]
+    covariance[:6, :6] += np.diag(_LEAST_SIGMA**2)
+    return Prediction(joint.T_world_curr, joint.curr_velocity, covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """The last state and the next, with their joint covariance (24, 24): last pose, velocity, next pose, velocity."""
+
+    T_world_last: FloatArray
+    T_world_curr: FloatArray
+    last_velocity: FloatArray
+    curr_velocity: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, state: State, interval_s: float, seen_from_s: float, carrier: Carrier) -> "_Joint":
+        T_moved = exp(state.velocity * interval_s)
+        F = np.eye(12)
+        F[:6, :6] = adjoint(inverse(T_moved))
+        F[:6, 6:] = interval_s * np.eye(6)
+        joint = np.zeros((24, 24))
+        joint[:12, :12] = state.covariance
+        joint[12:, :12] = F @ state.covariance
+        joint[:12, 12:] = joint[12:, :12].T
+        joint[12:, 12:] = F @ state.covariance @ F.T + _process_noise(state, interval_s, seen_from_s, carrier)
+        return cls(state.T_world_lidar, state.T_world_lidar @ T_moved, state.velocity, state.velocity, joint)
+
+    def measured_motion(self, T_last_curr: FloatArray, covariance: FloatArray) -> "_Joint":
+        T_expected = inverse(self.T_world_last) @ self.T_world_curr
+        H = np.zeros((6, 24))
+        H[:, :6], H[:, 12:18] = -adjoint(inverse(T_expected)), np.eye(6)
+        return self._updated(H, log(inverse(T_expected) @ T_last_curr), covariance)
+
+    def measured_velocity(self, velocity: FloatArray, covariance: FloatArray) -> "_Joint":
+        H = np.zeros((6, 24))
+        H[:, 18:] = np.eye(6)
+        return self._updated(H, velocity - self.curr_velocity, covariance)
+
+    def _updated(self, H: FloatArray, innovation: FloatArray, noise: FloatArray) -> "_Joint":
+        """Kalman update by a measurement with Jacobian H (6, 24)."""
+        PH = self.covariance @ H.T
+        gain = np.linalg.solve(H @ PH + noise, PH.T).T
+        step = gain @ innovation
+        covariance = self.covariance - gain @ PH.T
+        return _Joint(
+            self.T_world_last @ exp(step[:6]),
+            self.T_world_curr @ exp(step[12:18]),
+            self.last_velocity + step[6:12],
+            self.curr_velocity + step[18:],
+            0.5 * (covariance + covariance.T),
+        )
+
+
+def _process_noise(state: State, interval_s: float, seen_from_s: float, carrier: Carrier) -> FloatArray:
+    """(12, 12) what the velocity may change by, and the way with it.
+
+    Up to the end of the last sweep the way is gone with its velocity, from the beginning of the next one with the new
+    velocity, and in a gap between the two with one in between.
+    """
+    gap_s = min(max(0.0, interval_s - state.seen_until_s - seen_from_s), interval_s)
+    ahead_s = min(seen_from_s, interval_s) + 0.5 * gap_s
+    change = (carrier.acceleration * interval_s) ** 2
+    swept_s = interval_s - gap_s
+    uneven = (carrier.acceleration * swept_s**2 * _UNEVEN) ** 2 + carrier.acceleration**2 * interval_s * gap_s**3 / 12.0
+    Q = np.zeros((12, 12))
+    Q[:6, :6] = np.diag(change * ahead_s**2 + uneven)
+    Q[:6, 6:] = Q[6:, :6] = np.diag(change * ahead_s)
+    Q[6:, 6:] = np.diag(change)
+    return Q
 
 
 def _uncertainty(prior: Prior, config: MappingConfig) -> FloatArray:
-    """(6, 6) covariance of the odometry's motion: its own word, else the configuration's.
-
-    Its errors go together from scan to scan, while the state that it is fused with takes each for a new one.
-    """
+    """(6, 6) covariance of the odometry's motion: its own, inflated because its errors are correlated over time, else
+    the configuration's."""
     if prior.covariance is not None:
         return np.asarray(config.prior_caution**2 * prior.covariance, dtype=np.float64)
     sigmas = np.array([np.deg2rad(config.prior_rotation_deg)] * 3 + [config.prior_translation_m] * 3)
     return np.asarray(np.diag(sigmas**2), dtype=np.float64)
-
-
-def _fuse(covariance: FloatArray, difference: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What to add to an estimate for a second one that differs, and the covariance of both together."""
-    gain = covariance @ np.linalg.inv(covariance + other)
-    return gain @ difference, covariance - gain @ covariance

@@ -234,14 +234,12 @@ def _solve(
     J, r = system.jacobian, system.residuals
     degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
     held = _HELD * degeneracy.projector()
-    pose_information = np.linalg.inv(prediction.pose_covariance)
-    velocity_information = np.linalg.inv(prediction.velocity_covariance)
+    prior = np.linalg.inv(prediction.covariance)
+    away = np.concatenate([log(inverse(prediction.T_world_lidar) @ T_world_lidar), velocity - prediction.velocity])
     JW = J * (system.weights / _CORRELATION)[:, None]
-    matched, prior, b = np.zeros((12, 12)), np.zeros((12, 12)), np.zeros(12)
+    matched, b = np.zeros((12, 12)), -prior @ away
     matched[:6, :6] = JW.T @ J
-    prior[:6, :6], prior[6:, 6:] = pose_information, velocity_information
-    b[:6] = -(JW.T @ r) - (pose_information + held) @ log(inverse(prediction.T_world_lidar) @ T_world_lidar)
-    b[6:] = -velocity_information @ (velocity - prediction.velocity)
+    b[:6] -= JW.T @ r + held @ away[:6]
     holding = np.zeros((12, 12))
     holding[:6, :6] = held
     if times is not None:
@@ -251,7 +249,7 @@ def _solve(
         matched[6:, :6] = matched[:6, 6:].T
         matched[6:, 6:] = JWt.T @ Jt
         holding[6:, 6:] = held * float(np.mean(times**2))
-        b[6:] -= JWt.T @ r + holding[6:, 6:] @ (velocity - prediction.velocity)
+        b[6:] -= JWt.T @ r + holding[6:, 6:] @ away[6:]
     step: FloatArray = np.asarray(np.linalg.solve(matched + prior + holding, b), dtype=np.float64)
     return _Solution(step[:6], step[6:], _covariance(matched, prior, degeneracy), degeneracy)
 

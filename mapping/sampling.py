@@ -81,6 +81,11 @@ class SampledScan:
         """From the stamp to the last point; 0 when the scan is compensated already."""
         return 0.0 if self.times is None or not len(self) else max(0.0, float(self.times.max()))
 
+    @property
+    def seen_from_s(self) -> float:
+        """From the first point to the stamp; 0 when the scan is compensated already."""
+        return 0.0 if self.times is None or not len(self) else max(0.0, -float(self.times.min()))
+
     @cached_property
     def sweep(self) -> Sweep:
         """What is registered."""

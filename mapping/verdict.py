@@ -33,7 +33,7 @@ class Circumstances:
 
 def has_jumped(correction: FloatArray, prediction: Prediction) -> bool:
     """Whether a pose lies farther (6,) from where it was expected than any carrier explains."""
-    usual = np.maximum(_MOST_SIGMAS * np.sqrt(np.diag(prediction.pose_covariance)), _LEAST_JUMP)
+    usual = np.maximum(_MOST_SIGMAS * np.sqrt(np.diag(prediction.covariance)[:6]), _LEAST_JUMP)
     return bool((np.abs(correction) > usual).any())
 
 
