@@ -53,6 +53,10 @@ class TrackingConfig(BaseModel):
     gate_min_m: float = Field(0.05, gt=0.0, description="likewise, the least it can be")
     degraded_below: float = Field(0.6, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
     lost_below: float = Field(0.45, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
+    degraded_below_support: float = Field(
+        0.5, ge=0.0, le=1.0, description="inlier ratio of what constrains the least supported direction, likewise"
+    )
+    lost_below_support: float = Field(0.35, ge=0.0, le=1.0, description="likewise, under which a scan is lost")
     search_yaw_step_deg: float = Field(15.0, ge=1.0, le=360.0, description="start rotations around gravity when lost")
     give_up_after: int = Field(20, ge=1, description="lost scans in a row after which a new map is begun")
 

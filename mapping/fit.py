@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.tracking import Status
@@ -13,6 +14,10 @@ from mapping.local_map import LocalMap
 _FEWEST_FACING = 30
 # A scan that meets the map with less of its points has come to a new place, or is lost.
 _LEAST_OVERLAP = 0.1
+# A point so far from its surface counts half in the support, in cells; and what every direction is felt by at least, as
+# a part of the best held one, so that one which next to nothing is felt along is not judged by noise.
+_HALF_CELLS = 0.5
+_LEAST_FELT = 0.005
 
 
 @dataclass(frozen=True)
@@ -25,12 +30,16 @@ class Fit:
         residual_m: median distance of the matched points from their surfaces; None when there are none.
         inlier_ratio: share of the matched points that lie on their surface, the worst of those facing each axis of the
             world: nearly everything fits the ground. None when there are none.
+        support: the inlier ratio of the points that constrain the least supported direction of translation; most
+            points fit wherever a scan is slid along a street, and those that constrain it along the street do not.
+            None when there are none.
     """
 
     matched: int
     overlap: float
     residual_m: float | None
     inlier_ratio: float | None
+    support: float | None = None
 
     @property
     def inlier_share(self) -> float:
@@ -41,7 +50,11 @@ class Fit:
         """What that means."""
         if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP or self.inlier_ratio < config.lost_below:
             return Status.LOST
-        return Status.DEGRADED if self.inlier_ratio < config.degraded_below else Status.OK
+        support = 1.0 if self.support is None else self.support
+        if support < config.lost_below_support:
+            return Status.LOST
+        slides = support < config.degraded_below_support
+        return Status.DEGRADED if slides or self.inlier_ratio < config.degraded_below else Status.OK
 
     def explain(self, config: TrackingConfig) -> str:
         """Why the status is not ok; empty when it is."""
@@ -49,7 +62,9 @@ class Fit:
             return ""
         if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP:
             return f"only {100.0 * self.overlap:.0f} % of the scan meets the map"
-        return f"only {100.0 * self.inlier_ratio:.0f} % of the scan lies on the map"
+        if self.inlier_ratio < config.degraded_below:
+            return f"only {100.0 * self.inlier_ratio:.0f} % of the scan lies on the map"
+        return f"only {100.0 * (self.support or 0.0):.0f} % of what constrains one direction lies on the map: it may slide"
 
 
 def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, config: TrackingConfig) -> Fit:
@@ -69,4 +84,22 @@ def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalM
         overlap=len(matches) / len(points),
         residual_m=float(np.median(distances)),
         inlier_ratio=min(shares, default=float(inlier.mean())),
+        support=directional_support(matches.normals, distances / (_HALF_CELLS * local_map.cell_m)),
     )
+
+
+def directional_support(normals: FloatArray, distances: FloatArray) -> float:
+    """The least inlier ratio over all directions of translation, each point weighted by how much it constrains it.
+
+    The smallest generalised eigenvalue of the sums of `n n^T` over the points, with and without inlier weights.
+
+    Args:
+        normals: (N, 3) unit, of the surfaces.
+        distances: (N,) of the points from them, in units at which a point counts half.
+    """
+    weights = 1.0 / (1.0 + distances**2)
+    everything = normals.T @ normals
+    held = (normals * weights[:, None]).T @ normals
+    ridge = _LEAST_FELT * float(np.trace(everything)) * np.eye(3)
+    # What the ridge adds to both is supported as well as the whole.
+    return float(eigh(held + float(weights.mean()) * ridge, everything + ridge, eigvals_only=True)[0])

@@ -18,7 +18,7 @@ from mapping.doubt import Doubt
 from mapping.earlier_maps import EarlierMaps
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
-from mapping.placement import Placed, place, place_surprised, search, search_everywhere
+from mapping.placement import Placed, place, place_displaced, place_surprised, search, search_everywhere
 from mapping.prediction import Carrier, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
@@ -31,6 +31,8 @@ _CAUTION = 0.8
 _UNKNOWN_M = 10.0
 # Nothing goes on as it did for ever: while lost, the velocity fades by this from scan to scan.
 _FADING = 0.7
+# A displacement that was searched for must fit so much better than the expected one.
+_CLEARLY_BETTER = 1.1
 # How often the first sweep is drawn anew when the second has shown how it moved.
 _BEGINNINGS = 2
 
@@ -208,9 +210,14 @@ class Mapper:
         """
         coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
         near = place(sampled, prediction, last, local_map, self._config, coarse_first)
-        if not self._doubt.lies_badly(near.status, near.quality):
-            return near
         if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
+            return near
+        if not self._has_velocity or near.status is not Status.OK:
+            poses = (prediction.T_world_lidar, last.T_world_lidar)
+            displaced = place_displaced(sampled, poses, last, local_map, self._config)
+            if displaced is not None and displaced.quality > _CLEARLY_BETTER * near.quality:
+                return displaced
+        if not self._doubt.lies_badly(near.status, near.quality):
             return near
         anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s)
         again = place_surprised(sampled, anyhow, last, local_map, self._config)

@@ -1,5 +1,6 @@
 """Laying one scan on the map: from its prediction, again and patiently, and at last from anywhere."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +12,8 @@ from mapping.deskew import body_velocity
 from mapping.fit import Fit, measure_fit
 from mapping.floorplan import Floorplan
 from mapping.local_map import LocalMap
-from mapping.prediction import Prediction, State
-from mapping.recovery import best_starts, best_velocity, start_poses
+from mapping.prediction import Carrier, Prediction, Prior, State, predict
+from mapping.recovery import best_starts, best_supported, best_velocity, positions_around, start_poses
 from mapping.refinement import Refined, Sweep, compensated, refine
 from mapping.sampling import SampledScan
 
@@ -37,6 +38,10 @@ _PLACES = 24
 # Changes of the rate of turning that are tried on a scan that lies badly, rad/s: from full speed one way round to full
 # speed the other way between two sweeps.
 _TURNS = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
+# Displacements since the last scan that are tried where the velocity is not known: as far as a car goes, no farther than
+# the median range, so many cells apart, which is in reach of the coarse cells.
+_FASTEST_M_S = 50.0
+_DISPLACED_CELLS = 3.0
 _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
 
@@ -61,8 +66,8 @@ class Placed:
 
     @property
     def quality(self) -> float:
-        """To choose by among places: how much lies on the map, and how much more that is than what does not."""
-        return self.fit.inlier_share * (self.fit.inlier_ratio or 0.0)
+        """To choose by among places: the share of the scan that lies on the map, and how well that holds it."""
+        return self.fit.inlier_share * (self.fit.support or 0.0)
 
 
 def place(
@@ -110,6 +115,41 @@ def place_surprised(
         for velocity in starts
     ]
     return max(tried, key=lambda placed: placed.quality)
+
+
+def place_displaced(
+    sampled: SampledScan, rotations: Sequence[FloatArray], last: State, local_map: LocalMap, config: MappingConfig
+) -> Placed | None:
+    """Register a scan from displacements since the last one in every horizontal direction; the best, if any is ok.
+
+    A sensor that was at speed when the recording began, or whose odometry is wrong, is out of reach of the expected
+    pose, and most of a street fits there too.
+
+    Args:
+        sampled: the points.
+        rotations: poses (4, 4) whose rotations are tried.
+        last: the scan before.
+        local_map: what is registered to.
+        config: how.
+    """
+    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
+    points = compensated(sweep.planes, sweep.plane_times, last.velocity)
+    if not len(points) or interval_s <= 0.0:
+        return None
+    radius_m, up = min(_FASTEST_M_S * interval_s, sampled.range_m), local_map.vertical()
+    step_m = _DISPLACED_CELLS * local_map.cell_m
+    starts = []
+    for rotation in rotations:
+        T = last.T_world_lidar.copy()
+        T[:3, :3] = rotation[:3, :3]
+        starts.append(positions_around(T, up, radius_m, step_m))
+    tried = []
+    for start in best_supported(points, np.concatenate(starts), local_map):
+        velocity = body_velocity(inverse(last.T_world_lidar) @ start, interval_s)
+        moving = State.moving(last, velocity)
+        prediction = predict(moving, sampled.stamp, Prior(), Carrier(), config, sampled.seen_from_s)
+        tried.append(_place_patiently(sampled, prediction, last, local_map, config))
+    return max((placed for placed in tried if placed.status is Status.OK), key=lambda placed: placed.quality, default=None)
 
 
 def _place_patiently(

@@ -81,6 +81,12 @@ class State:
         )
 
     @classmethod
+    def moving(cls, state: "State", velocity: FloatArray) -> "State":
+        """At the pose of a state, with another velocity (6,) that is hardly known."""
+        sigmas = np.concatenate([_LEAST_SIGMA, _ANY_VELOCITY])
+        return cls(state.stamp, state.T_world_lidar, velocity, np.diag(sigmas**2), state.seen_until_s)
+
+    @classmethod
     def astray(cls, stamp: float, T_world_lidar: FloatArray, velocity: FloatArray) -> "State":
         """Somewhere near here, moving anyhow."""
         sigmas = np.concatenate([_ASTRAY, _ANY_VELOCITY])
