@@ -19,7 +19,7 @@ from mapping.earlier_maps import EarlierMaps
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
 from mapping.placement import Placed, place, place_displaced, place_surprised, search, search_everywhere
-from mapping.prediction import Carrier, Prediction, Prior, State, predict
+from mapping.prediction import Carrier, OdometryNoise, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
 from mapping.verdict import Circumstances, has_jumped, judge
@@ -74,6 +74,7 @@ class Mapper:
         self._map: LocalMap | None = None
         self._state: State | None = None
         self._carrier = Carrier()
+        self._noise = OdometryNoise()
         self._expected_error_m = _UNKNOWN_M
         self._doubt = Doubt()
         self._earlier = EarlierMaps()
@@ -93,6 +94,7 @@ class Mapper:
             "map": None if self._map is None else self._map.state(),
             "last": None if self._state is None else dict(vars(self._state)),
             "carrier": dict(vars(self._carrier)),
+            "noise": dict(vars(self._noise)),
             "expected_error_m": self._expected_error_m,
             "doubt": self._doubt.state(),
             "earlier": self._earlier.state(),
@@ -107,6 +109,7 @@ class Mapper:
         self._map = saved.optional("map", LocalMap.restored)
         self._state = saved.optional("last", State.restored)
         self._carrier = Carrier.restored(saved.part("carrier"))
+        self._noise = OdometryNoise.restored(saved.part("noise"))
         self._expected_error_m = saved.number("expected_error_m")
         self._doubt.restore(saved.part("doubt"))
         self._earlier.restore(saved.part("earlier"))
@@ -118,11 +121,10 @@ class Mapper:
         """Lay the next scan on the map, and add it."""
         sampled = self._sampler.sample(scan)
         last = self._state or State.first(scan.stamp, prior.velocity)
-        prediction = predict(last, scan.stamp, prior, self._carrier, self._config, sampled.seen_from_s)
+        prediction = predict(last, scan.stamp, prior, self._carrier, self._config, sampled.seen_from_s, self._noise)
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
-            made_up = prior.velocity is None and sampled.times is not None and self._config.continuous_time
-            self._first = sampled if made_up else None
+            self._first = sampled if sampled.times is not None and self._config.continuous_time else None
         elif self._first is not None:
             mapped = self._lay_second(sampled, prior, prediction, last, self._first, self._map)
             self._first = None
@@ -161,7 +163,7 @@ class Mapper:
                 break
             last = self._begin_again(first, last, mapped.state)
             self._carrier, self._has_velocity = carrier, False
-            prediction = predict(last, sampled.stamp, prior, carrier, self._config, sampled.seen_from_s)
+            prediction = predict(last, sampled.stamp, prior, carrier, self._config, sampled.seen_from_s, self._noise)
             assert self._map is not None
             mapped = self._lay(sampled, prior, prediction, last, self._map)
         return mapped
@@ -188,7 +190,7 @@ class Mapper:
             local_map = self._map = local_map.resized(sampled.cell_m)
         if self._is_blind(sampled):
             return self._see_nothing(sampled, prediction)
-        near = self._place_near(sampled, prior, prediction, last, local_map)
+        near, prediction = self._place_expected(sampled, prior, prediction, last, local_map)
         placed = self._look(near, sampled, prediction, last, local_map)
         if placed is None:
             return self._miss(sampled, prediction, near.fit)
@@ -197,8 +199,22 @@ class Mapper:
         interval_s = sampled.stamp - last.stamp
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
+        if self._has_velocity:
+            way = inverse(last.T_world_lidar) @ placed.refined.T_world_lidar
+            self._noise = self._noise.seen(prior, way, self._config)
         self._has_velocity = True
         return self._accept(sampled, prediction, last, placed, placed.refined, found=placed is not near)
+
+    def _place_expected(
+        self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
+    ) -> tuple[Placed, Prediction]:
+        """A scan registered from where it is expected; from both expectations where odometry and motion disagree."""
+        near = self._place_near(sampled, prior, prediction, last, local_map)
+        if not (prediction.contradicted and self._has_velocity):
+            return near, prediction
+        alone = predict(last, sampled.stamp, Prior(), self._carrier, self._config, sampled.seen_from_s)
+        other = self._place_near(sampled, Prior(), alone, last, local_map)
+        return (other, alone) if other.quality > near.quality else (near, prediction)
 
     def _place_near(
         self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
@@ -219,7 +235,7 @@ class Mapper:
                 return displaced
         if not self._doubt.lies_badly(near.status, near.quality):
             return near
-        anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s)
+        anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s, self._noise)
         again = place_surprised(sampled, anyhow, last, local_map, self._config)
         return again if again.is_beyond_doubt and again.quality > near.quality else near
 

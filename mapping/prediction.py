@@ -24,6 +24,10 @@ _ASTRAY = np.array([np.deg2rad(20.0)] * 3 + [1.0] * 3)
 _SHAKING = 2.0
 # Displacement within a sweep by which a constant velocity misses a changing one, per acceleration and square of time.
 _UNEVEN = 1.0 / 8.0
+# How fast the odometry's noise follows its errors, and beyond what squared innovation its motion is improbable: that of
+# chi square with six degrees of freedom, one time in ten thousand.
+_NOISE_FOLLOWING = 0.2
+_GATE = 27.9
 # No pose is better than this, whatever its residuals say.
 _LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 
@@ -133,6 +137,30 @@ class Carrier:
         return Carrier(*followed)
 
 
+@dataclass(frozen=True)
+class OdometryNoise:
+    """How much larger an odometry's errors are than its covariance states.
+
+    Attributes:
+        variance: factor on the covariance; never less than one.
+    """
+
+    variance: float = 1.0
+
+    @classmethod
+    def restored(cls, saved: Saved) -> "OdometryNoise":
+        """What was saved, which is all of it."""
+        return cls(saved.number("variance"))
+
+    def seen(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> "OdometryNoise":
+        """The noise after a registered motion (4, 4), by the normalised squared error of the odometry's."""
+        if prior.T_prev_curr is None:
+            return self
+        error = log(inverse(prior.T_prev_curr) @ T_prev_curr)
+        squared = float(error @ np.linalg.solve(_uncertainty(prior, config), error)) / len(error)
+        return OdometryNoise(max(1.0, self.variance + _NOISE_FOLLOWING * (squared - self.variance)))
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """The state expected of a scan before it is registered.
@@ -141,16 +169,19 @@ class Prediction:
         T_world_lidar: (4, 4) at the stamp.
         velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
         covariance: (12, 12) joint covariance of the errors of pose and velocity, as in `State`.
+        contradicted: whether the odometry's motion is improbable, given the motion before.
     """
 
     T_world_lidar: FloatArray
     velocity: FloatArray
     covariance: FloatArray
+    contradicted: bool = False
 
 
 def predict(
-    state: State, stamp: float, prior: Prior, carrier: Carrier, config: MappingConfig, seen_from_s: float = 0.0
-) -> Prediction:
+    state: State, stamp: float, prior: Prior, carrier: Carrier, config: MappingConfig, seen_from_s: float = 0.0,
+    noise: OdometryNoise = OdometryNoise(),
+) -> Prediction:  # fmt: skip
     """Propagate the last state to a stamp, and update it with the odometry's measurements.
 
     The velocity is constant during a sweep and changes between two of them by white noise of the carrier's
@@ -164,17 +195,19 @@ def predict(
         carrier: accelerations to expect.
         config: of an odometry without a covariance.
         seen_from_s: from the first point of the next sweep to its stamp.
+        noise: of the odometry.
     """
     interval_s = stamp - state.stamp
     joint = _Joint.of(state, interval_s, seen_from_s, carrier)
-    uncertainty = _uncertainty(prior, config)
+    uncertainty, contradicted = noise.variance * _uncertainty(prior, config), False
     if prior.T_prev_curr is not None:
+        contradicted = joint.contradicts(prior.T_prev_curr, uncertainty)
         joint = joint.measured_motion(prior.T_prev_curr, uncertainty)
     if prior.velocity is not None and interval_s > 0.0:
         joint = joint.measured_velocity(prior.velocity, uncertainty * (_SHAKING / interval_s) ** 2)
     covariance = joint.covariance[12:, 12:]
     covariance[:6, :6] += np.diag(_LEAST_SIGMA**2)
-    return Prediction(joint.T_world_curr, joint.curr_velocity, covariance)
+    return Prediction(joint.T_world_curr, joint.curr_velocity, covariance, contradicted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,10 +234,19 @@ class _Joint:
         return cls(state.T_world_lidar, state.T_world_lidar @ T_moved, state.velocity, state.velocity, joint)
 
     def measured_motion(self, T_last_curr: FloatArray, covariance: FloatArray) -> "_Joint":
+        return self._updated(*self._motion_innovation(T_last_curr), covariance)
+
+    def contradicts(self, T_last_curr: FloatArray, covariance: FloatArray) -> bool:
+        """Whether a motion (4, 4) with this covariance fails the innovation test."""
+        H, innovation = self._motion_innovation(T_last_curr)
+        return bool(innovation @ np.linalg.solve(H @ self.covariance @ H.T + covariance, innovation) > _GATE)
+
+    def _motion_innovation(self, T_last_curr: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Jacobian (6, 24) of the motion since the last scan, and how far a measured one differs (6,)."""
         T_expected = inverse(self.T_world_last) @ self.T_world_curr
         H = np.zeros((6, 24))
         H[:, :6], H[:, 12:18] = -adjoint(inverse(T_expected)), np.eye(6)
-        return self._updated(H, log(inverse(T_expected) @ T_last_curr), covariance)
+        return H, log(inverse(T_expected) @ T_last_curr)
 
     def measured_velocity(self, velocity: FloatArray, covariance: FloatArray) -> "_Joint":
         H = np.zeros((6, 24))
