@@ -17,9 +17,9 @@ from math import erf, sqrt
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import print_row
+from mapping_accuracy import BEYOND_TRUTH_S, print_row
 from numpy.typing import NDArray
-from odometry_accuracy import BEYOND_TRUTH_S, network_alone, rms, squared_errors
+from odometry_accuracy import network_alone, rms, squared_errors
 from scipy.stats import chi2
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
@@ -94,7 +94,7 @@ def _try(config: LearnedConfig, excerpt: Excerpt, scans: Sequence[Scan]) -> Outc
     estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
     measured = np.array([motion.failure is None for motion in motions[1:]])
     error = log(inverse(estimated) @ true)
-    squared = squared_errors(motions[1:], error)
+    squared = squared_errors([motion.covariance for motion in motions[1:]], error)
     return Outcome(
         simulation.world.name, simulation.sensor.name, simulation.motion.name,
         np.linalg.norm(true[measured, :3, 3], axis=1), np.rad2deg(rotation_angle(true[measured])), error[measured],
