@@ -16,12 +16,11 @@ in the LiDAR frame, NEES is `xi^T Sigma^-1 xi`, chi-square with six degrees of f
 NEES over 6 has the median 0.89 where the covariance is right, and more where it is too small. Within 1, 2, 3 sigma are
 shares in %; they should be 68.3, 95.4 and 99.7 (chi-square quantiles of these probabilities). Scans that are not `ok`
 are left out, unless `--all`, and counted. Of recordings on disk at most `--scans` scans are taken. The truth of a real
-drive has errors of its own, which add to the estimate's.
+drive has errors of its own, which add to the estimate's; those of its first pose alone make the rows of poses useless.
 """
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +33,7 @@ from mapping_accuracy import (
     recordings,
     true_trajectory,
 )
-from odometry_accuracy import estimated_motions, squared_errors
-from scipy.special import erf
-from scipy.stats import chi2
+from odometry_accuracy import SIGMAS, estimated_motions, shares_within_sigmas, squared_errors
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.tracking import Status
@@ -44,25 +41,7 @@ from lidarslam.pipeline import ScanResult
 from lidarslam.simulation.worlds.registry import WORLDS
 from odometry.config import OdometryConfig
 
-_DOF = 6
-_SIGMAS = (1, 2, 3)
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """Of one kind of estimates: how many, the median of NEES over 6, and % within each of the sigmas."""
-
-    count: int
-    median: float
-    within_percent: tuple[float, ...]
-
-    @classmethod
-    def of(cls, nees: FloatArray) -> "Consistency":
-        """Of the NEES (N,), at least one."""
-        limits = [chi2.ppf(erf(sigma / np.sqrt(2.0)), _DOF) for sigma in _SIGMAS]
-        shares = tuple(100.0 * float(np.mean(nees <= limit)) for limit in limits)
-        return cls(len(nees), float(np.median(nees)) / _DOF, shares)
 
 
 def nees_of_poses(results: Sequence[ScanResult], truth: FloatArray) -> FloatArray:
@@ -107,14 +86,13 @@ def rows(recorded: Recorded, method: str, keeps_all: bool) -> Iterator[list[str]
         "registration": (nees_of_registration(results, truth), ok[1:] & ok[:-1]),
         "pose": (nees_of_poses(results, truth)[1:], ok[1:]),
     }
-    for kind, (nees, counts) in kinds.items():
-        known = nees[counts & np.isfinite(nees)]
+    for kind, (nees, chosen) in kinds.items():
+        known = nees[chosen & np.isfinite(nees)]
         if not len(known):
             continue
-        consistency = Consistency.of(known)
-        shares = [f"{percent:.0f}" for percent in consistency.within_percent]
-        left_out = str(len(nees) - consistency.count)
-        yield [recorded.name, method, kind, str(consistency.count), left_out, f"{consistency.median:.2f}", *shares]
+        counts = [str(len(known)), str(len(nees) - len(known))]
+        shares = [f"{100.0 * share:.0f}" for share in shares_within_sigmas(known)]
+        yield [recorded.name, method, kind, *counts, f"{np.median(known) / 6.0:.2f}", *shares]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -128,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not options.sources and not options.worlds:
         options.worlds = list(WORLDS)
     header = ["recording", "method", "of", "count", "left out", "median NEES/6"]
-    header += [f"within {sigma} sigma, %" for sigma in _SIGMAS]
+    header += [f"within {sigma} sigma, %" for sigma in SIGMAS]
     print_row(header)
     print_row(["---"] * len(header))
     for recorded in recordings(options, options.scans):

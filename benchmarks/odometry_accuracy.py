@@ -25,6 +25,7 @@ from mapping_accuracy import (
     recordings,
     true_trajectory,
 )
+from scipy.special import erf
 from scipy.stats import chi2
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
@@ -35,6 +36,10 @@ from odometry.config import OdometryConfig
 from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
+
+# Numbers of standard deviations, and the share of errors that should lie within each.
+SIGMAS = (1, 2, 3)
+EXPECTED_SHARES = tuple(float(erf(sigma / np.sqrt(2.0))) for sigma in SIGMAS)
 
 _COVERED_95 = float(chi2.ppf(0.95, 6))
 
@@ -139,6 +144,11 @@ def squared_errors(covariances: Sequence[FloatArray | None], errors: FloatArray)
             for covariance, error in zip(covariances, errors, strict=True)
         ]
     )
+
+
+def shares_within_sigmas(squared: FloatArray) -> list[float]:
+    """Of squared errors (N,) as above, the shares that lie within each of `SIGMAS`."""
+    return [float(np.mean(squared <= chi2.ppf(share, 6))) for share in EXPECTED_SHARES]
 
 
 def rms(values: FloatArray) -> float:
