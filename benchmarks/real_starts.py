@@ -20,6 +20,7 @@ each scan is held against the one before. Other peers know no status, and are ok
 
 import argparse
 import json
+import logging
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -135,9 +136,10 @@ def length_error(trajectory: Trajectory, reference: Trajectory, shortest_m: floa
     return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, shortest_m)
 
 
-def judged_runs(source: Path, step: int, arguments: argparse.Namespace) -> Iterator[tuple[str, Judged]]:
+def judged_runs(
+    source: Path, recording: Recording, step: int, arguments: argparse.Namespace
+) -> Iterator[tuple[str, Judged]]:
     """Every method from every start, with its name."""
-    recording = open_recording(source)
     truth = recording.ground_truth
     methods = sorted(arguments.methods, key=lambda name: name != REFERENCE)
     if truth is None and REFERENCE not in methods:
@@ -223,14 +225,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--all", action="store_true", help="every run too")
     options = parser.parse_args(arguments)
     rows = []
+    logging.basicConfig(stream=sys.stderr, level=logging.ERROR)  # not to the streams of a run, which end with it
     for source in options.sources:
+        recording = open_recording(source)
         for step in options.steps:
             runs: dict[str, list[Judged]] = {method: [] for method in options.methods}
-            for method, judged in judged_runs(source, step, options):
+            for method, judged in judged_runs(source, recording, step, options):
                 runs.setdefault(method, []).append(judged)
             if options.all:
-                print_starts(source.name, step, runs)
-            rows += [row(source.name, method, step, judged, options.wrong_percent) for method, judged in runs.items()]
+                print_starts(recording.name, step, runs)
+            rows += [
+                row(recording.name, method, step, judged, options.wrong_percent) for method, judged in runs.items()
+            ]
     header = ["recording", "step", "method", "starts", "worst ATE, m", "median ATE, m", "worst start"]
     header += ["worst length error, %", "lost", "degraded", "ok", "ok but wrong"]
     print_row(header)
