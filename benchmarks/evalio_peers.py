@@ -17,7 +17,8 @@ CT-ICP's instants were found by comparison with exact truth:
 - compensated scans: it belongs to the stamp of the scan before. The last scan is therefore registered a second time.
 
 The poses at the stamps are interpolated between these at constant velocity. GenZ-ICP and MAD-ICP compensate no motion
-by default; their poses are taken for those of the middle of the sweep, which on those recordings fits as well as any.
+by default, so that the sweep has no one instant; their poses are taken for those of its middle. On a simulated street
+at 12 m/s GenZ-ICP's ATE is 0.037, 0.043 or 0.053 m with the start, the middle or the end.
 """
 
 import argparse

@@ -9,7 +9,8 @@ every `--every`-th scan of the recording; near the end of the recording it takes
 - worst, median ATE: metres, after SE(3) alignment, over the starts; with ground truth only;
 - worst start: the scan that the worst run starts at, by ATE, or by length where there is no truth;
 - worst length error: of the path's length against the truth's, without truth against KISS-ICP's, in % of the latter or
-  of `--shortest` metres, whichever is longer;
+  of `--shortest` metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
+  whose truth is satellite navigation with errors of several percent over such short runs;
 - lost, degraded: scans, of all runs;
 - ok: runs that end with exit status 0;
 - ok but wrong: of these, the runs whose length is wrong by more than `--wrong-percent`.
@@ -118,14 +119,16 @@ def run_other(method: str, recording: Recording, scans: range) -> Ended:
     return Ended(trajectory, None, None, 0)
 
 
-def judge(ended: Ended, scans: range, truth: Trajectory | None, reference: Ended | None, shortest_m: float) -> Judged:
-    """Hold a run against the truth, or without it against the reference's run."""
+def judge(
+    ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None, shortest_m: float
+) -> Judged:
+    """Hold a run against the truth, and the length of its path against that of another trajectory."""
     trajectory = ended.trajectory
-    other = truth if truth is not None else reference.trajectory if reference is not None else None
     ate_m = length_error_percent = None
-    if trajectory is not None and other is not None:
-        length_error_percent = length_error(trajectory, other, shortest_m)
-        ate_m = None if truth is None else evaluate_trajectory(trajectory, truth).errors.ate_rmse_m
+    if trajectory is not None and of_length is not None:
+        length_error_percent = length_error(trajectory, of_length, shortest_m)
+    if trajectory is not None and truth is not None:
+        ate_m = evaluate_trajectory(trajectory, truth).errors.ate_rmse_m
     return Judged(scans.start, len(scans), ate_m, length_error_percent, ended.lost, ended.degraded, ended.status)
 
 
@@ -142,14 +145,16 @@ def judged_runs(
     """Every method from every start, with its name."""
     truth = recording.ground_truth
     methods = sorted(arguments.methods, key=lambda name: name != REFERENCE)
-    if truth is None and REFERENCE not in methods:
+    uses_reference = truth is None or arguments.lengths_of == REFERENCE
+    if uses_reference and REFERENCE not in methods:
         methods.insert(0, REFERENCE)
     for scans in starts_of(len(recording), arguments.every, arguments.scans, step):
-        reference: Ended | None = None
+        of_length = None if uses_reference else truth
         for method in methods:
             ended = run_ours(method, source, scans) if method in OPTIONS else run_other(method, recording, scans)
-            reference = ended if method == REFERENCE else reference
-            judged = judge(ended, scans, truth, reference, arguments.shortest)
+            if uses_reference and method == REFERENCE:
+                of_length = ended.trajectory
+            judged = judge(ended, scans, truth, of_length, arguments.shortest)
             _report(f"{recording.name} step {step} start {scans.start} {method}: {_line(judged)} {ended.message}")
             yield method, judged
 
@@ -220,6 +225,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scans", type=int, default=50, help="of a run")
     parser.add_argument(
         "--shortest", type=float, default=10.0, help="metres that an error of length is in %% of at least"
+    )
+    parser.add_argument(
+        "--lengths-of", choices=["truth", REFERENCE], default="truth", help="what lengths are held against"
     )
     parser.add_argument("--wrong-percent", type=float, default=3.0)
     parser.add_argument("--all", action="store_true", help="every run too")

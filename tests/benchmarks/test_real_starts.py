@@ -39,14 +39,14 @@ def test_a_sensor_that_stands_is_judged_by_the_shortest_length() -> None:
     assert length_error(_straight(0.5), _straight(0.0), shortest_m=10.0) == pytest.approx(10.0)
 
 
-def test_without_truth_there_is_no_ate_and_the_reference_counts() -> None:
-    judged = judge(Ended(_straight(4.5), 0, 0, 0), range(21), None, Ended(_straight(5.0), 0, 0, 0), 1.0)
+def test_without_truth_there_is_no_ate_but_a_length() -> None:
+    judged = judge(Ended(_straight(4.5), 0, 0, 0), range(21), None, _straight(5.0), 1.0)
     assert judged.ate_m is None
     assert judged.length_error_percent == pytest.approx(-10.0)
 
 
 def test_a_run_without_a_trajectory_is_the_worst_one() -> None:
-    judged = judge(Ended(None, None, None, 1, "it died"), range(40, 60), _straight(5.0), None, 1.0)
+    judged = judge(Ended(None, None, None, 1, "it died"), range(40, 60), _straight(5.0), _straight(5.0), 1.0)
     cells = row("drive", "CT-ICP", 1, [_judged(0, 0.5, 1.0), judged], 3.0)
     assert cells[3:7] == ["2", "0.500", "0.500", "40"]
 
