@@ -18,7 +18,7 @@ simulator into memory.
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
 from lidarslam.localisation import make_localiser
-from lidarslam.pipeline import Pipeline
+from lidarslam.pipeline import Pipeline, ScanResult
 from lidarslam.scan_order import in_order
 from lidarslam.simulation.carriers import CARRIERS
 from lidarslam.simulation.mounts import mount_pose
@@ -45,8 +45,14 @@ from mapping.config import MappingConfig
 from odometry.config import KissConfig, OdometryConfig
 from odometry.registry import make_odometry
 
-# How far outside the truth's own stamps a scan may lie for the wrong odometry to be made there.
-_BEYOND_TRUTH_S = 0.2
+# How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
+BEYOND_TRUTH_S = 0.2
+
+METHODS = {
+    "learned+map": Config(),
+    "constant-velocity+map": Config(odometry=OdometryConfig(method="constant-velocity")),
+    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(enabled=False)),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +105,17 @@ def make_simulation(world: str, motion: str, sensor: str, scans: int, seed: int)
     return Simulation(place, find_sensor(sensor), carried, mount_pose("upright", carried.sensor_height_m), scans, seed)
 
 
+def true_trajectory(recorded: Recorded) -> Trajectory:
+    """The truth at the scans' stamps."""
+    stamps = np.array([scan.stamp for scan in recorded.scans])
+    return Trajectory(stamps, recorded.truth.at(stamps, BEYOND_TRUTH_S))
+
+
 def wrong_odometry(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int) -> Trajectory:
     """The truth at the scans' stamps, every motion changed by a rotation and a translation in random directions."""
     rng = np.random.default_rng(seed)
-    stamps = np.array([scan.stamp for scan in recorded.scans])
-    truth = Trajectory(stamps, recorded.truth.at(stamps, _BEYOND_TRUTH_S))
+    truth = true_trajectory(recorded)
+    stamps = truth.stamps
     errors = rng.normal(size=(len(stamps) - 1, 2, 3))
     errors *= np.array([np.deg2rad(wrong_deg), wrong_m])[:, None] / np.linalg.norm(errors, axis=2, keepdims=True)
     wrong = truth.relative_motions() @ exp(errors.reshape(-1, 6))
@@ -111,12 +123,8 @@ def wrong_odometry(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: i
 
 
 def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> Outcome:
-    """Take a recording through the pipeline of `lidarslam run`."""
-    odometry = make_odometry(config.odometry, prior)
-    try:
-        results = list(Pipeline(odometry, make_localiser(config), config.global_map).run(recorded.scans))
-    finally:
-        odometry.close()
+    """Take a recording through the pipeline, and hold the trajectory against the truth."""
+    results = pipeline_results(recorded, config, prior)
     stamps = np.array([result.stamp for result in results])
     errors = errors_of(Trajectory(stamps, np.array([result.T_world_lidar for result in results])), recorded)
     statuses = [result.status for result in results]
@@ -128,6 +136,15 @@ def localise(recorded: Recorded, config: Config, prior: Trajectory | None = None
         degraded=statuses.count(Status.DEGRADED),
         refine_ms=float(np.median(refine_ms)) if refine_ms else None,
     )
+
+
+def pipeline_results(recorded: Recorded, config: Config, prior: Trajectory | None = None) -> list[ScanResult]:
+    """Take a recording through the pipeline of `lidarslam run`."""
+    odometry = make_odometry(config.odometry, prior)
+    try:
+        return list(Pipeline(odometry, make_localiser(config), config.global_map).run(recorded.scans))
+    finally:
+        odometry.close()
 
 
 def errors_of(estimate: Trajectory, recorded: Recorded) -> TrajectoryErrors:
@@ -194,7 +211,7 @@ def main() -> None:
     header += [f"odometry wrong by {wrong}", "ours with it", "ours, % of the path: without / with it"]
     print_row(header)
     print_row(["---"] * len(header))
-    for recorded in _recordings(arguments):
+    for recorded in recordings(arguments):
         print_row(row(recorded, arguments.voxels, arguments.wrong_deg, arguments.wrong_m, arguments.seed))
 
 
@@ -216,9 +233,11 @@ def simulated_recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
             yield simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed)
 
 
-def _recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
+def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterator[Recorded]:
+    """All that are asked for, one in memory at a time; of those on disk at most so many scans."""
     for source in arguments.sources:
-        yield read(source)
+        recorded = read(source)
+        yield replace(recorded, scans=recorded.scans[:most])
     yield from simulated_recordings(arguments)
 
 

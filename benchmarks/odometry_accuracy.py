@@ -17,10 +17,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import Recorded, add_simulation_arguments, errors_of, print_row, read, simulate
+from mapping_accuracy import (
+    Recorded,
+    add_simulation_arguments,
+    errors_of,
+    print_row,
+    recordings,
+    true_trajectory,
+)
+from scipy.special import erf
 from scipy.stats import chi2
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
+from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
 from odometry.alignment_config import AlignmentConfig
 from odometry.config import OdometryConfig
@@ -28,8 +37,11 @@ from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
+# Numbers of standard deviations, and the share of errors that should lie within each.
+SIGMAS = (1, 2, 3)
+EXPECTED_SHARES = tuple(float(erf(sigma / np.sqrt(2.0))) for sigma in SIGMAS)
+
 _COVERED_95 = float(chi2.ppf(0.95, 6))
-BEYOND_TRUTH_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -55,11 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print_row([*columns, "ATE, m", "failed", "covered, %", "CPU, ms a scan"])
     print_row(["---"] * 12)
     methods = _methods(options.weights)
-    for source in options.sources:
-        _print(read(source), methods)
-    for world in options.worlds:
-        for motion in options.motions:
-            _print(simulate(world, motion, options.sensor, options.scans, options.seed), methods)
+    for recorded in recordings(options):
+        _print(recorded, methods)
 
 
 def network_alone(weights: Path | None) -> LearnedConfig:
@@ -77,8 +86,7 @@ def _methods(weights: Path | None) -> dict[str, OdometryConfig]:
 
 
 def _print(recorded: Recorded, methods: dict[str, OdometryConfig]) -> None:
-    stamps = np.array([scan.stamp for scan in recorded.scans])
-    truth = Trajectory(stamps, recorded.truth.at(stamps, BEYOND_TRUTH_S))
+    truth = true_trajectory(recorded)
     motions = truth.relative_motions()
     step, turn = rms(np.linalg.norm(motions[:, :3, 3], axis=1)), np.rad2deg(rms(rotation_angle(motions)))
     for name, config in methods.items():
@@ -96,12 +104,8 @@ def _print(recorded: Recorded, methods: dict[str, OdometryConfig]) -> None:
 
 
 def _try(config: OdometryConfig, recorded: Recorded, truth: Trajectory) -> Errors:
-    odometry = make_odometry(config)
     started = time.process_time()
-    try:
-        motions = [odometry.estimate(scan) for scan in recorded.scans]
-    finally:
-        odometry.close()
+    motions = estimated_motions(config, recorded.scans)
     cpu_ms = 1e3 * (time.process_time() - started) / len(motions)
     estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
     wrong = inverse(estimated) @ truth.relative_motions()
@@ -116,21 +120,35 @@ def _try(config: OdometryConfig, recorded: Recorded, truth: Trajectory) -> Error
     )
 
 
+def estimated_motions(config: OdometryConfig, scans: Sequence[Scan]) -> list[Motion]:
+    """What an odometry alone says of each scan."""
+    odometry = make_odometry(config)
+    try:
+        return [odometry.estimate(scan) for scan in scans]
+    finally:
+        odometry.close()
+
+
 def _covered_percent(motions: Sequence[Motion], errors: FloatArray) -> float | None:
     """Of the errors (N, 6), those within the 95 % ellipsoid of their covariance."""
-    squared = squared_errors(motions, errors)
+    squared = squared_errors([motion.covariance for motion in motions], errors)
     squared = squared[np.isfinite(squared)]
     return 100.0 * float(np.mean(squared <= _COVERED_95)) if len(squared) else None
 
 
-def squared_errors(motions: Sequence[Motion], errors: FloatArray) -> FloatArray:
+def squared_errors(covariances: Sequence[FloatArray | None], errors: FloatArray) -> FloatArray:
     """(N,) of errors (N, 6), in standard deviations, summed over the six directions; NaN without a covariance."""
     return np.array(
         [
-            np.nan if motion.covariance is None else error @ np.linalg.solve(motion.covariance, error)
-            for motion, error in zip(motions, errors, strict=True)
+            np.nan if covariance is None else error @ np.linalg.solve(covariance, error)
+            for covariance, error in zip(covariances, errors, strict=True)
         ]
     )
+
+
+def shares_within_sigmas(squared: FloatArray) -> list[float]:
+    """Of squared errors (N,) as above, the shares that lie within each of `SIGMAS`."""
+    return [float(np.mean(squared <= chi2.ppf(share, 6))) for share in EXPECTED_SHARES]
 
 
 def rms(values: FloatArray) -> float:

@@ -13,14 +13,12 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import erf, sqrt
 from pathlib import Path
 
 import numpy as np
-from mapping_accuracy import print_row
+from mapping_accuracy import BEYOND_TRUTH_S, print_row
 from numpy.typing import NDArray
-from odometry_accuracy import BEYOND_TRUTH_S, network_alone, rms, squared_errors
-from scipy.stats import chi2
+from odometry_accuracy import EXPECTED_SHARES, SIGMAS, network_alone, rms, shares_within_sigmas, squared_errors
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
@@ -30,7 +28,6 @@ from odometry.config import OdometryConfig
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
-_SIGMAS = (1, 2, 3)
 # What a motion should be better than: degrees, metres, and part of the step.
 _GOOD_DEG, _GOOD_M, _GOOD_SHARE = 0.3, 0.02, 0.03
 _FASTEST_DEG = 15.0
@@ -94,7 +91,7 @@ def _try(config: LearnedConfig, excerpt: Excerpt, scans: Sequence[Scan]) -> Outc
     estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
     measured = np.array([motion.failure is None for motion in motions[1:]])
     error = log(inverse(estimated) @ true)
-    squared = squared_errors(motions[1:], error)
+    squared = squared_errors([motion.covariance for motion in motions[1:]], error)
     return Outcome(
         simulation.world.name, simulation.sensor.name, simulation.motion.name,
         np.linalg.norm(true[measured, :3, 3], axis=1), np.rad2deg(rotation_angle(true[measured])), error[measured],
@@ -152,11 +149,10 @@ def _print_coverage(name: str, outcomes: Sequence[Outcome]) -> None:
     squared = np.concatenate([one.squared for one in outcomes])
     squared = squared[np.isfinite(squared)]
     print(f"\n{name}: errors within so many standard deviations, {len(squared)} motions\n")
-    print_row(["", *(str(sigma) for sigma in _SIGMAS)])
+    print_row(["", *(str(sigma) for sigma in SIGMAS)])
     print_row(["---"] * 4)
-    expected = [erf(sigma / sqrt(2.0)) for sigma in _SIGMAS]
-    print_row(["should be, %", *(f"{100.0 * share:.1f}" for share in expected)])
-    print_row(["are, %", *(f"{100.0 * np.mean(squared <= chi2.ppf(share, 6)):.1f}" for share in expected)])
+    print_row(["should be, %", *(f"{100.0 * share:.1f}" for share in EXPECTED_SHARES)])
+    print_row(["are, %", *(f"{100.0 * share:.1f}" for share in shares_within_sigmas(squared))])
 
 
 if __name__ == "__main__":

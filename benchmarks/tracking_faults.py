@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mapping_accuracy import make_simulation, print_row
+from mapping_accuracy import METHODS, make_simulation, print_row
 
 from evaluation.trajectory_metrics import evaluate_trajectory
 from lidarslam.config import Config
@@ -47,9 +47,8 @@ from lidarslam.simulation.mounts import mount_pose
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
-from mapping.config import GlobalMapConfig, MappingConfig
+from mapping.config import GlobalMapConfig
 from mapping.visibility import seen_through
-from odometry.config import OdometryConfig
 from odometry.registry import make_odometry
 
 _POLLUTED_M = 0.2
@@ -62,11 +61,6 @@ _PLACES = {
     "tunnel": ("tunnel", "vlp-16", "legged", 150, 90),
     "street": ("street", "os1-64", "car", 150, 90),
     "forest": ("forest", "vlp-16", "handheld", 150, 90),
-}
-_METHODS = {
-    "learned+map": Config(),
-    "constant-velocity+map": Config(odometry=OdometryConfig(method="constant-velocity")),
-    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(enabled=False)),
 }
 
 
@@ -176,7 +170,7 @@ def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:
 def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) -> list[str]:
     """The cells of one method on one recording."""
     kept = GlobalMapConfig(leave_out_moved=not keep_moved)
-    results, points = run(case, _METHODS[name].model_copy(update={"global_map": kept}))
+    results, points = run(case, METHODS[name].model_copy(update={"global_map": kept}))
     recorded, truth = case.recorded, case.recorded.truth.T_world_lidar
     poses = np.array([result.T_world_lidar for result in results])
     true = inverse(truth[0]) @ truth
@@ -238,7 +232,7 @@ def main() -> None:
     kinds = [*_FAULTS, "traffic", "still", "featureless"]
     parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=["office", "tunnel", "street"])
-    parser.add_argument("--methods", nargs="+", choices=list(_METHODS), default=list(_METHODS))
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--wrong-m", type=float, default=0.2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep-moved", action="store_true", help="what was seen through stays in the map")

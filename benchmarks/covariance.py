@@ -1,0 +1,119 @@
+"""Are the covariances of poses and motions right? Their normalised estimation error squared (NEES), against the truth.
+
+    python benchmarks/covariance.py
+    python benchmarks/covariance.py KITTI/sequences/04 --worlds street --motions car --scans 100 --methods learned+map
+
+Prints a Markdown table, up to three rows for each recording and method. With the error `xi = log(T_estimate^-1 T_true)`
+in the LiDAR frame, NEES is `xi^T Sigma^-1 xi`, chi-square with six degrees of freedom where Sigma is right:
+
+- odometry: of the motions T_prev_curr between successive scans, with the covariance that the odometry gives;
+- registration: of the motions between successive registered poses, T_world_prev^-1 T_world_curr, with
+  `Sigma = Sigma_curr + Ad(T_curr_prev) Sigma_prev Ad(T_curr_prev)^T`. That takes the errors of the two poses for
+  independent; the error of the map, which they share, cancels;
+- pose: of the registered poses themselves, relative to the first scan, where the world begins. This includes the drift
+  of the map, of which a covariance of the registration knows nothing.
+
+NEES over 6 has the median 0.89 where the covariance is right, and more where it is too small. Within 1, 2, 3 sigma are
+shares in %; they should be 68.3, 95.4 and 99.7 (chi-square quantiles of these probabilities). Scans that are not `ok`
+are left out, unless `--all`, and counted. Of recordings on disk at most `--scans` scans are taken. The truth of a real
+drive has errors of its own, which add to the estimate's; those of its first pose alone make the rows of poses useless.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from mapping_accuracy import (
+    METHODS,
+    Recorded,
+    add_simulation_arguments,
+    pipeline_results,
+    print_row,
+    recordings,
+    true_trajectory,
+)
+from odometry_accuracy import SIGMAS, estimated_motions, shares_within_sigmas, squared_errors
+
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
+from lidarslam.core.tracking import Status
+from lidarslam.pipeline import ScanResult
+from lidarslam.simulation.worlds.registry import WORLDS
+from odometry.config import OdometryConfig
+
+_MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
+
+
+def nees_of_poses(results: Sequence[ScanResult], truth: FloatArray) -> FloatArray:
+    """(N,) of poses against the truth (N, 4, 4), the first made to coincide; NaN without a covariance."""
+    poses = np.array([result.T_world_lidar for result in results])
+    errors = log(inverse(inverse(poses[0]) @ poses) @ inverse(truth[0]) @ truth)
+    return squared_errors([result.covariance for result in results], errors)
+
+
+def nees_of_registration(results: Sequence[ScanResult], truth: FloatArray) -> FloatArray:
+    """(N-1,) of motions between successive poses, against those of the truth (N, 4, 4); NaN without a covariance."""
+    poses = np.array([result.T_world_lidar for result in results])
+    motions = inverse(poses[:-1]) @ poses[1:]
+    errors = log(inverse(motions) @ inverse(truth[:-1]) @ truth[1:])
+    pairs = zip(results[:-1], results[1:], motions, strict=True)
+    return squared_errors([motion_covariance(*pair) for pair in pairs], errors)
+
+
+def motion_covariance(previous: ScanResult, current: ScanResult, T_prev_curr: FloatArray) -> FloatArray | None:
+    """(6, 6) of the motion between two poses with independent errors; None when one has no covariance."""
+    if previous.covariance is None or current.covariance is None:
+        return None
+    A = adjoint(inverse(T_prev_curr))
+    return np.asarray(current.covariance + A @ previous.covariance @ A.T, dtype=np.float64)
+
+
+def nees_of_odometry(recorded: Recorded, config: OdometryConfig, truth: FloatArray) -> FloatArray:
+    """(N-1,) of an odometry's motions; NaN where it gives no covariance, or measured nothing."""
+    motions = estimated_motions(config, recorded.scans)[1:]
+    errors = log(inverse(np.array([motion.T_prev_curr for motion in motions])) @ inverse(truth[:-1]) @ truth[1:])
+    measured = [motion.covariance if motion.failure is None else None for motion in motions]
+    return squared_errors(measured, errors)
+
+
+def rows(recorded: Recorded, method: str, keeps_all: bool) -> Iterator[list[str]]:
+    """The cells of every kind of estimates that comes with covariances."""
+    truth = true_trajectory(recorded).T_world_lidar
+    results = pipeline_results(recorded, METHODS[method])
+    ok = np.array([keeps_all or result.status is Status.OK for result in results])
+    kinds = {
+        "odometry": (nees_of_odometry(recorded, METHODS[method].odometry, truth), np.ones(len(ok) - 1, bool)),
+        "registration": (nees_of_registration(results, truth), ok[1:] & ok[:-1]),
+        "pose": (nees_of_poses(results, truth)[1:], ok[1:]),
+    }
+    for kind, (nees, chosen) in kinds.items():
+        known = nees[chosen & np.isfinite(nees)]
+        if not len(known):
+            continue
+        counts = [str(len(known)), str(len(nees) - len(known))]
+        shares = [f"{100.0 * share:.0f}" for share in shares_within_sigmas(known)]
+        yield [recorded.name, method, kind, *counts, f"{np.median(known) / 6.0:.2f}", *shares]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line and print the table, row by row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
+    add_simulation_arguments(parser, motions=("car", "tracked"))
+    parser.add_argument("--methods", nargs="+", choices=_MAPPED, default=_MAPPED)
+    parser.add_argument("--all", action="store_true", help="lost and degraded scans too, where they have a covariance")
+    options = parser.parse_args(arguments)
+    if not options.sources and not options.worlds:
+        options.worlds = list(WORLDS)
+    header = ["recording", "method", "of", "count", "left out", "median NEES/6"]
+    header += [f"within {sigma} sigma, %" for sigma in SIGMAS]
+    print_row(header)
+    print_row(["---"] * len(header))
+    for recorded in recordings(options, options.scans):
+        for method in options.methods:
+            for cells in rows(recorded, method, options.all):
+                print_row(cells)
+
+
+if __name__ == "__main__":
+    main()

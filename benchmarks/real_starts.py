@@ -1,0 +1,257 @@
+"""Every method from many starts of real recordings: does a run that ends well have the right trajectory?
+
+    python benchmarks/real_starts.py 2011_09_26/2011_09_26_drive_0005_sync KITTI/sequences/04
+    python benchmarks/real_starts.py RECORDING --steps 1 2 3 5 --every 20 --methods learned+map CT-ICP --all
+
+Prints a Markdown table, a row for each recording, method and scan step. A run takes `--scans` scans from each start,
+every `--every`-th scan of the recording; near the end of the recording it takes what is left, if that is half of it.
+
+- worst, median ATE: metres, after SE(3) alignment, over the starts; with ground truth only;
+- worst start: the scan that the worst run starts at, by ATE, or by length where there is no truth;
+- worst length error: of the path's length against the truth's, without truth against KISS-ICP's, in % of the latter or
+  of `--shortest` metres, whichever is longer. With `--lengths-of KISS-ICP` always against KISS-ICP's, for recordings
+  whose truth is satellite navigation with errors of several percent over such short runs;
+- lost, degraded: scans, of all runs;
+- ok: runs that end with exit status 0;
+- ok but wrong: of these, the runs whose length is wrong by more than `--wrong-percent`.
+
+Our methods and KISS-ICP run as `lidarslam run` does, with its exit status; for KISS-ICP that is `--no-mapping`, where
+each scan is held against the one before. Other peers know no status, and are ok when their process comes to its end.
+"""
+
+import argparse
+import json
+import logging
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner
+from evalio_peers import PEERS, PeerError, run_peer
+from mapping_accuracy import print_row
+
+from evaluation.association import associate
+from evaluation.trajectory_metrics import evaluate_trajectory
+from lidarslam.cli import main as lidarslam
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.registry import open_recording
+from lidarslam.scan_order import in_order
+
+# Methods that `lidarslam run` has, and the options that choose them.
+OPTIONS: dict[str, tuple[str, ...]] = {
+    "learned+map": (),
+    "constant-velocity+map": ("--odometry", "constant-velocity"),
+    "KISS-ICP": ("--odometry", "kiss-icp", "--no-mapping"),
+}
+METHODS = (*OPTIONS, *PEERS)
+REFERENCE = "KISS-ICP"
+
+
+@dataclass(frozen=True, eq=False)
+class Ended:
+    """A run that has ended.
+
+    Attributes:
+        trajectory: None when there is none.
+        lost, degraded: scans; None for a method that knows no status.
+        status: exit status.
+        message: why there is no trajectory.
+    """
+
+    trajectory: Trajectory | None
+    lost: int | None
+    degraded: int | None
+    status: int
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A run from one start, beside the truth or the reference; None where that cannot be said."""
+
+    start: int
+    scans: int
+    ate_m: float | None
+    length_error_percent: float | None
+    lost: int | None
+    degraded: int | None
+    status: int
+
+    @property
+    def badness(self) -> float:
+        """What runs are ordered by."""
+        value = self.length_error_percent if self.ate_m is None else self.ate_m
+        return float("inf") if value is None else abs(value)
+
+
+def starts_of(scans: int, every: int, wanted: int, step: int) -> list[range]:
+    """The scans of each run; the first is there however short, others have half of what is wanted at the least."""
+    runs = [range(start, min(start + wanted * step, scans), step) for start in range(0, scans, every)]
+    return [run for run in runs if run.start == 0 or 2 * len(run) >= wanted]
+
+
+def run_ours(method: str, source: Path, scans: range) -> Ended:
+    """A run as the command line makes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        where = ["--start", str(scans.start), "--stop", str(scans.stop), "--step", str(scans.step)]
+        done = CliRunner().invoke(lidarslam, ["run", str(source), "--out", str(out), *where, *OPTIONS[method]])
+        if done.exception is not None and not isinstance(done.exception, SystemExit):
+            raise done.exception
+        if not (out / "summary.json").exists():
+            return Ended(None, None, None, done.exit_code, done.output.strip())
+        summary = json.loads((out / "summary.json").read_text())
+        trajectory = read_tum(out / "trajectory.tum")
+    return Ended(trajectory, summary["lost_scans"], summary["degraded_scans"], done.exit_code)
+
+
+def run_other(method: str, recording: Recording, scans: range) -> Ended:
+    """A run of a peer."""
+    try:
+        trajectory = run_peer(method, in_order(recording.scans(scans.start, scans.stop, scans.step)))
+    except PeerError as error:
+        return Ended(None, None, None, 1, str(error))
+    return Ended(trajectory, None, None, 0)
+
+
+def judge(
+    ended: Ended, scans: range, truth: Trajectory | None, of_length: Trajectory | None, shortest_m: float
+) -> Judged:
+    """Hold a run against the truth, and the length of its path against that of another trajectory."""
+    trajectory = ended.trajectory
+    ate_m = length_error_percent = None
+    if trajectory is not None and of_length is not None:
+        length_error_percent = length_error(trajectory, of_length, shortest_m)
+    if trajectory is not None and truth is not None:
+        ate_m = evaluate_trajectory(trajectory, truth).errors.ate_rmse_m
+    return Judged(scans.start, len(scans), ate_m, length_error_percent, ended.lost, ended.degraded, ended.status)
+
+
+def length_error(trajectory: Trajectory, reference: Trajectory, shortest_m: float) -> float:
+    """How much longer a path is than the reference's at the same instants, in percent."""
+    matched = associate(trajectory, reference)
+    true_m = matched.reference.length_m
+    return 100.0 * (matched.estimate.length_m - true_m) / max(true_m, shortest_m)
+
+
+def judged_runs(
+    source: Path, recording: Recording, step: int, arguments: argparse.Namespace
+) -> Iterator[tuple[str, Judged]]:
+    """Every method from every start, with its name."""
+    truth = recording.ground_truth
+    methods = sorted(arguments.methods, key=lambda name: name != REFERENCE)
+    uses_reference = truth is None or arguments.lengths_of == REFERENCE
+    if uses_reference and REFERENCE not in methods:
+        methods.insert(0, REFERENCE)
+    for scans in starts_of(len(recording), arguments.every, arguments.scans, step):
+        of_length = None if uses_reference else truth
+        for method in methods:
+            ended = run_ours(method, source, scans) if method in OPTIONS else run_other(method, recording, scans)
+            if uses_reference and method == REFERENCE:
+                of_length = ended.trajectory
+            judged = judge(ended, scans, truth, of_length, arguments.shortest)
+            _report(f"{recording.name} step {step} start {scans.start} {method}: {_line(judged)} {ended.message}")
+            yield method, judged
+
+
+def _line(judged: Judged) -> str:
+    return f"ATE {_metres(judged.ate_m)} m, length {_percent(judged.length_error_percent)} %, exit {judged.status}"
+
+
+def _report(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def row(name: str, method: str, step: int, runs: Sequence[Judged], wrong_percent: float) -> list[str]:
+    """The cells of one method."""
+    worst = max(runs, key=lambda run: run.badness)
+    ates = [run.ate_m for run in runs if run.ate_m is not None]
+    errors = [run.length_error_percent for run in runs if run.length_error_percent is not None]
+    ok = [run for run in runs if run.status == 0]
+    wrong = [run for run in ok if run.length_error_percent is None or abs(run.length_error_percent) > wrong_percent]
+    return [
+        name,
+        str(step),
+        method,
+        str(len(runs)),
+        _metres(max(ates, default=None)),
+        _metres(float(np.median(ates)) if ates else None),
+        str(worst.start),
+        _percent(max(errors, key=abs, default=None)),
+        _total([run.lost for run in runs]),
+        _total([run.degraded for run in runs]),
+        str(len(ok)),
+        str(len(wrong)),
+    ]
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.1f}"
+
+
+def _total(counts: Sequence[int | None]) -> str:
+    known = [count for count in counts if count is not None]
+    return str(sum(known)) if known else "-"
+
+
+def print_starts(name: str, step: int, runs: dict[str, list[Judged]]) -> None:
+    """A table with a row for each run."""
+    print_row(["recording", "step", "method", "start", "scans", "ATE, m", "length, %", "lost", "degraded", "exit"])
+    print_row(["---"] * 10)
+    for method, judged in runs.items():
+        for run in judged:
+            counts = [_total([run.lost]), _total([run.degraded]), str(run.status)]
+            where = [name, str(step), method, str(run.start), str(run.scans)]
+            print_row([*where, _metres(run.ate_m), _percent(run.length_error_percent), *counts])
+    print(flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line, run, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="+", type=Path, help="recordings")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[*OPTIONS, "CT-ICP"])
+    parser.add_argument("--steps", nargs="+", type=int, default=[1], help="take every n-th scan")
+    parser.add_argument("--every", type=int, default=10, help="scans from one start to the next")
+    parser.add_argument("--scans", type=int, default=50, help="of a run")
+    parser.add_argument(
+        "--shortest", type=float, default=10.0, help="metres that an error of length is in %% of at least"
+    )
+    parser.add_argument(
+        "--lengths-of", choices=["truth", REFERENCE], default="truth", help="what lengths are held against"
+    )
+    parser.add_argument("--wrong-percent", type=float, default=3.0)
+    parser.add_argument("--all", action="store_true", help="every run too")
+    options = parser.parse_args(arguments)
+    rows = []
+    logging.basicConfig(stream=sys.stderr, level=logging.ERROR)  # not to the streams of a run, which end with it
+    for source in options.sources:
+        recording = open_recording(source)
+        for step in options.steps:
+            runs: dict[str, list[Judged]] = {method: [] for method in options.methods}
+            for method, judged in judged_runs(source, recording, step, options):
+                runs.setdefault(method, []).append(judged)
+            if options.all:
+                print_starts(recording.name, step, runs)
+            rows += [
+                row(recording.name, method, step, judged, options.wrong_percent) for method, judged in runs.items()
+            ]
+    header = ["recording", "step", "method", "starts", "worst ATE, m", "median ATE, m", "worst start"]
+    header += ["worst length error, %", "lost", "degraded", "ok", "ok but wrong"]
+    print_row(header)
+    print_row(["---"] * len(header))
+    for cells in rows:
+        print_row(cells)
+
+
+if __name__ == "__main__":
+    main()

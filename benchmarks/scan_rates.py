@@ -1,0 +1,86 @@
+"""Scans farther and farther apart: every simulated world at 1, 2, 3 and 5 times the scan interval.
+
+    python benchmarks/scan_rates.py
+    python benchmarks/scan_rates.py RECORDING
+    python benchmarks/scan_rates.py RECORDING --worlds office street --motions car --steps 1 5 --methods CT-ICP
+
+Prints a Markdown table, a row for each recording and step: how far the sensor moves and turns from scan to scan (the
+95th percentile), and of each method the ATE in metres after SE(3) alignment with the scans that were lost and degraded.
+A failed peer is told on standard error, and its cell says so; CT-ICP itself knows no status.
+
+Without recordings, all worlds are simulated. Simulated recordings go straight from the simulator into memory. At n
+times the scan interval every n-th scan is taken, each with all its points. `--scans` is for the single interval; of
+recordings on disk it is the most that are taken.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from evalio_peers import PEERS, PeerError, run_peer
+from mapping_accuracy import (
+    METHODS,
+    Recorded,
+    add_simulation_arguments,
+    errors_of,
+    localise,
+    print_row,
+    recordings,
+    true_trajectory,
+)
+
+from lidarslam.core.geometry import rotation_angle
+from lidarslam.simulation.worlds.registry import WORLDS
+
+
+def every_nth(recorded: Recorded, step: int) -> Recorded:
+    """The recording with its scans `step` times as far apart."""
+    return replace(recorded, scans=recorded.scans[::step])
+
+
+def result(method: str, recorded: Recorded) -> str:
+    """What a method makes of a recording."""
+    if method in METHODS:
+        return localise(recorded, METHODS[method]).text()
+    try:
+        return f"{errors_of(run_peer(method, recorded.scans), recorded).ate_rmse_m:.3f}"
+    except PeerError as error:
+        print(error, file=sys.stderr, flush=True)
+        return "failed"
+
+
+def row(recorded: Recorded, step: int, methods: Sequence[str]) -> list[str]:
+    """The cells of one recording at one step."""
+    chosen = every_nth(recorded, step)
+    motions = true_trajectory(chosen).relative_motions()
+    moved_m = float(np.percentile(np.linalg.norm(motions[:, :3, 3], axis=1), 95.0))
+    turned_deg = float(np.rad2deg(np.percentile(rotation_angle(motions), 95.0)))
+    cells = [recorded.name, str(step), str(len(chosen.scans)), f"{moved_m:.2f}", f"{turned_deg:.1f}"]
+    for method in methods:
+        cells.append(result(method, chosen))
+        print(f"{recorded.name} step {step} {method}: {cells[-1]}", file=sys.stderr, flush=True)
+    return cells
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the command line and print the table, row by row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
+    add_simulation_arguments(parser, motions=("car", "tracked"))
+    parser.add_argument("--steps", nargs="+", type=int, default=[1, 2, 3, 5], help="times the scan interval")
+    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *PEERS], default=[*METHODS, "CT-ICP"])
+    options = parser.parse_args(arguments)
+    if not options.sources and not options.worlds:
+        options.worlds = list(WORLDS)
+    print_row(["recording", "step", "scans", "moved, m", "turned, deg", *options.methods])
+    print_row(["---"] * (5 + len(options.methods)))
+    for recorded in recordings(options, options.scans):
+        for step in options.steps:
+            print_row(row(recorded, step, options.methods))
+
+
+if __name__ == "__main__":
+    main()
