@@ -5,8 +5,11 @@ from lidarslam.core.tracking import Status
 
 # After so long without a scan the sensor may be anywhere.
 _GAP_S = 1.0
-# A place found again is confirmed by so many scans that lie where it leads one to expect them.
+# A place found again is confirmed by so many scans that lie where it leads one to expect them, and for so long; a scan
+# that does not, contradicts it.
 _CONFIRMED_BY = 3
+_CONFIRMED_AFTER_S = 1.0
+_ROUNDING_S = 1e-3
 # Looking all over the map takes a second or two: it is done at these lost scans in a row, and at every so manieth.
 _LOOKS_AT = (1, 2, 4, 8, 13)
 _LOOKS_EVERY = 20
@@ -29,6 +32,7 @@ class Doubt:
         self.is_astray = False
         self._was_degraded = False
         self._to_confirm = 0
+        self._found_s: float | None = None  # when it was found again, until that is confirmed
         self._usual = 0.0
 
     def state(self) -> State:
@@ -38,6 +42,7 @@ class Doubt:
             "is_astray": self.is_astray,
             "was_degraded": self._was_degraded,
             "to_confirm": self._to_confirm,
+            "found_s": self._found_s,
             "usual": self._usual,
         }
 
@@ -47,6 +52,7 @@ class Doubt:
         self.is_astray = saved.flag("is_astray")
         self._was_degraded = saved.flag("was_degraded")
         self._to_confirm = saved.integer("to_confirm")
+        self._found_s = saved.optional_number("found_s")
         self._usual = saved.number("usual")
 
     def is_surprised(self, interval_s: float) -> bool:
@@ -70,12 +76,12 @@ class Doubt:
 
     @property
     def is_unconfirmed(self) -> bool:
-        """Whether the sensor was found again, and too few scans since then have confirmed it."""
-        return self._to_confirm > 0
+        """Whether the sensor was found again, and the scans of the next second have not all confirmed it yet."""
+        return self._found_s is not None
 
     def saw_nothing(self) -> None:
         """A scan had next to nothing to see."""
-        self.is_astray, self._to_confirm = True, 0
+        self.is_astray, self._found_s = True, None
 
     def missed(self) -> None:
         """A scan fitted nowhere."""
@@ -86,13 +92,15 @@ class Doubt:
         """Scans are held against another map from now on."""
         self.lost_in_a_row, self._usual = 0, 0.0
 
-    def laid(self, status: Status, found: bool, quality: float) -> None:
+    def laid(self, status: Status, found: bool, quality: float, stamp: float) -> None:
         """A scan lies on the map so well, where it was expected or where it was found."""
         self.lost_in_a_row, self.is_astray = 0, False
         self._was_degraded = status is Status.DEGRADED
         if status is Status.OK:
             self._usual += _FOLLOWING * (quality - self._usual)
         if found:
-            self._to_confirm = _CONFIRMED_BY
-        elif self._to_confirm and status is Status.OK:
+            self._to_confirm, self._found_s = _CONFIRMED_BY, stamp
+        elif self._found_s is not None and status is Status.OK:
             self._to_confirm -= 1
+            if self._to_confirm <= 0 and stamp - self._found_s >= _CONFIRMED_AFTER_S - _ROUNDING_S:
+                self._found_s = None

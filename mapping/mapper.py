@@ -195,7 +195,10 @@ class Mapper:
         if placed is None:
             return self._miss(sampled, prediction, near.fit)
         assert placed.refined is not None
-        self._doubt.laid(placed.status, placed is not near, placed.quality)
+        found = placed is not near
+        if not found and self._doubt.is_unconfirmed and self._is_contradicted(placed, prior, prediction, last):
+            return self._miss(sampled, prediction, near.fit)
+        self._doubt.laid(placed.status, found, placed.quality, sampled.stamp)
         interval_s = sampled.stamp - last.stamp
         if interval_s > 0.0 and self._has_velocity:
             self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
@@ -203,7 +206,7 @@ class Mapper:
             way = inverse(last.T_world_lidar) @ placed.refined.T_world_lidar
             self._noise = self._noise.seen(prior, way, self._config)
         self._has_velocity = True
-        return self._accept(sampled, prediction, last, placed, placed.refined, found=placed is not near)
+        return self._accept(sampled, prediction, last, placed, placed.refined, found)
 
     def _place_expected(
         self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
@@ -244,7 +247,7 @@ class Mapper:
     ) -> Placed | None:
         """A scan that was laid on the map near where it was expected, or where it fits better; None when nowhere."""
         doubt, config = self._doubt, self._config
-        surprised = doubt.is_surprised(sampled.stamp - last.stamp)
+        surprised = doubt.is_surprised(sampled.stamp - last.stamp) or doubt.is_unconfirmed
         if near.status is Status.LOST or (surprised and not near.is_beyond_doubt):
             return self._look_everywhere(near, sampled, prediction, last, local_map)
         if near.status is Status.DEGRADED and doubt.looks_around:
@@ -257,11 +260,19 @@ class Mapper:
                 return back.placed
         return near
 
+    def _is_contradicted(self, placed: Placed, prior: Prior, prediction: Prediction, last: State) -> bool:
+        """Whether the way since the last scan contradicts the place where the sensor was found again."""
+        assert placed.refined is not None
+        correction = log(inverse(prediction.T_world_lidar) @ placed.refined.T_world_lidar)
+        way = inverse(last.T_world_lidar) @ placed.refined.T_world_lidar
+        return has_jumped(correction, prediction) or self._noise.contradicts(prior, way, self._config)
+
     def _look_everywhere(
         self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap
     ) -> Placed | None:
         """Turned on the spot, then all over the map; what fits best counts, if it fits well."""
-        places = [near] if near.status is not Status.LOST and near.is_certain else []
+        believable = near.is_beyond_doubt if self._doubt.is_unconfirmed else near.is_certain
+        places = [near] if near.status is not Status.LOST and believable else []
         places += [found] if (found := search(sampled, prediction, last, local_map, self._config)) else []
         if not any(placed.is_beyond_doubt for placed in places) and self._doubt.looks_everywhere:
             there = search_everywhere(sampled, prediction, last, local_map, self._config)

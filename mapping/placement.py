@@ -29,6 +29,7 @@ _SHARE_TO_RETURN = 0.5
 # wrong places, at right ones 94 % and more; how much meets it depends on how much of the view is new.
 _RATIO_ANYWHERE = 0.85
 _SHARE_ANYWHERE = 0.4
+_SUPPORT_ANYWHERE = 0.6
 _CLEARLY = 1.2
 _ELSEWHERE_CELLS = 4.0
 # How far around the sensor a scan is drawn from above, in median ranges, and in cells of the map one of the drawing's.
@@ -61,8 +62,9 @@ class Placed:
     @property
     def is_beyond_doubt(self) -> bool:
         """Whether it lies on the map so well that it need not have been anywhere before."""
-        ratio, share = self.fit.inlier_ratio or 0.0, self.fit.inlier_share
-        return self.status is Status.OK and ratio > _RATIO_ANYWHERE and share > _SHARE_ANYWHERE
+        ratio, share, support = self.fit.inlier_ratio or 0.0, self.fit.inlier_share, self.fit.support or 0.0
+        fits = ratio > _RATIO_ANYWHERE and share > _SHARE_ANYWHERE and support > _SUPPORT_ANYWHERE
+        return self.status is Status.OK and fits
 
     @property
     def quality(self) -> float:

@@ -29,7 +29,7 @@ _UNEVEN = 1.0 / 8.0
 _NOISE_FOLLOWING = 0.2
 _GATE = 27.9
 # No pose is better than this, whatever its residuals say.
-_LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
+LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class State:
     @classmethod
     def first(cls, stamp: float, velocity: FloatArray | None) -> "State":
         """At the origin, moving anyhow unless something is known."""
-        sigmas = np.concatenate([_LEAST_SIGMA, _ANY_VELOCITY])
+        sigmas = np.concatenate([LEAST_SIGMA, _ANY_VELOCITY])
         return cls(stamp, np.eye(4), np.zeros(6) if velocity is None else velocity, np.diag(sigmas**2))
 
     @classmethod
@@ -87,7 +87,7 @@ class State:
     @classmethod
     def moving(cls, state: "State", velocity: FloatArray) -> "State":
         """At the pose of a state, with another velocity (6,) that is hardly known."""
-        sigmas = np.concatenate([_LEAST_SIGMA, _ANY_VELOCITY])
+        sigmas = np.concatenate([LEAST_SIGMA, _ANY_VELOCITY])
         return cls(state.stamp, state.T_world_lidar, velocity, np.diag(sigmas**2), state.seen_until_s)
 
     @classmethod
@@ -156,9 +156,20 @@ class OdometryNoise:
         """The noise after a registered motion (4, 4), by the normalised squared error of the odometry's."""
         if prior.T_prev_curr is None:
             return self
-        error = log(inverse(prior.T_prev_curr) @ T_prev_curr)
-        squared = float(error @ np.linalg.solve(_uncertainty(prior, config), error)) / len(error)
+        squared = _squared_error(prior, T_prev_curr, config) / 6.0
         return OdometryNoise(max(1.0, self.variance + _NOISE_FOLLOWING * (squared - self.variance)))
+
+
+    def contradicts(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
+        """Whether a registered motion (4, 4) is improbable, given the odometry's."""
+        return prior.T_prev_curr is not None and _squared_error(prior, T_prev_curr, config) > _GATE * self.variance
+
+
+def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> float:
+    """The odometry's squared error, in standard deviations, if a motion (4, 4) is right."""
+    assert prior.T_prev_curr is not None
+    error = log(inverse(prior.T_prev_curr) @ T_prev_curr)
+    return float(error @ np.linalg.solve(_uncertainty(prior, config), error))
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +217,7 @@ def predict(
     if prior.velocity is not None and interval_s > 0.0:
         joint = joint.measured_velocity(prior.velocity, uncertainty * (_SHAKING / interval_s) ** 2)
     covariance = joint.covariance[12:, 12:]
-    covariance[:6, :6] += np.diag(_LEAST_SIGMA**2)
+    covariance[:6, :6] += np.diag(LEAST_SIGMA**2)
     return Prediction(joint.T_world_curr, joint.curr_velocity, covariance, contradicted)
 
 

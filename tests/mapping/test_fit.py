@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
 from mapping.config import TrackingConfig
-from mapping.fit import Fit, measure_fit
+from mapping.fit import Fit, directional_support, measure_fit
 from mapping.local_map import LocalMap
 
 CONFIG = TrackingConfig()
@@ -111,3 +111,39 @@ def test_far_points_may_lie_farther_from_their_surface(rng: np.random.Generator)
         asked = np.column_stack([np.full(500, distance - 0.4), rng.uniform(-2, 2, (500, 2))])
         fit = measure_fit(asked, np.eye(4), local_map, CONFIG)
         assert fit.inlier_ratio == expected
+
+
+def street_normals(rng: np.random.Generator, along: int) -> FloatArray:
+    """(N, 3) of ground and facades along x, somewhat rough, and of so many surfaces that face along it."""
+    normals = np.zeros((2_000 + 1_000 + along, 3))
+    normals[:2_000, 2] = normals[2_000:3_000, 1] = normals[3_000:, 0] = 1.0
+    normals += rng.normal(scale=0.03, size=normals.shape)
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def test_of_a_scan_that_slides_along_a_street_what_constrains_it_is_not_supported(rng: np.random.Generator) -> None:
+    """One point in twelve shows the slide: the inlier ratio of all hardly changes, the support does."""
+    normals = street_normals(rng, along=270)
+    held, slid = (np.abs(normals @ [distance, 0.0, 0.0]) for distance in (0.05, 3.0))
+    assert directional_support(normals, held) > 0.99
+    assert directional_support(normals, slid) < 0.2
+    assert np.mean(slid < 1.0) > 0.9
+
+
+def test_a_direction_that_nothing_constrains_is_supported_as_the_rest_is(rng: np.random.Generator) -> None:
+    """In an even tunnel nothing shows a slide; that is a matter of degeneracy, not of the fit."""
+    normals = street_normals(rng, along=0)
+    assert directional_support(normals, np.full(len(normals), 0.1)) > 0.98
+
+
+def test_support_is_the_same_in_any_frame(rng: np.random.Generator) -> None:
+    normals, distances = street_normals(rng, along=270), rng.uniform(0.0, 2.0, 3_270)
+    turned = normals @ exp([0.3, -0.2, 1.0, 0.0, 0.0, 0.0])[:3, :3].T
+    assert directional_support(turned, distances) == pytest.approx(directional_support(normals, distances))
+
+
+@pytest.mark.parametrize(("support", "status"), [(0.7, Status.OK), (0.45, Status.DEGRADED), (0.2, Status.LOST)])
+def test_a_scan_that_may_slide_is_not_ok_however_much_of_it_lies_on_the_map(support: float, status: Status) -> None:
+    fit = Fit(1_000, 0.9, 0.01, 0.95, support)
+    assert fit.status(CONFIG) is status
+    assert ("slide" in fit.explain(CONFIG)) == (status is not Status.OK)

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from mapping.config import MappingConfig
-from mapping.prediction import Carrier, Prediction, Prior, State, predict
+from mapping.prediction import LEAST_SIGMA, Carrier, OdometryNoise, Prediction, Prior, State, predict
 
 VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s
 MOVED = exp(0.1 * VELOCITY)
@@ -14,10 +14,19 @@ OFF = np.array([0.03, -0.03, 0.03, 0.1, -0.1, 0.15])
 AS_TOLD = MappingConfig(prior_caution=1.0)
 
 
+# Of the pose of the last scan and of its velocity.
+POSE_SIGMA, VELOCITY_SIGMA = np.array([1e-7] * 3 + [1e-6] * 3), np.array([0.5] * 3 + [1.0] * 3)
+
+
 def predicted(prior: Prior, config: MappingConfig | None = None, pose: FloatArray | None = None) -> Prediction:
-    known = np.diag(np.array([0.02] * 3 + [0.05] * 3 + [0.5] * 3 + [1.0] * 3) ** 2)
+    known = np.diag(np.concatenate([POSE_SIGMA, VELOCITY_SIGMA]) ** 2)
     state = State(5.0, np.eye(4) if pose is None else pose, VELOCITY, known, seen_until_s=0.1)
     return predict(state, 5.1, prior, Carrier(), config or AS_TOLD)
+
+
+def motion_covariance(prediction: Prediction) -> FloatArray:
+    """(6, 6) of the pose, without what no pose is better than."""
+    return prediction.covariance[:6, :6] - np.diag(LEAST_SIGMA**2)
 
 
 def step(prediction: Prediction) -> FloatArray:
@@ -38,13 +47,13 @@ def test_without_an_odometry_the_sensor_goes_on() -> None:
 def test_an_odometry_that_is_sure_is_believed() -> None:
     prediction = predicted(Prior(MOVED @ exp(OFF), covariance=isotropic(1e-5)))
     np.testing.assert_allclose(step(prediction), OFF, atol=1e-4)
-    assert np.sqrt(np.diag(prediction.pose_covariance)).max() < 1.1e-5
+    assert np.sqrt(np.diag(motion_covariance(prediction))).max() < 1.1e-5
 
 
 def test_an_odometry_that_is_unsure_is_not() -> None:
     alone, with_prior = (predicted(p) for p in (Prior(), Prior(MOVED @ exp(OFF), covariance=isotropic(1e3))))
     np.testing.assert_allclose(step(with_prior), 0.0, atol=1e-6)
-    np.testing.assert_allclose(with_prior.pose_covariance, alone.pose_covariance, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(with_prior.covariance, alone.covariance, rtol=1e-4, atol=1e-9)
 
 
 def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
@@ -55,7 +64,7 @@ def test_each_direction_is_believed_as_its_own_covariance_says() -> None:
         prediction = predicted(Prior(MOVED @ exp(OFF), covariance=covariance), pose=pose)
         moved = log(inverse(pose @ MOVED) @ prediction.T_world_lidar)
         np.testing.assert_allclose(np.delete(moved, 3), np.delete(OFF, 3), atol=2e-3)
-        sigmas = np.sqrt(np.diag(prediction.pose_covariance))
+        sigmas = np.sqrt(np.diag(motion_covariance(prediction)))
         assert sigmas[3] > 0.005
         assert np.delete(sigmas, 3).max() < 2e-4
 
@@ -87,12 +96,12 @@ def test_velocities_are_believed_as_far_as_their_covariance_says(sigma: float, f
     np.testing.assert_allclose(prediction.velocity, VELOCITY + followed, atol=1e-3)
 
 
-def test_a_velocity_is_believed_less_than_the_motion_it_was_had_from() -> None:
-    """Twice the deviation: of a carrier that shakes from sweep to sweep the odometry tells a part only."""
-    sigma, widest = 1e-4, np.linalg.inv(predicted(Prior()).velocity_covariance)
-    prediction = predicted(Prior(velocity=VELOCITY, covariance=isotropic(sigma)), MappingConfig(prior_caution=1.0))
-    told = np.linalg.inv(prediction.velocity_covariance) - widest
-    np.testing.assert_allclose(np.diag(told), (2.0 * sigma / 0.1) ** -2, rtol=1e-6)
+def test_a_velocity_counts_with_twice_the_deviation_of_the_motion_it_is_derived_from() -> None:
+    sigma, before = 1e-4, np.linalg.inv(predicted(Prior()).covariance)
+    prediction = predicted(Prior(velocity=VELOCITY, covariance=isotropic(sigma)))
+    # The least deviation of a pose is added after the measurement: compared without it, where it is next to nothing.
+    gained = np.linalg.inv(prediction.covariance)[6:, 6:] - before[6:, 6:]
+    np.testing.assert_allclose(np.diag(gained), (2.0 * sigma / 0.1) ** -2, rtol=1e-2)
 
 
 def test_uncertainty_goes_along_with_the_sensor() -> None:
@@ -100,8 +109,67 @@ def test_uncertainty_goes_along_with_the_sensor() -> None:
     turning = np.array([0.0, 0.0, 0.5 * np.pi / 0.1, 0.0, 0.0, 0.0])
     covariance = np.diag(np.array([1e-4] * 3 + [0.5, 1e-4, 1e-4] + [1e-4] * 6) ** 2)
     prediction = predict(State(5.0, np.eye(4), turning, covariance, 0.1), 5.1, Prior(), Carrier(), MappingConfig())
-    sigmas = np.sqrt(np.diag(prediction.pose_covariance))
+    sigmas = np.sqrt(np.diag(prediction.covariance)[:6])
     assert sigmas[4] == pytest.approx(0.5, rel=0.01)
     assert sigmas[3] < 0.1
     A = adjoint(inverse(exp(0.1 * turning)))
     np.testing.assert_allclose((A @ [0, 0, 0, 1.0, 0, 0])[3:], [0.0, -1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("seen_from_s", [0.0, 0.05, 0.1], ids=["stamped at the start", "in the middle", "at the end"])
+def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_another(seen_from_s: float) -> None:
+    """Monte Carlo: each sweep at its own velocity, the second beginning where the first ended."""
+    rng, count, sigma = np.random.default_rng(1), 200_000, 15.0 * 0.1
+    before = rng.normal(scale=VELOCITY_SIGMA[3], size=count)
+    after = before + rng.normal(scale=sigma, size=count)
+    way = before * (0.1 - seen_from_s) + after * seen_from_s
+    known = np.diag(np.concatenate([np.full(6, 1e-9), np.full(6, VELOCITY_SIGMA[3])]) ** 2)
+    state = State(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.1 - seen_from_s)
+    covariance = predict(state, 5.1, Prior(), Carrier(translation=15.0), MappingConfig(), seen_from_s).covariance
+    joint = covariance[np.ix_([4, 10], [4, 10])]
+    uneven = (15.0 * 0.1**2 / 8.0) ** 2 + LEAST_SIGMA[4] ** 2
+    np.testing.assert_allclose(joint - np.diag([uneven, 0.0]), np.cov(way, after), rtol=0.02, atol=2e-4)
+
+
+def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable() -> None:
+    """Independent, both would be likely; it is the correlation that keeps the one from making up for the other."""
+    known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
+    state = State(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.05)
+    covariance = predict(state, 5.1, Prior(), Carrier(), MappingConfig(), 0.05).covariance
+    back_and_fast = np.zeros(12)
+    back_and_fast[3], back_and_fast[9] = -0.05, 1.0
+    forth_and_fast = np.abs(back_and_fast)
+    squared = [error @ np.linalg.solve(covariance, error) for error in (back_and_fast, forth_and_fast)]
+    assert squared[0] > 20.0
+    assert squared[1] < 1.0
+
+
+def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was() -> None:
+    """However sure the odometry is, the next pose is no better known than the last."""
+    known = np.diag(np.array([1e-6] * 3 + [0.3] * 3 + [1e-6] * 6) ** 2)
+    state = State(5.0, np.eye(4), np.zeros(6), known)
+    prediction = predict(state, 5.1, Prior(np.eye(4), covariance=isotropic(1e-6)), Carrier(), AS_TOLD)
+    np.testing.assert_allclose(np.sqrt(np.diag(prediction.covariance))[3:6], 0.3, rtol=1e-3)
+
+
+def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted() -> None:
+    moved = exp(0.1 * VELOCITY)
+    assert not predicted(Prior(moved, covariance=isotropic(0.01))).contradicted
+    assert not predicted(Prior()).contradicted
+    known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
+    driving = State(5.0, np.eye(4), np.array([0.0, 0.0, 0.0, 11.0, 0.0, 0.0]), known, 0.1)
+    standing = Prior(np.eye(4), covariance=isotropic(0.01))
+    assert predict(driving, 5.1, standing, Carrier(), AS_TOLD).contradicted
+    doubted = OdometryNoise(variance=1e4)
+    assert not predict(driving, 5.1, standing, Carrier(), AS_TOLD, noise=doubted).contradicted
+
+
+def test_the_noise_of_an_odometry_follows_its_errors() -> None:
+    rng, noise = np.random.default_rng(0), OdometryNoise()
+    for _ in range(200):
+        noise = noise.seen(Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.01, size=6)), AS_TOLD)
+    assert noise.variance < 2.5
+    for _ in range(200):
+        noise = noise.seen(Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.1, size=6)), AS_TOLD)
+    assert 50.0 < noise.variance < 200.0
+    assert noise.seen(Prior(), MOVED, AS_TOLD) == noise

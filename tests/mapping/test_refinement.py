@@ -74,7 +74,7 @@ def predicted(
     """A prediction that is hardly trusted."""
     variances = np.array([np.deg2rad(rotation_deg)] * 3 + [metres] * 3) ** 2
     motion = np.zeros(6) if velocity is None else velocity
-    return Prediction(T_world_lidar, motion, np.diag(variances), np.diag(100.0 * variances))
+    return Prediction(T_world_lidar, motion, np.diag(np.concatenate([variances, 100.0 * variances])))
 
 
 def register(
