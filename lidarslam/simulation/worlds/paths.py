@@ -96,6 +96,13 @@ def distance_to_loop(xy: FloatArray, loop: FloatArray) -> FloatArray:
     return np.asarray(distance)
 
 
+def beside_loop(loop: FloatArray, index: int, left_m: float) -> tuple[FloatArray, float]:
+    """A place (2,) to the left of a point of the closed polyline (M, 2), and the polyline's heading there."""
+    ahead = loop[(index + 1) % len(loop)] - loop[index - 1]
+    yaw = float(np.arctan2(ahead[1], ahead[0]))
+    return loop[index] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+
+
 def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:
     """Points (N, 3) on the ground at (N, 2)."""
     return np.column_stack([xy, ground.height_at(xy)])

@@ -14,6 +14,7 @@ WORLDS: dict[str, str] = {
     "forest": "lidarslam.simulation.worlds.forest",
     "hall": "lidarslam.simulation.worlds.hall",
     "park": "lidarslam.simulation.worlds.park",
+    "fields": "lidarslam.simulation.worlds.fields",
 }
 
 
