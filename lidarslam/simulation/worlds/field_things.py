@@ -90,8 +90,8 @@ def trees(green: Builder, rng: np.random.Generator, road: FloatArray, ground: He
     """Single trees far from one another, and some bushes."""
     low, high = road.min(axis=0) - 0.7 * farthest_m, road.max(axis=0) + 0.7 * farthest_m
     stands = np.empty((0, 2))
-    for where in rng.uniform(low, high, (150, 2)):
-        distance = float(distance_to_loop(where[None], road)[0])
+    darts = rng.uniform(low, high, (150, 2))
+    for where, distance in zip(darts, distance_to_loop(darts, road), strict=True):
         apart = np.linalg.norm(stands - where, axis=1).min(initial=np.inf)
         if not _KEEP_OFF_M + 2.0 < distance < 0.8 * farthest_m or apart < 55.0:
             continue

@@ -61,11 +61,11 @@ def _road(rng: np.random.Generator) -> FloatArray:
 
 
 def _distances(road: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The ground's lowest corner (2,), and the distances (X, Y) of its grid points from the middle of the road."""
+    """The ground's lowest corner (2,), and how far (X, Y) its grid points are from the road's middle, up to 12 m."""
     low = np.floor(road.min(axis=0) - _MARGIN_M)
     shape = tuple(np.ceil((road.max(axis=0) + _MARGIN_M - low) / _CELL_M).astype(int) + 1)
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    return low, distance_to_loop((low + _CELL_M * grid).reshape(-1, 2), road).reshape(shape)
+    return low, distance_to_loop((low + _CELL_M * grid).reshape(-1, 2), road, 12.0).reshape(shape)
 
 
 def _ground(rng: np.random.Generator, low: FloatArray, distance: FloatArray) -> HeightField:

@@ -15,6 +15,7 @@ WORLDS: dict[str, str] = {
     "hall": "lidarslam.simulation.worlds.hall",
     "park": "lidarslam.simulation.worlds.park",
     "fields": "lidarslam.simulation.worlds.fields",
+    "terrace": "lidarslam.simulation.worlds.terrace",
 }
 
 
