@@ -17,6 +17,7 @@ _SPEED_LIMIT_MPS = 14.0  # 50 km/h
 # Hardly a slope: houses that step up with it would tell one from another.
 _HILLS_M = (0.05, 0.15)
 _PARKED_SHARE = (0.02, 0.08)
+_STOREYS = (2, 3)
 _HOUSES_PER_LAMP = 5
 # Grass between kerb and pavement.
 _VERGE_M = (0.4, 1.8)
@@ -33,7 +34,7 @@ def build(seed: int) -> World:
     survey.repeat(width, depth)
     solid = Builder()
     lay_kerbs(solid, plan, ground)
-    _houses(solid, house(rng, width, depth, (False, False)), survey, ground)
+    _houses(solid, house(rng, width, depth, (False, False), _STOREYS), survey, ground)
     _lamps(solid, plan, ground, _HOUSES_PER_LAMP * width)
     park_cars(solid, rng, plan, ground, _PARKED_SHARE)
     return World(
