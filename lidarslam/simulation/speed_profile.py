@@ -46,7 +46,7 @@ def round_and_round(
     speeds = _within_acceleration(three, limits, acceleration)[middle]
     times = _arrivals(positions, speeds)
     steps = int(np.ceil(times[-1] / TIME_STEP_S))
-    travelled = _travelled(positions, speeds, times, (times[-1] / steps) * np.arange(steps + 1))
+    travelled = _travelled(positions, speeds, times, float(times[-1]) / steps * np.arange(steps + 1))
     laps = np.concatenate([travelled[:-1] - lap, travelled, travelled[1:] + lap])
     smooth = smoothed(laps, smoothing_s)
     rates = np.gradient(smooth, TIME_STEP_S)
