@@ -27,7 +27,7 @@ def rest_to_rest(
     limits[[0, -1]] = 0.0
     speeds = _within_acceleration(positions, limits, acceleration)
     times = _arrivals(positions, speeds)
-    moments = TIME_STEP_S * np.arange(int(np.ceil(times[-1] / TIME_STEP_S)) + 1)
+    moments = TIME_STEP_S * np.arange(int(np.ceil(times[-1] / TIME_STEP_S)) + 1, dtype=np.float64)
     smooth = smoothed(_travelled(positions, speeds, times, moments), smoothing_s, ends="rest")
     return smooth, np.gradient(smooth, TIME_STEP_S)
 
@@ -46,7 +46,7 @@ def round_and_round(
     speeds = _within_acceleration(three, limits, acceleration)[middle]
     times = _arrivals(positions, speeds)
     steps = int(np.ceil(times[-1] / TIME_STEP_S))
-    travelled = _travelled(positions, speeds, times, float(times[-1]) / steps * np.arange(steps + 1))
+    travelled = _travelled(positions, speeds, times, float(times[-1]) / steps * np.arange(steps + 1, dtype=np.float64))
     laps = np.concatenate([travelled[:-1] - lap, travelled, travelled[1:] + lap])
     smooth = smoothed(laps, smoothing_s)
     rates = np.gradient(smooth, TIME_STEP_S)
