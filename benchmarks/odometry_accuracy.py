@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _print(read(source), methods)
     for world in options.worlds:
         for motion in options.motions:
-            _print(simulate(world, motion, options.sensor, options.scans, options.seed), methods)
+            _print(simulate(world, motion, options.sensor, options.scans, options.seed, options.speed), methods)
 
 
 def network_alone(weights: Path | None) -> LearnedConfig:
