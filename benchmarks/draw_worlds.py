@@ -1,6 +1,9 @@
-"""Draw the exact map of every simulated world, as one lap of its route sees it.
+r"""Draw the exact map of every simulated world, as one lap of its route sees it.
 
-python benchmarks/draw_worlds.py --out docs/pictures
+    python benchmarks/draw_worlds.py --out docs/pictures --worlds street office tunnel forest hall park
+    python benchmarks/draw_worlds.py --out docs/pictures --worlds terrace --scans 40 --width 800
+    python benchmarks/draw_worlds.py --out docs/pictures --worlds fields --motion car-fast --sensor hdl-64e \
+        --scans 150 --width 800
 """
 
 import argparse
@@ -15,16 +18,20 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 
 
-def draw_world(name: str, seed: int, motion: str, sensor: str, path: Path) -> int:
-    """Draw one world; how many points its map has."""
+def simulate(name: str, seed: int, motion: str, sensor: str, scans: int | None) -> Simulation:
+    """A lap of a world's route, or its first scans."""
     world = build_world(name, seed)
     carried = motion_along_route(motion, world, seed)
     device = find_sensor(sensor)
-    scans = int(carried.duration_s * device.rate_hz)
+    lap = int(carried.duration_s * device.rate_hz)
     T_body_lidar = mount_pose("upright", carried.sensor_height_m)
-    simulation = Simulation(world, device, carried, T_body_lidar, scans, seed)
-    seen = reference_map(simulation, step=max(1, scans // 200))
-    camera = Camera(azimuth_deg=-60.0, elevation_deg=38.0)
+    return Simulation(world, device, carried, T_body_lidar, min(lap, scans or lap), seed)
+
+
+def draw_map(simulation: Simulation, path: Path, width: int) -> int:
+    """Draw what a simulation sees; how many points its map has."""
+    seen = reference_map(simulation, step=max(1, len(simulation) // 200))
+    camera = Camera(azimuth_deg=-60.0, elevation_deg=38.0, width=width, height=9 * width // 16)
     save_picture(path, draw(seen.points, height_colours(seen.points), seen.normals, camera))
     return len(seen.points)
 
@@ -36,12 +43,15 @@ def main() -> None:
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
     parser.add_argument("--motion", default="car")
     parser.add_argument("--sensor", default="os0-64")
+    parser.add_argument("--scans", type=int, help="draw what the first scans see; default: a lap")
+    parser.add_argument("--width", type=int, default=1600, help="pixels")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.worlds:
         path = arguments.out / f"{name}.png"
-        points = draw_world(name, arguments.seed, arguments.motion, arguments.sensor, path)
+        simulation = simulate(name, arguments.seed, arguments.motion, arguments.sensor, arguments.scans)
+        points = draw_map(simulation, path, arguments.width)
         print(f"{path}: {points:,} points", flush=True)
 
 

@@ -92,16 +92,18 @@ def read(source: Path) -> Recorded:
     return Recorded(recording.name, list(in_order(recording.scans())), truth)
 
 
-def simulate(world: str, motion: str, sensor: str, scans: int, seed: int) -> Recorded:
+def simulate(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None) -> Recorded:
     """A recording straight from the simulator."""
-    simulation = make_simulation(world, motion, sensor, scans, seed)
+    simulation = make_simulation(world, motion, sensor, scans, seed, speed_mps)
     return Recorded(f"{world}, {motion}", list(simulation.scans()), simulation.ground_truth)
 
 
-def make_simulation(world: str, motion: str, sensor: str, scans: int, seed: int) -> Simulation:
-    """An upright sensor going round a world's route."""
+def make_simulation(
+    world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None = None
+) -> Simulation:
+    """An upright sensor going round a world's route, at the motion's own speed or another."""
     place = build_world(world, seed)
-    carried = motion_along_route(motion, place, seed)
+    carried = motion_along_route(motion, place, seed, speed_mps)
     return Simulation(place, find_sensor(sensor), carried, mount_pose("upright", carried.sensor_height_m), scans, seed)
 
 
@@ -224,13 +226,14 @@ def add_simulation_arguments(
     parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
     parser.add_argument("--scans", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--speed", type=float, help="metres a second; default: the motion's own")
 
 
 def simulated_recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
     """Every world with every motion, one in memory at a time."""
     for world in arguments.worlds:
         for motion in arguments.motions:
-            yield simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed)
+            yield simulate(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)
 
 
 def recordings(arguments: argparse.Namespace, most: int | None = None) -> Iterator[Recorded]:

@@ -14,9 +14,9 @@ from lidarslam.simulation.worlds.registry import WORLDS
 from odometry.config import KissConfig
 
 
-def run_one(world: str, motion: str, sensor: str, scans: int, seed: int) -> str:
+def run_one(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None) -> str:
     """One cell of the table."""
-    outcome = run_kiss(simulate(world, motion, sensor, scans, seed), KissConfig())
+    outcome = run_kiss(simulate(world, motion, sensor, scans, seed, speed_mps), KissConfig())
     return f"{outcome.ate_m:.2f} ({outcome.length_m:.0f} m)"
 
 
@@ -29,7 +29,8 @@ def main() -> None:
     print_row(["---"] * (1 + len(arguments.motions)))
     for world in arguments.worlds:
         cells = [
-            run_one(world, motion, arguments.sensor, arguments.scans, arguments.seed) for motion in arguments.motions
+            run_one(world, motion, arguments.sensor, arguments.scans, arguments.seed, arguments.speed)
+            for motion in arguments.motions
         ]
         print_row([world, *cells])
 

@@ -21,6 +21,7 @@ class Simulated(_Model):
     world: str = "office"
     sensor: str = "vlp-16"
     motion: str = "handheld"
+    speed_mps: float | None = Field(None, gt=0.0, description="null: as the motion and the world have it")
     mount: str = "upright"
     scans: int = Field(300, ge=1)
     seed: int = Field(0, ge=0)

@@ -26,7 +26,7 @@ _GEOMETRIC: dict[str, LossConfig] = {
 
 
 class SimulatedConfig(BaseModel):
-    """Recordings that are simulated for the training, of all worlds, sensors and carriers."""
+    """Recordings that are simulated for the training, of the worlds, sensors and carriers of the mixture."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

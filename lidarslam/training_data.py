@@ -16,9 +16,7 @@ from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.scan_order import in_order
-from lidarslam.simulation.mixture import Ingredients, ingredients_of, mixture
-from lidarslam.simulation.sensor_table import SENSORS
-from lidarslam.simulation.worlds.registry import WORLDS
+from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Ingredients, ingredients_of, mixture
 from lidarslam.train_config import SimulatedConfig
 from odometry.image_config import ImageConfig
 from odometry.preparation import PreparedRecording, prepare
@@ -85,10 +83,10 @@ def simulated(config: SimulatedConfig) -> list[Stretch]:
     """The simulated recordings; their worlds are built when they are needed.
 
     Raises:
-        ConfigError: a world or sensor that they are to be of does not exist, or there is none of that kind.
+        ConfigError: a world or sensor that they are to be of is not in the mixture, or there is none of that kind.
     """
-    _require_known("simulated.worlds", config.worlds, WORLDS)
-    _require_known("simulated.sensors", config.sensors, SENSORS)
+    _require_known("simulated.worlds", config.worlds, MIXED_WORLDS)
+    _require_known("simulated.sensors", config.sensors, SENSOR_WEIGHTS)
     chosen = [number for number in range(config.recordings) if _is_wanted(ingredients_of(number, config.seed), config)]
     if config.recordings and not chosen:
         raise ConfigError(

@@ -44,6 +44,7 @@ def _formats() -> Iterable[str]:
     cls=CommandWithExample,
     epilog="""lidarslam simulate --out recordings/office
     lidarslam simulate --out recordings/street --world street --sensor hdl-64e --motion car --format kitti
+    lidarslam simulate --out recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
     lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000""",
 )
 @click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that the recording is made in.")
@@ -53,6 +54,13 @@ def _formats() -> Iterable[str]:
     "--motion",
     type=Registered(_motions),
     help="What carries the LiDAR.  [default: handheld; car on a trajectory]",
+)
+@click.option(
+    "--speed",
+    "speed_mps",
+    type=click.FloatRange(min=0.1, max=60.0),
+    metavar="M/S",
+    help="How fast it goes where no bend slows it down.  [default: as what carries it does, within the route's limit]",
 )
 @click.option(
     "--trajectory",

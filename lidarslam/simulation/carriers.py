@@ -37,6 +37,8 @@ class Carrier:
         footprint_m: radius over which it averages the ground.
         leans_with_ground: whether it takes the ground's pitch and roll.
         banks: whether it leans into its accelerations, as what flies must.
+        keeps_going: whether it is at speed when a lap begins, and laps follow one another without a halt; else they
+            begin and end at rest.
         flight_height_m: above the ground, where the route is high enough; 0 for what does not fly.
         sensor_height_m: of the LiDAR above the body's origin, which is on the ground or is the flying body.
         smoothing_s: half the time over which accelerations set in.
@@ -57,18 +59,17 @@ class Carrier:
     swings_deg: tuple[float, ...] = ()
     leans_with_ground: bool = True
     banks: bool = False
+    keeps_going: bool = False
     flight_height_m: float = 0.0
     sway: tuple[Swing, ...] = ()
 
 
+_SUSPENSION = (Swing("pitch", 0.25, 1.3), Swing("roll", 0.25, 1.1), Swing("z", 0.01, 1.3))
 _RUMBLE = (Swing("z", 0.0015, 6.0), Swing("roll", 0.25, 4.3), Swing("pitch", 0.25, 5.1))
 # Heights: 1.73 m is KITTI's. The legged robot's gait of 2 Hz and its amplitudes are those of a trotting quadruped of
 # 30 to 50 kg, the pedestrian's of a LiDAR on a hand-held stick; both are round figures, not measurements.
 _TABLE = (
-    Carrier(
-        "car", 12.0, 1.8, 2.4, 45.0, 60.0, 135.0, 1.0, 1.3, 1.73, smoothing_s=0.5,
-        sway=(Swing("pitch", 0.25, 1.3), Swing("roll", 0.25, 1.1), Swing("z", 0.01, 1.3)),
-    ),
+    Carrier("car", 12.0, 1.8, 2.4, 45.0, 60.0, 135.0, 1.0, 1.3, 1.73, smoothing_s=0.5, sway=_SUSPENSION),
     Carrier(
         "handheld", 1.3, 0.8, 1.0, 80.0, 200.0, 135.0, 0.3, 0.4, 1.5, smoothing_s=0.3, leans_with_ground=False,
         sway=(
@@ -97,6 +98,10 @@ _TABLE = (
             Swing("z", 0.25, 0.09), Swing("y", 0.08, 0.17), Swing("x", 0.03, 0.29), Swing("yaw", 3.0, 0.13),
             Swing("roll", 0.6, 0.9), Swing("pitch", 0.6, 0.8),
         ),
+    ),
+    Carrier(
+        "car-fast", 20.0, 2.5, 3.5, 45.0, 60.0, 135.0, 1.0, 1.3, 1.73, smoothing_s=0.5, keeps_going=True,
+        sway=_SUSPENSION,
     ),
 )  # fmt: skip
 CARRIERS: dict[str, Carrier] = {carrier.name: carrier for carrier in _TABLE}

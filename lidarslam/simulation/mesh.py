@@ -110,6 +110,11 @@ def world_mesh(world: World) -> Mesh:
     return merge([box_mesh(world.boxes), cylinder_mesh(world.cylinders), *grounds])
 
 
+def first_ground_triangle(world: World) -> int:
+    """Number in `world_mesh` of the first triangle of the height fields, which are its last."""
+    return len(_BOX_TRIANGLES) * len(world.boxes) + 4 * CYLINDER_SIDES * len(world.cylinders)
+
+
 def _prism_triangles(n: int) -> IntArray:
     """(4 n, 3) triangles of a prism: vertices 0 and 1 the ends' centres, then n around the start, n around the end."""
     k = np.arange(n, dtype=np.int32)

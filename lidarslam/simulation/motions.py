@@ -46,10 +46,12 @@ class Motion:
         name: of the carrier, or of the trajectory that is followed.
         times: (K,) from 0 to `duration_s`.
         base: (K, 7) world position, roll, pitch, yaw and activity (0 to 1) at the times; cubic splines go through
-            them, at rest at either end. R_world_body = Rz(yaw) Ry(pitch) Rx(roll).
+            them. R_world_body = Rz(yaw) Ry(pitch) Rx(roll).
         sway: what comes on top, seeded.
         sensor_height_m: how far above the body's origin a LiDAR sits.
         repeats: whether another lap follows a lap; else the body stays where it is in the end.
+        rests: whether a lap begins and ends at rest; else its last pose is its first, whole turns of yaw aside, and the
+            next lap follows without a halt.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Motion:
     sway: Sway
     sensor_height_m: float
     repeats: bool = True
+    rests: bool = True
 
     def __post_init__(self) -> None:
         if self.base.shape != (len(self.times), len(CHANNELS)) or self.times[0] != 0.0:
@@ -65,11 +68,13 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
-        """Time of one lap; it begins with a second at rest."""
+        """Time of one lap."""
         return float(self.times[-1])
 
     @cached_property
     def _spline(self) -> CubicSpline[np.float64]:
+        if self.repeats and not self.rests:
+            return _closed_spline(self.times, self.base)
         return CubicSpline(self.times, self.base, bc_type="clamped" if self.repeats else "natural")
 
     def pose_at(self, times: FloatArray) -> FloatArray:
@@ -83,6 +88,20 @@ class Motion:
         dx, dy = x - state[:, 0], y - state[:, 1]
         position = np.stack([state[:, 0] + c * dx - s * dy, state[:, 1] + s * dx + c * dy, z], axis=-1)
         return make_transform(rotations(roll, pitch, yaw), position)
+
+
+def _closed_spline(times: FloatArray, values: FloatArray) -> CubicSpline[np.float64]:
+    """Through values (K, D) at times (K,), with equal derivatives at either end, whatever the values differ by there.
+
+    A periodic spline of what is left without a linear trend, and the trend on top.
+    """
+    slope = (values[-1] - values[0]) / times[-1]
+    level = values - np.multiply.outer(times, slope)
+    level[-1] = level[0]
+    spline = CubicSpline(times, level, bc_type="periodic")
+    spline.c[2] += slope
+    spline.c[3] += np.multiply.outer(times[:-1], slope)
+    return spline
 
 
 def rotations(roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:

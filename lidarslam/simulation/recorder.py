@@ -11,11 +11,16 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.caster import Caster, Hits
+from lidarslam.simulation.grass import ranges_in_grass
+from lidarslam.simulation.mesh import first_ground_triangle
 from lidarslam.simulation.motions import Motion
 from lidarslam.simulation.noise import bloom, intensities, measure, reflectivity, scan_rng
 from lidarslam.simulation.scan_patterns import Rays
 from lidarslam.simulation.sensor import Sensor
-from lidarslam.simulation.world import World
+from lidarslam.simulation.world import Grass, World
+
+# Blades stand every way; half of a beam's power is what they reflect on average.
+_BLADE_COSINE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +30,8 @@ class SimulatedScan:
     Attributes:
         scan: points exact in float32, stamped at the sweep's start, as the drivers' message headers are.
         intensities: (N,) float32, whole numbers from 0 to 255.
-        true_ranges: (N,) float64 along the rays that were measured, before noise and edge effects; inf where a point
-            came from its neighbour's surface alone. None if unknown.
+        true_ranges: (N,) float64 along the rays that were measured, before noise, edge effects and grass; inf where a
+            point came from its neighbour's surface alone. None if unknown.
         moving: (N,) whether the ray met something that moves; None if unknown.
     """
 
@@ -128,6 +133,8 @@ class Simulation:
         ranges, bloomed = bloom(model, hits.ranges, pattern.lasers, pattern.column_angle, rng)
         # What only grazes an edge meets no surface whose slant would matter.
         cosines = np.where(bloomed, 1.0, hits.cosines)
+        if self.world.grass is not None:
+            ranges, cosines = self._through_grass(self.world.grass, echoes, ranges, cosines, ~bloomed, rng)
         shares = reflectivity(hits.surfaces)
         measured = measure(model, ranges, cosines, shares, rng)
         returned = np.flatnonzero(np.isfinite(measured))
@@ -140,6 +147,24 @@ class Simulation:
         )
         brightness = intensities(cosines[returned], shares[returned])
         return SimulatedScan(scan, brightness, hits.ranges[returned], hits.moving[returned])
+
+    def _through_grass(
+        self,
+        grass: Grass,
+        echoes: Echoes,
+        ranges: FloatArray,
+        cosines: FloatArray,
+        is_clear: NDArray[np.bool_],
+        rng: np.random.Generator,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Ranges and cosines (N,) of a sweep's rays; of those that meet the ground, some end at a blade before it."""
+        ground = np.flatnonzero(is_clear & (echoes.hits.surfaces >= first_ground_triangle(self.world)))
+        points = echoes.origins[ground] + ranges[ground, None] * echoes.directions[ground]
+        shortened, is_blade = ranges_in_grass(grass, points, ranges[ground], cosines[ground], rng)
+        ranges, cosines = ranges.copy(), cosines.copy()
+        ranges[ground] = shortened
+        cosines[ground[is_blade]] = _BLADE_COSINE
+        return ranges, cosines
 
     def echoes(self, index: int) -> Echoes:
         """What the rays of one sweep meet in truth, every one cast from the pose at its own time."""

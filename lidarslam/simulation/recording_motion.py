@@ -33,10 +33,14 @@ def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[M
     What leans with the ground follows a trajectory on the ground, everything else takes its poses as they are.
 
     Raises:
-        InputError: there is no such carrier, or the trajectory cannot be followed or is too short.
+        InputError: there is no such carrier, it cannot go along the route, or the trajectory cannot be followed, is too
+            short, or comes with a speed.
     """
     if request.trajectory is None:
-        return motion_along_route(request.motion, world, request.seed), request.scans or _SCANS
+        motion = motion_along_route(request.motion, world, request.seed, request.speed_mps)
+        return motion, request.scans or _SCANS
+    if request.speed_mps is not None:
+        raise InputError(f"{request.trajectory}: a trajectory has its own speed; leave out --speed")
     trajectory = read_trajectory(request.trajectory)
     carrier = find_carrier(request.motion)
     smoothing_s = _smoothing_s(request.trajectory)

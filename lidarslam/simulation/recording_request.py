@@ -14,6 +14,7 @@ class RecordRequest:
         scans: how many; None: 300, or as many as the trajectory lasts.
         seed: of the world, the motion and the noise; the same request gives the same bytes.
         trajectory: TUM or KITTI file to move along instead of the world's route; `motion` is what moves along it.
+        speed_mps: of the carrier where no bend slows it down, instead of its own and of the route's limit.
         overwrite: whether an earlier recording in `out` is replaced.
     """
 
@@ -26,6 +27,7 @@ class RecordRequest:
     seed: int
     format: str
     trajectory: Path | None = None
+    speed_mps: float | None = None
     overwrite: bool = False
 
 

@@ -22,7 +22,10 @@ def command_line(request: RecordRequest, summary: RecordingSummary) -> str:
     words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
     if request.trajectory is not None:
         words += ["--trajectory", str(request.trajectory)]
-    words += ["--motion", request.motion, "--mount", request.mount]
+    words += ["--motion", request.motion]
+    if request.speed_mps is not None:
+        words += ["--speed", f"{request.speed_mps:g}"]
+    words += ["--mount", request.mount]
     words += ["--scans", str(summary.scans), "--seed", str(request.seed)]
     return shlex.join([*words, "--format", request.format])
 
@@ -97,7 +100,8 @@ def _rows(request: RecordRequest, summary: RecordingSummary) -> Iterator[tuple[s
 
 
 def _motion(request: RecordRequest) -> str:
-    return f"{request.motion} along {request.trajectory.name}" if request.trajectory else request.motion
+    speed = f" at {request.speed_mps:g} m/s" if request.speed_mps is not None else ""
+    return f"{request.motion} along {request.trajectory.name}" if request.trajectory else request.motion + speed
 
 
 def _item(text: str) -> list[str]:

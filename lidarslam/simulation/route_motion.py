@@ -5,12 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.carriers import Carrier, Swing, find_carrier
 from lidarslam.simulation.ground_contact import ground_under
 from lidarslam.simulation.motions import CHANNELS, Motion, Sway
 from lidarslam.simulation.rounded_path import RoundedPath, corner_windows, straightened, turning_angles
-from lidarslam.simulation.speed_profile import TIME_STEP_S, invert, rest_to_rest, smoothed
+from lidarslam.simulation.speed_profile import TIME_STEP_S, invert, rest_to_rest, round_and_round, smoothed
 from lidarslam.simulation.world import World
 
 _REST_S = 1.0  # at the start of every lap
@@ -42,25 +43,31 @@ class _Stretch:
     yaw: FloatArray
 
 
-def motion_along_route(name: str, world: World, seed: int) -> Motion:
+def motion_along_route(name: str, world: World, seed: int, speed_mps: float | None = None) -> Motion:
     """The named carrier on the world's route, its speed and sway varied by the seed.
 
     A lap starts and ends in the middle of the route's longest leg. Corners are rounded as far as the carrier and the
     route's free side allow, or taken by turning on the spot.
 
+    Args:
+        name: of the carrier.
+        world: whose route it is.
+        seed: of speed and sway.
+        speed_mps: instead of the carrier's own and of the route's limit; bends are taken more slowly all the same.
+
     Raises:
-        InputError: there is no such carrier.
+        InputError: there is no such carrier, or it does not stop and the route has a corner that asks for it.
     """
     carrier = find_carrier(name)
     rng = np.random.default_rng([seed, *name.encode()])
     carrier = replace(carrier, speed_mps=carrier.speed_mps * rng.uniform(0.85, 1.1))
-    stretches = _stretches(carrier, world)
-    xy, lift, rise, yaw = (
-        np.concatenate([getattr(stretch, part) for stretch in stretches]) for part in ("xy", "lift", "rise", "yaw")
-    )
-    base = _on_the_ground(carrier, world, _Stretch(xy, lift, rise, yaw))
+    if speed_mps is not None:
+        carrier = replace(carrier, speed_mps=speed_mps)
+        world = replace(world, route=replace(world.route, speed_limit_mps=speed_mps))
+    base = _circuit(carrier, world) if carrier.keeps_going else _from_rest(carrier, world)
     times = np.linspace(0.0, TIME_STEP_S * (len(base) - 1), len(base))
-    return Motion(name, times, base, seeded_sway(carrier, rng), carrier.sensor_height_m)
+    sway = seeded_sway(carrier, rng)
+    return Motion(name, times, base, sway, carrier.sensor_height_m, rests=not carrier.keeps_going)
 
 
 def seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
@@ -80,6 +87,31 @@ def seeded_sway(carrier: Carrier, rng: np.random.Generator) -> Sway:
         tuple(frequency(swing) for swing in carrier.sway),
         tuple(rng.uniform(0.0, 2.0 * np.pi) for _ in carrier.sway),
     )
+
+
+def _from_rest(carrier: Carrier, world: World) -> FloatArray:
+    """The base (N, 7) of a lap that begins and ends at rest."""
+    stretches = _stretches(carrier, world)
+    parts = (np.concatenate([getattr(one, part) for one in stretches]) for part in ("xy", "lift", "rise", "yaw"))
+    return _on_the_ground(carrier, world, _Stretch(*parts))
+
+
+def _circuit(carrier: Carrier, world: World) -> FloatArray:
+    """The base (N, 7) of a lap at speed throughout, whose last pose is its first but for whole turns of yaw."""
+    corners = _lap(carrier, world)[1:-1]
+    if np.abs(turning_angles(corners)).max() > np.deg2rad(carrier.stop_angle_deg):
+        raise InputError(f"{carrier.name} does not stop, and the route of {world.name} has a corner to turn round at")
+    way = _drive(carrier, world, corners, is_closed=True)
+    # Rates and averages over time need what comes before the lap and after it.
+    count = round(_REST_S / TIME_STEP_S)
+    turn = np.array(way.yaw[-1] - way.yaw[0])
+
+    def around(values: FloatArray, gain: FloatArray) -> FloatArray:
+        return np.concatenate([values[-count - 1 : -1] - gain, values, values[1 : count + 1] + gain])
+
+    none = np.zeros(())
+    wider = _Stretch(around(way.xy, none), around(way.lift, none), around(way.rise, none), around(way.yaw, turn))
+    return _on_the_ground(carrier, world, wider)[count:-count]
 
 
 def _stretches(carrier: Carrier, world: World) -> list[_Stretch]:
@@ -118,12 +150,16 @@ def _lap(carrier: Carrier, world: World) -> FloatArray:
     return np.concatenate([[middle], vertices, [middle]])
 
 
-def _drive(carrier: Carrier, world: World, vertices: FloatArray) -> _Stretch:
+def _drive(carrier: Carrier, world: World, vertices: FloatArray, is_closed: bool = False) -> _Stretch:
+    """From rest to rest along a polyline (M, 3), or at speed round a closed one from the middle of its last leg."""
     route = world.route
+    if is_closed:
+        vertices = np.concatenate([vertices[-2:], vertices, vertices[:2]])
     cut = max(min(route.free_side_m - carrier.half_width_m, route.corner_radius_m), 0.2 * route.free_side_m)
     windows = corner_windows(vertices, _LARGEST_WINDOW_M, cut)
     path = RoundedPath(vertices, windows)
-    u = np.linspace(0.0, path.lengths[-1], max(int(path.lengths[-1] / _PATH_STEP_M), 20) + 1)
+    begin, end = (path.lengths[[1, -3]] + path.lengths[[2, -2]]) / 2.0 if is_closed else path.lengths[[0, -1]]
+    u = np.linspace(begin, end, max(int((end - begin) / _PATH_STEP_M), 20) + 1)
     _, first, second = path.at(u)
     stretch = np.hypot(first[:, 0], first[:, 1])
     s = np.concatenate([[0.0], np.cumsum(0.5 * (stretch[1:] + stretch[:-1]) * np.diff(u))])
@@ -131,8 +167,9 @@ def _drive(carrier: Carrier, world: World, vertices: FloatArray) -> _Stretch:
     bend = np.maximum(bend, 1e-6)
     limits = np.minimum(np.sqrt(carrier.side_acceleration / bend), np.deg2rad(carrier.turn_rate_deg) / bend)
     limits = np.minimum(limits, min(carrier.speed_mps, route.speed_limit_mps))
-    travelled, _ = rest_to_rest(s, limits, carrier.acceleration, carrier.smoothing_s)
-    u = np.clip(np.maximum.accumulate(invert(s, u)(travelled)), 0.0, u[-1])
+    profile = round_and_round if is_closed else rest_to_rest
+    travelled, _ = profile(s, limits, carrier.acceleration, carrier.smoothing_s)
+    u = np.clip(np.maximum.accumulate(invert(s, u)(travelled)), begin, end)
     where, first, _ = path.at(u)
     # A ramp's foot is rounded by no more than the body's own length.
     lift, climb, _ = RoundedPath(vertices, np.minimum(windows, 2.0 * carrier.footprint_m)).at(u)

@@ -44,18 +44,32 @@ def _one_column(elevations_deg: FloatArray, columns: int, start_azimuth_deg: flo
     return Spinning(elevations_deg, np.zeros(2 * half), firing, columns, start_azimuth_deg)
 
 
-def _velodyne_64(columns: int) -> Spinning:
+def _velodyne_64(columns: int, elevation_offsets_deg: FloatArray | float = 0.0) -> Spinning:
     """HDL-64E S2: an upper block with a third and a lower one with half a degree between the lasers.
 
     The lasers stand side by side in groups, about 3.2 degrees apart, as the calibration files that come with the
     devices show; both blocks fire at the same time.
+
+    Args:
+        columns: number of columns in a turn.
+        elevation_offsets_deg: (64,) calibrated minus nominal elevation of each laser, from the highest down.
     """
     upper = np.linspace(2.0, -8.33, 32)
     lower = np.linspace(-8.83, -24.33, 32)
+    elevations = np.concatenate([upper, lower]) + elevation_offsets_deg
     side_by_side = np.array([7.9, 4.7, 1.5, -1.9, -5.1, -8.4, 9.1, 5.8, 2.6, -0.7, -3.9, -7.2])
     offsets = np.concatenate([side_by_side[(np.arange(32) + 8) % 12], side_by_side[np.arange(32) % 12]])
     firing = np.tile(np.linspace(0.0, 31.0 / 32.0, 32), 2)
-    return Spinning(np.concatenate([upper, lower])[::-1], offsets[::-1], firing[::-1], columns)
+    return Spinning(elevations[::-1], offsets[::-1], firing[::-1], columns)
+
+
+def _calibration_offsets_deg(lasers: int, sigma_deg: float, largest_deg: float, seed: int) -> FloatArray:
+    """Made-up offsets (lasers,) of a device's elevations from the nominal ones: normal, clipped, the same every time.
+
+    Calibration files of real HDL-64E have offsets of this size; these are not those of any device.
+    """
+    drawn = sigma_deg * np.random.default_rng(seed).standard_normal(lasers)
+    return np.asarray(np.clip(drawn, -largest_deg, largest_deg))
 
 
 def _ouster(altitudes_deg: FloatArray, azimuths_deg: list[float], columns: int) -> Spinning:
@@ -92,6 +106,13 @@ _TABLE = (
         "velodyne",
         10.0,
         _velodyne_64(2083),
+        RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002),
+    ),
+    Sensor(  # the same with uneven rings, as every real one has
+        "hdl-64e-calibrated",
+        "velodyne",
+        10.0,
+        _velodyne_64(2083, _calibration_offsets_deg(64, sigma_deg=0.06, largest_deg=0.12, seed=64)),
         RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002),
     ),
     Sensor(

@@ -1,4 +1,4 @@
-"""How fast along a way, from rest to rest: within limits, without jerks."""
+"""How fast along a way, from rest to rest or round and round: within limits, without jerks."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -23,20 +23,55 @@ def rest_to_rest(
         acceleration: of speeding up and slowing down.
         smoothing_s: half the window; the window's weights are (1 - x^2)^2.
     """
-    squares = speed_limits**2
-    squares[[0, -1]] = 0.0
+    limits = speed_limits.copy()
+    limits[[0, -1]] = 0.0
+    speeds = _within_acceleration(positions, limits, acceleration)
+    times = _arrivals(positions, speeds)
+    moments = TIME_STEP_S * np.arange(int(np.ceil(times[-1] / TIME_STEP_S)) + 1, dtype=np.float64)
+    smooth = smoothed(_travelled(positions, speeds, times, moments), smoothing_s, ends="rest")
+    return smooth, np.gradient(smooth, TIME_STEP_S)
+
+
+def round_and_round(
+    positions: FloatArray, speed_limits: FloatArray, acceleration: float, smoothing_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """As `rest_to_rest` for one lap of a closed way, whose last position is the first: at speed where it closes.
+
+    The lap's time is rounded up to whole steps, all speeds that much lower.
+    """
+    lap = positions[-1]
+    three = np.concatenate([positions[:-1], positions[:-1] + lap, positions + 2.0 * lap])
+    limits = np.concatenate([speed_limits[:-1], speed_limits[:-1], speed_limits])
+    middle = slice(len(positions) - 1, 2 * len(positions) - 1)
+    speeds = _within_acceleration(three, limits, acceleration)[middle]
+    times = _arrivals(positions, speeds)
+    steps = int(np.ceil(times[-1] / TIME_STEP_S))
+    travelled = _travelled(positions, speeds, times, float(times[-1]) / steps * np.arange(steps + 1, dtype=np.float64))
+    laps = np.concatenate([travelled[:-1] - lap, travelled, travelled[1:] + lap])
+    smooth = smoothed(laps, smoothing_s)
+    rates = np.gradient(smooth, TIME_STEP_S)
+    return smooth[steps : 2 * steps + 1] - smooth[steps], rates[steps : 2 * steps + 1]
+
+
+def _within_acceleration(positions: FloatArray, speed_limits: FloatArray, acceleration: float) -> FloatArray:
+    """The highest speeds (M,) within the limits (M,) that constant acceleration can reach and leave in time."""
     gain = 2.0 * acceleration * positions
-    squares = gain + np.minimum.accumulate(squares - gain)
+    squares = gain + np.minimum.accumulate(speed_limits**2 - gain)
     squares = np.minimum.accumulate((squares + gain)[::-1])[::-1] - gain
-    speeds = np.sqrt(np.maximum(squares, 0.0))
-    times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(positions) / (speeds[:-1] + speeds[1:]))])
-    moments = TIME_STEP_S * np.arange(int(np.ceil(times[-1] / TIME_STEP_S)) + 1)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+
+def _arrivals(positions: FloatArray, speeds: FloatArray) -> FloatArray:
+    """Times (M,) at the positions (M,), from 0."""
+    return np.concatenate([[0.0], np.cumsum(2.0 * np.diff(positions) / (speeds[:-1] + speeds[1:]))])
+
+
+def _travelled(positions: FloatArray, speeds: FloatArray, times: FloatArray, moments: FloatArray) -> FloatArray:
+    """Positions (N,) at moments (N,), with constant acceleration between the positions (M,)."""
     piece = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
     since = np.minimum(moments, times[-1]) - times[piece]
     rise = np.diff(speeds)[piece] / np.diff(times)[piece]
-    travelled = positions[piece] + since * (speeds[piece] + 0.5 * rise * since)
-    smooth = smoothed(travelled, smoothing_s, ends="rest")
-    return smooth, np.gradient(smooth, TIME_STEP_S)
+    return np.asarray(positions[piece] + since * (speeds[piece] + 0.5 * rise * since))
 
 
 def smoothed(values: FloatArray, half_width_s: float, ends: str = "same") -> FloatArray:

@@ -108,6 +108,23 @@ class HeightField:
 
 
 @dataclass(frozen=True, eq=False)
+class Grass:
+    """Blades on the ground, too thin and too many for primitives: what rays meet among them is drawn for each scan.
+
+    Attributes:
+        heights: of the blades above the ground, 0 where none grow.
+        free_path_m: mean path of a ray among the blades until one reflects it; the shorter, the denser.
+    """
+
+    heights: HeightField
+    free_path_m: float
+
+    def __post_init__(self) -> None:
+        if self.heights.heights.min() < 0.0 or not self.free_path_m > 0.0:
+            raise ValueError(f"Grass must have heights of 0 or more and a positive path, got {self.free_path_m}")
+
+
+@dataclass(frozen=True, eq=False)
 class Mover:
     """Something that drives around: boxes that follow a polyline at constant speed, again and again.
 
@@ -190,6 +207,7 @@ class World:
         route: the way through it.
         map_spacing_m: distance between the points of its reference map: 5 cm indoors, 10 cm outdoors, where surfaces
             are rougher and a map has millions of points.
+        grass: on its ground, if any; not in the reference map, and unknown to the batched caster.
     """
 
     name: str
@@ -200,6 +218,7 @@ class World:
     height_fields: tuple[HeightField, ...] = ()
     movers: tuple[Mover, ...] = ()
     map_spacing_m: float = 0.05
+    grass: Grass | None = None
 
     def ground_at(self, xy: FloatArray) -> FloatArray:
         """z (N,) of the first height field, which is the ground; 0 where there is none."""

@@ -9,8 +9,10 @@ import pytest
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.mixture import Excerpt, ingredients_of, mixture
+from lidarslam.simulation.carriers import CARRIERS
+from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Excerpt, ingredients_of, mixture
 from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensor_table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
 
 SEED = 0
@@ -19,7 +21,7 @@ SCANS = 3
 
 @pytest.fixture(scope="module")
 def drawn() -> list[Excerpt]:
-    return list(mixture(len(WORLDS), SCANS, SEED))
+    return list(mixture(len(MIXED_WORLDS), SCANS, SEED))
 
 
 @dataclass
@@ -69,10 +71,26 @@ def test_an_excerpt_is_streamed():
 
 
 def test_all_worlds_appear(drawn):
-    assert {simulation(excerpt).world.name for excerpt in drawn} == set(WORLDS)
+    assert {simulation(excerpt).world.name for excerpt in drawn} == set(MIXED_WORLDS)
     assert len({excerpt.name for excerpt in drawn}) == len(drawn)
     assert len({simulation(excerpt).sensor.name for excerpt in drawn}) > 2
     assert len({simulation(excerpt).motion.name for excerpt in drawn}) > 2
+
+
+def test_ingredients_are_registered():
+    assert set(MIXED_WORLDS) <= set(WORLDS)
+    assert set(SENSOR_WEIGHTS) <= set(SENSORS)
+    assert {ingredients_of(number, SEED).carrier for number in range(60)} <= set(CARRIERS)
+
+
+def test_the_draw_of_a_number_does_not_change():
+    """What is added to the registries leaves prepared training data and measured figures as they are."""
+    first = [tuple(vars(ingredients_of(number, SEED)).values()) for number in range(3)]
+    assert first == [
+        ("street", "os1-64", "handheld", "upright"),
+        ("office", "xt32", "legged", "upside-down"),
+        ("tunnel", "vlp-16", "handheld", "upright"),
+    ]
 
 
 def test_excerpts_have_so_many_scans_of_their_recording(drawn):

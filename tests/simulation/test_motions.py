@@ -1,5 +1,7 @@
 """Motions are continuous, physical, on the ground, and come round."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,10 +10,11 @@ from lidarslam.core.geometry import exp, is_rigid, make_transform
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.carriers import CARRIERS
 from lidarslam.simulation.given_motion import motion_along
-from lidarslam.simulation.motions import rotations
+from lidarslam.simulation.motions import Sway, rotations
 from lidarslam.simulation.rounded_path import RoundedPath, corner_windows, straightened
 from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.speed_profile import TIME_STEP_S, rest_to_rest
+from lidarslam.simulation.speed_profile import TIME_STEP_S, rest_to_rest, round_and_round
+from lidarslam.simulation.world import Route, World
 
 STEP_S = 0.005
 # name: largest acceleration along, across and up (m/s^2), turn rate (deg/s) and angular acceleration (deg/s^2); the
@@ -23,6 +26,7 @@ LIMITS = {
     "tracked": (2.0, 2.0, 6.0, 121.0, 520.0),
     "tracked-harsh": (2.0, 2.0, 6.0, 181.0, 920.0),
     "drone": (3.0, 3.0, 4.0, 90.0, 300.0),
+    "car-fast": (3.5, 5.0, 3.0, 60.0, 120.0),
 }
 
 
@@ -63,12 +67,18 @@ def test_position_and_velocity_are_continuous(motion):
         assert np.abs(after - 2.0 * now + before)[2:].max() < 10.0 * fine**2 + 1e-11
 
 
-def test_starts_at_rest(motion):
+def test_starts_at_rest_or_at_speed(motion):
     T = motion.pose_at(np.linspace(0.0, 0.5, 50))
-    np.testing.assert_allclose(T, np.broadcast_to(T[:1], T.shape), atol=1e-9)
+    if CARRIERS[motion.name].keeps_going:
+        speed = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) / (0.5 / 49)
+        assert speed.min() > 3.0
+    else:
+        np.testing.assert_allclose(T, np.broadcast_to(T[:1], T.shape), atol=1e-9)
 
 
 def test_laps_come_round_exactly(motion):
+    if not motion.rests:  # the sway goes on as it likes
+        motion = replace(motion, sway=Sway())
     laps = motion.duration_s * np.arange(4)
     np.testing.assert_allclose(motion.pose_at(laps), motion.pose_at(np.zeros(4)), atol=1e-9)
     quarter = motion.pose_at(np.array([0.25, 1.25]) * motion.duration_s)
@@ -127,6 +137,39 @@ def test_legged_sways_with_its_gait(yard):
     assert 1.5 < np.fft.rfftfreq(len(times), 0.01)[spectrum.argmax()] < 2.5
 
 
+def test_what_keeps_going_never_halts(yard):
+    motion = motion_along_route("car-fast", yard, seed=4)
+    T = motion.pose_at(np.arange(0.0, 2.5 * motion.duration_s, STEP_S))
+    velocity = np.gradient(T[:, :3, 3], STEP_S, axis=0)
+    assert np.linalg.norm(velocity, axis=1).min() > 1.2
+    seam = motion.duration_s + np.array([-1e-4, 1e-4])
+    before, after = motion.pose_at(seam)
+    assert np.abs(after - before).max() < 2.5e-4 * np.linalg.norm(velocity, axis=1).max()
+    assert np.abs(np.diff(velocity, axis=0)).max() / STEP_S < 6.0
+
+
+@pytest.mark.parametrize("speed_mps", [5.0, 30.0])
+def test_a_speed_can_be_asked_for(speed_mps):
+    """On a ring road of 400 m radius, on which 3.5 m/s^2 across allow 37 m/s."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 1257)[:-1]
+    ring = 400.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    world = World("ring", 0, Route(ring, 4.0, 2.0, 4.0, speed_limit_mps=14.0))
+    motion = motion_along_route("car-fast", world, seed=1, speed_mps=speed_mps)
+    positions = motion.pose_at(np.arange(0.0, motion.duration_s, 0.1))[:, :3, 3]
+    speeds = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1) / 0.1
+    np.testing.assert_allclose(speeds, speed_mps, rtol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(positions[:, :2], axis=1), 400.0, atol=0.02)
+    limited = motion_along_route("car-fast", world, seed=1)
+    assert limited.duration_s == pytest.approx(2.0 * np.pi * 400.0 / 14.0, rel=0.01)
+
+
+def test_what_keeps_going_is_not_sent_into_a_dead_end():
+    there = np.column_stack([np.linspace(0.0, 50.0, 11), np.zeros((11, 2))])
+    world = World("lane", 0, Route(np.concatenate([there, there[-2:0:-1]]), 2.0, 2.0, 4.0, 14.0))
+    with pytest.raises(InputError, match="car-fast does not stop, and the route of lane has a corner"):
+        motion_along_route("car-fast", world, seed=0)
+
+
 def test_seeds_vary_and_repeat(yard):
     first, same, other = (motion_along_route("handheld", yard, seed) for seed in (1, 1, 2))
     times = np.linspace(0.0, 30.0, 100)
@@ -135,7 +178,7 @@ def test_seeds_vary_and_repeat(yard):
 
 
 def test_unknown_motion_is_answered_with_the_choices(yard):
-    with pytest.raises(InputError, match=r"'train'.*car, handheld, legged, tracked, tracked-harsh, drone"):
+    with pytest.raises(InputError, match=r"'train'.*car, handheld, legged, tracked, tracked-harsh, drone, car-fast"):
         motion_along_route("train", yard, 0)
 
 
@@ -215,6 +258,19 @@ def test_speed_profile_keeps_its_limits():
     assert speeds.max() < 6.0 + 1e-9
     assert np.abs(np.gradient(speeds, TIME_STEP_S)).max() < 2.0 + 1e-6
     assert speeds[np.abs(travelled - 30.0) < 2.0].max() < 1.01
+
+
+def test_a_lap_without_a_halt_is_as_fast_where_it_closes():
+    positions = np.linspace(0.0, 200.0, 2001)
+    limits = np.where(np.abs(positions - 80.0) < 10.0, 4.0, 15.0)
+    travelled, speeds = round_and_round(positions, limits, acceleration=2.0, smoothing_s=0.3)
+    assert travelled[0] == 0.0
+    np.testing.assert_allclose(travelled[-1], 200.0)
+    np.testing.assert_allclose(speeds[0], speeds[-1], atol=1e-9)
+    assert (np.diff(travelled) > 0.0).all()
+    assert speeds.max() < 15.0 + 1e-9
+    np.testing.assert_allclose(speeds.min(), 4.0, rtol=0.02)
+    assert np.abs(np.gradient(np.tile(speeds[:-1], 3), TIME_STEP_S)).max() < 2.0 + 1e-6
 
 
 def test_rotations_are_in_the_order_yaw_pitch_roll():

@@ -1,4 +1,4 @@
-"""Street, park and forest: drawn from the seed alone, passable, closed, and standing on the ground."""
+"""Streets, park, forest and fields: drawn from the seed alone, passable, closed, and standing on the ground."""
 
 from collections.abc import Iterator
 
@@ -8,17 +8,25 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.simulation.caster import Caster
 from lidarslam.simulation.mesh import CYLINDER_SIDES, box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.route_motion import motion_along_route
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.clearance import sample_route
 from lidarslam.simulation.worlds.paths import loop_length
 from lidarslam.simulation.worlds.registry import build_world
 
-NAMES = ("street", "park", "forest")
+NAMES = ("street", "park", "forest", "fields", "terrace")
 SEEDS = (0, 3)  # for the street, one block and two
 CASES = [(name, seed) for name in NAMES for seed in SEEDS]
-LENGTHS_M = {"street": (290.0, 520.0), "park": (200.0, 400.0), "forest": (150.0, 300.0)}
-MOST_BOXES = {"street": 6000, "park": 8000, "forest": 8000}
+LENGTHS_M = {
+    "street": (290.0, 520.0),
+    "park": (200.0, 400.0),
+    "forest": (150.0, 300.0),
+    "fields": (1600.0, 2100.0),
+    "terrace": (850.0, 1100.0),
+}
+MOST_BOXES = {"street": 6000, "park": 8000, "forest": 8000, "fields": 5000, "terrace": 20_000}
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +101,8 @@ def samples_of(world: World, near_m: float) -> FloatArray:
 
 
 def test_nothing_solid_reaches_into_the_free_space(world):
-    points, path = samples_of(world, world.route.free_side_m), sample_route(world.route)
+    farther_m = 8.0 if world.name == "fields" else 0.0  # nothing else is near the route there
+    points, path = samples_of(world, world.route.free_side_m + farther_m), sample_route(world.route)
     distance, nearest = cKDTree(path[:, :2]).query(points[:, :2], distance_upper_bound=world.route.free_side_m)
     beneath = np.isfinite(distance)  # within the free side: it must be above the free height, or in the ground
     above = points[beneath, 2] - path[nearest[beneath], 2]
@@ -145,7 +154,7 @@ def test_houses_reach_below_the_ground_and_wheels_just_to_it(worlds):
 
 def test_movers_stay_on_the_ground_and_off_the_route(world):
     path = cKDTree(sample_route(world.route)[:, :2])
-    assert bool(world.movers) == (world.name != "forest")
+    assert bool(world.movers) == (world.name not in ("forest", "fields"))
     for mover in world.movers:
         length = np.linalg.norm(np.roll(mover.waypoints, -1, axis=0) - mover.waypoints, axis=1).sum()
         poses = mover.pose_at(np.linspace(0.0, length / mover.speed_mps, 150))
@@ -197,3 +206,70 @@ def test_forests_differ_in_their_trunks_and_keep_them_apart(worlds):
         assert radii.std() > 0.04
         apart = cKDTree(cylinders.starts[trunks, :2]).query(cylinders.starts[trunks, :2], k=2)[0][:, 1]
         assert apart.min() > 1.7
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_fields_can_be_crossed_at_any_speed_of_a_car(seed, worlds):
+    world = worlds["fields", seed]
+    for speed_mps in (10.0, 20.0, 30.0):
+        motion = motion_along_route("car-fast", world, seed, speed_mps)
+        positions = motion.pose_at(np.arange(0.0, 2.0 * motion.duration_s, 0.05))[:, :3, 3]
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        is_slower = np.flatnonzero(steps / 0.05 < 0.98 * speed_mps)
+        travelled = np.cumsum(steps)
+        longest = np.diff(travelled[is_slower]).max() if len(is_slower) else travelled[-1]
+        assert longest > 300.0
+        assert steps.min() / 0.05 > min(0.98 * speed_mps, 15.0)
+        upwards = np.diff(positions[:, 2], 2) / 0.05**2
+        assert np.abs(upwards).max() < 5.0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_fields_roll_and_are_nearly_bare(seed, worlds):
+    world = worlds["fields", seed]
+    route = world.route.waypoints
+    slope = np.diff(route[:, 2]) / np.linalg.norm(np.diff(route[:, :2], axis=0), axis=1)
+    assert 0.015 < slope.std() < 0.06
+    assert 3.0 < np.ptp(route[:, 2]) < 25.0
+    eyes = route[::10] + np.array([0.0, 0.0, 1.73])
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)[:-1]
+    rays = np.tile(np.stack([np.cos(angle), np.sin(angle), np.full(180, 0.06)], axis=1), (len(eyes), 1))
+    solids = merge([box_mesh(world.boxes), cylinder_mesh(world.cylinders)])
+    origins = np.repeat(eyes, 180, axis=0)
+    ranges = Caster(world, solids).cast(origins, rays, np.zeros(len(rays)), 60.0).ranges
+    assert 0.002 < np.isfinite(ranges).mean() < 0.1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_grass_grows_beside_the_roads_and_not_on_them(seed, worlds):
+    for name, kept_free_m, tallest_m in (("fields", 1.7, 1.0), ("terrace", 1.8, 0.25)):
+        world = worlds[name, seed]
+        assert world.grass is not None
+        heights = world.grass.heights
+        route = sample_route(world.route, 0.5)[:, :2]
+        ring = kept_free_m * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
+        assert heights.height_at((route[:, None] + ring).reshape(-1, 2)).max() == 0.0
+        assert 0.8 * tallest_m > heights.heights[heights.heights > 0.0].mean() > 0.04
+        assert heights.heights.max() < tallest_m
+        assert (heights.heights.shape, heights.cell_m) == (
+            world.height_fields[0].heights.shape,
+            world.height_fields[0].cell_m,
+        )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_terrace_looks_alike_from_every_house(seed, worlds):
+    """Ranges to the facades are those one house on, but for what stands before a few of them."""
+    world = worlds["terrace", seed]
+    caster = Caster(world, box_mesh(world.boxes))
+    step_m = 0.02
+    x = np.arange(120.0, 260.0, step_m)
+    ground = world.ground_at(np.column_stack([x, np.zeros(len(x))]))
+    widths = np.arange(round(5.0 / step_m), round(7.0 / step_m))
+    for outward in (-1.0, 1.0):  # of the first street, along y = 0
+        rays = np.tile([0.0, outward, 0.0], (len(x), 1))
+        eyes = [np.column_stack([x, np.zeros(len(x)), ground + height]) for height in (1.2, 2.5, 4.5)]
+        profile = np.stack([caster.cast(at, rays, np.zeros(len(x)), 50.0).ranges for at in eyes])
+        alike = np.array([(np.abs(profile[:, k:] - profile[:, :-k]) < 0.05).mean() for k in widths])
+        assert alike.max() > 0.9
+        assert np.median(alike) < 0.8  # there is relief to be alike

@@ -231,6 +231,21 @@ def test_along_a_tum_trajectory(tmp_path, given):
     assert "handheld along given.tum" in text
 
 
+def test_a_speed_is_kept_and_written_down(tmp_path):
+    summary = record(request(tmp_path / "a", motion="car", speed_mps=0.4, scans=40, sensor="livox"), silently)
+    assert 0.2 < summary.length_m / summary.duration_s < 0.4
+    text = (tmp_path / "a" / "README.md").read_text()
+    assert "--motion car --speed 0.4 --mount" in text
+    assert "car at 0.4 m/s" in text
+
+
+def test_a_trajectory_has_its_own_speed(tmp_path, given):
+    path = tmp_path / "given.tum"
+    write_tum(path, given)
+    with pytest.raises(InputError, match="leave out --speed"):
+        record(request(tmp_path / "a", trajectory=path, speed_mps=3.0), silently)
+
+
 def test_a_car_follows_a_trajectory_on_the_ground(tmp_path, given):
     path = tmp_path / "given.tum"
     write_tum(path, given)
@@ -284,7 +299,7 @@ def test_command(tmp_path):
     ("option", "value", "choice"),
     [("--world", "moon", "street"), ("--sensor", "sonar", "os1-128"), ("--motion", "crawl", "legged"),
      ("--mount", "loose", "upside-down"), ("--format", "pcap", "rosbag1"), ("--scans", "0", "x>=1"),
-     ("--seed", "-1", "x>=0"), ("--trajectory", "absent.tum", "does not exist")],
+     ("--seed", "-1", "x>=0"), ("--speed", "0", "0.1<=x<=60"), ("--trajectory", "absent.tum", "does not exist")],
 )  # fmt: skip
 def test_command_misused(option, value, choice, tmp_path):
     done = CliRunner().invoke(main, ["simulate", "--out", str(tmp_path / "x"), option, value])

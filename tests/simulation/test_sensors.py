@@ -13,6 +13,7 @@ FACTS = {
     "vlp-16": (28_800, 16, -15.0, 15.0),
     "hdl-32e": (69_440, 32, -30.67, 10.67),
     "hdl-64e": (133_312, 64, -24.33, 2.0),
+    "hdl-64e-calibrated": (133_312, 64, -24.30, 1.97),
     "os0-64": (65_536, 64, -45.46, 45.85),
     "os1-64": (65_536, 64, -16.611, 16.611),
     "os1-128": (131_072, 128, -21.82, 20.95),
@@ -65,6 +66,17 @@ def test_vlp_16_fires_by_its_manual():
     np.testing.assert_allclose(np.diff(fractions[:16]) * 1800 * 55.296, 2.304, atol=1e-9)
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     np.testing.assert_allclose(azimuth[1] - azimuth[0], -2.0 * np.pi * fractions[1], atol=1e-12)
+
+
+def test_calibrated_rings_are_uneven_and_stay_in_order():
+    nominal, calibrated = (find_sensor(name).pattern.elevations_deg for name in ("hdl-64e", "hdl-64e-calibrated"))
+    offsets = calibrated - nominal
+    assert 0.03 < offsets.std() < 0.09
+    assert 0.08 < np.abs(offsets).max() < 0.1201
+    assert np.diff(calibrated).min() > 0.08
+    # A third of a degree above -8.5 degrees and half a degree below it, but for the offsets.
+    np.testing.assert_allclose(np.diff(nominal)[nominal[:-1] > -8.5], 10.33 / 31.0, atol=1e-9)
+    np.testing.assert_allclose(np.diff(nominal)[nominal[1:] < -8.5], 0.5, atol=1e-9)
 
 
 def test_ouster_fires_whole_columns():

@@ -51,10 +51,16 @@ class _Style:
         return middle[:, None] + 0.5 * self.opening * pitch * np.array([-1.0, 1.0])
 
 
-def house(rng: np.random.Generator, width: float, depth: float, open_sides: tuple[bool, bool]) -> Builder:
+def house(
+    rng: np.random.Generator,
+    width: float,
+    depth: float,
+    open_sides: tuple[bool, bool],
+    storeys: tuple[int, int] = (2, 5),
+) -> Builder:
     """A house of two to five storeys; `open_sides` says whether its left and right sides have windows too."""
     part = Builder()
-    style = _draw_style(rng)
+    style = _draw_style(rng, storeys)
     recess, top = style.recess_m, style.top_m
     left, right = (recess * is_open for is_open in open_sides)
     low, high = np.array([left, recess, -FOUNDATION_M]), np.array([width - right, depth, top])
@@ -82,12 +88,12 @@ def house(rng: np.random.Generator, width: float, depth: float, open_sides: tupl
     return part
 
 
-def _draw_style(rng: np.random.Generator) -> _Style:
+def _draw_style(rng: np.random.Generator, storeys: tuple[int, int]) -> _Style:
     storey = rng.uniform(2.9, 3.5)
     is_shop = rng.random() < 0.3
     sill = rng.uniform(0.7, 1.0)
     return _Style(
-        storeys=int(rng.integers(2, 6)),
+        storeys=int(rng.integers(*storeys, endpoint=True)),
         storey_m=storey,
         recess_m=rng.uniform(0.14, 0.38),
         axis_m=rng.uniform(2.1, 3.4),

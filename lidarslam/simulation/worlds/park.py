@@ -7,7 +7,14 @@ from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import furnishing, plants
 from lidarslam.simulation.worlds.building import Builder, smooth_noise
 from lidarslam.simulation.worlds.furnishing import upright
-from lidarslam.simulation.worlds.paths import distance_to_loop, on_ground, prune, resample_loop, winding_loop
+from lidarslam.simulation.worlds.paths import (
+    beside_loop,
+    distance_to_loop,
+    on_ground,
+    prune,
+    resample_loop,
+    winding_loop,
+)
 
 _CELL_M = 0.5
 _MARGIN_M = 60.0
@@ -53,29 +60,22 @@ def _ground(rng: np.random.Generator, path: FloatArray) -> HeightField:
     return HeightField(low, _CELL_M, heights - 0.06 * (1.0 - on_grass))
 
 
-def _beside(path: FloatArray, index: int, left_m: float) -> tuple[FloatArray, float]:
-    """A place (2,) to the left of a point of the path, and the heading of the path there."""
-    ahead = path[(index + 1) % len(path)] - path[index - 1]
-    yaw = float(np.arctan2(ahead[1], ahead[0]))
-    return path[index] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
-
-
 def _along_the_path(solid: Builder, rng: np.random.Generator, path: FloatArray, ground: HeightField) -> None:
     """Lamp posts by turns on either side, and between them a bench with a litter bin, a sign, or nothing."""
     count = max(6, round(0.5 * len(path) / _LAMP_SPACING_M))
     side = 1.0
     for place in np.arange(count) + rng.uniform(-0.2, 0.2, count):
         at = int(place / count * len(path)) % len(path)
-        where, yaw = _beside(path, at, side * rng.uniform(2.4, 3.2))
+        where, yaw = beside_loop(path, at, side * rng.uniform(2.4, 3.2))
         solid.place(furnishing.lamp_post(3.6, 0.0), upright(ground, where, yaw))
         between = (at + int(rng.integers(14, 30))) % len(path)
         if rng.random() < 0.5:
-            where, yaw = _beside(path, between, side * rng.uniform(2.9, 3.3))
+            where, yaw = beside_loop(path, between, side * rng.uniform(2.9, 3.3))
             solid.place(furnishing.bench(rng), upright(ground, where, yaw - side * 0.5 * np.pi))
-            where, yaw = _beside(path, (between + 4) % len(path), side * 2.8)
+            where, yaw = beside_loop(path, (between + 4) % len(path), side * 2.8)
             solid.place(furnishing.litter_bin(), upright(ground, where, yaw))
         elif rng.random() < 0.3:
-            where, yaw = _beside(path, between, -side * 2.6)
+            where, yaw = beside_loop(path, between, -side * 2.6)
             solid.place(furnishing.sign(rng), upright(ground, where, yaw))
         side = -side
 
@@ -83,9 +83,9 @@ def _along_the_path(solid: Builder, rng: np.random.Generator, path: FloatArray, 
 def _pavilion(solid: Builder, rng: np.random.Generator, path: FloatArray, ground: HeightField) -> FloatArray:
     """An open pavilion on columns beside the path; its middle and radius (1, 3), where nothing else may stand."""
     size, high = rng.uniform(5.0, 8.0), rng.uniform(2.9, 3.4)
-    where, yaw = _beside(path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0))
+    where, yaw = beside_loop(path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0))
     while distance_to_loop(where[None], path)[0] < 0.75 * size + 2.5:
-        where, yaw = _beside(path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0))
+        where, yaw = beside_loop(path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0))
     part, half = Builder(), 0.5 * size
     part.block((-half - 0.3, -half - 0.3, -1.2), (half + 0.3, half + 0.3, 0.18))
     for x in np.linspace(-half, half, 3):
@@ -128,7 +128,7 @@ def _borders(
     """A few low walls, hedges and bushes along the path."""
     for at in rng.integers(0, len(path), 9):
         left = rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 9.0)
-        start, yaw = _beside(path, int(at), left)
+        start, yaw = beside_loop(path, int(at), left)
         length, high = rng.uniform(5.0, 12.0), rng.uniform(0.5, 1.2)
         end = start + length * np.array([np.cos(yaw), np.sin(yaw)])
         line = start + np.linspace(0.0, 1.0, 9)[:, None] * (end - start)
@@ -143,7 +143,7 @@ def _borders(
             for a, b in zip(line[:-1:2], line[2::2], strict=True):  # steps down a slope with the ground
                 green.place(plants.hedge(rng, 0.25 * length, high, 0.7), upright(ground, 0.5 * (a + b), yaw))
     for at in rng.integers(0, len(path), 14):
-        where, yaw = _beside(path, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0))
+        where, yaw = beside_loop(path, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0))
         if np.linalg.norm(taken[:, :2] - where, axis=1).min() > taken[:, 2].max() + 1.5:
             green.place(plants.bush(rng, rng.uniform(0.6, 1.3), 24), upright(ground, where, yaw))
 

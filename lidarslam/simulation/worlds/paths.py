@@ -90,10 +90,20 @@ def winding_loop(
         wobble *= 0.97
 
 
-def distance_to_loop(xy: FloatArray, loop: FloatArray) -> FloatArray:
-    """Distance (N,) of points (N, 2) from the closed polyline (M, 2), good to 0.1 m from a decimetre on."""
-    distance, _ = cKDTree(resample_loop(loop, 0.2)).query(xy)
-    return np.asarray(distance)
+def distance_to_loop(xy: FloatArray, loop: FloatArray, farthest_m: float = np.inf) -> FloatArray:
+    """Distance (N,) of points (N, 2) from the closed polyline (M, 2), good to 0.1 m from a decimetre on.
+
+    What is farther than `farthest_m` counts as that far, and is soon done.
+    """
+    distance, _ = cKDTree(resample_loop(loop, 0.2)).query(xy, distance_upper_bound=farthest_m)
+    return np.minimum(distance, farthest_m)
+
+
+def beside_loop(loop: FloatArray, index: int, left_m: float) -> tuple[FloatArray, float]:
+    """A place (2,) to the left of a point of the closed polyline (M, 2), and the polyline's heading there."""
+    ahead = loop[(index + 1) % len(loop)] - loop[index - 1]
+    yaw = float(np.arctan2(ahead[1], ahead[0]))
+    return loop[index] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
 
 
 def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:

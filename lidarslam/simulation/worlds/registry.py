@@ -14,6 +14,8 @@ WORLDS: dict[str, str] = {
     "forest": "lidarslam.simulation.worlds.forest",
     "hall": "lidarslam.simulation.worlds.hall",
     "park": "lidarslam.simulation.worlds.park",
+    "fields": "lidarslam.simulation.worlds.fields",
+    "terrace": "lidarslam.simulation.worlds.terrace",
 }
 
 

@@ -28,16 +28,16 @@ def build(seed: int) -> World:
     """A quarter of a city; everybody drives on the right."""
     rng = np.random.default_rng(seed)
     plan = draw_plan(rng)
-    ground = _ground(rng, plan)
+    ground = lay_ground(rng, plan, (0.6, 1.1))
     survey = LotSurvey(plan)
     survey.walk(rng)
     solid, green = Builder(), Builder()
-    _kerbs(solid, plan, ground)
+    lay_kerbs(solid, plan, ground)
     _houses(solid, rng, survey, ground)
     _gardens(solid, green, rng, survey, ground)
-    _parked_cars(solid, rng, plan, ground)
+    park_cars(solid, rng, plan, ground, (0.35, 0.85))
     _pavements(solid, green, rng, plan, ground)
-    route = Route(on_ground(_lane(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, 11.0)
+    route = Route(on_ground(lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, 11.0)
     solid.place(prune(green, route), np.eye(4))
     return World(
         "street",
@@ -46,34 +46,35 @@ def build(seed: int) -> World:
         boxes=solid.boxes,
         cylinders=solid.cylinders,
         height_fields=(ground,),
-        movers=(*_traffic(rng, plan, ground), *_people(rng, plan, ground)),
+        movers=(*traffic(rng, plan, ground), *people(rng, plan, ground)),
         map_spacing_m=0.1,
     )
 
 
-def _lane(tour: FloatArray, step_m: float) -> FloatArray:
+def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
     """The middle (N, 2) of the right lane along a tour (M, 2)."""
     corners = offset_loop(tour, 0.5 * _LANE_M)
     radii = np.where(turns_left(corners), _LEFT_RADIUS_M, _RIGHT_RADIUS_M)
     return subdivide_loop(round_corners(corners, radii, step_m), 5.0)
 
 
-def _ground(rng: np.random.Generator, plan: StreetPlan) -> HeightField:
-    """Gentle slopes, a cambered road, pavements a kerb higher, and roughness on all of it."""
+def lay_ground(rng: np.random.Generator, plan: StreetPlan, hills_m: tuple[float, float]) -> HeightField:
+    """Gentle slopes of that deviation, a cambered road, pavements a kerb higher, and roughness on all of it."""
     margin = plan.network.half_width_m + plan.pavement_m + 20.0
     low, high = plan.network.nodes.min(axis=0) - margin, plan.network.nodes.max(axis=0) + margin
     low = np.floor(low)  # nodes are at whole metres, so that a kerb is at grid points
     shape = tuple(np.ceil((high - low) / _CELL_M).astype(int) + 1)
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
     kerb = plan.network.kerb_distance((low + _CELL_M * grid).reshape(-1, 2)).reshape(shape)
-    heights = rng.uniform(0.6, 1.1) * smooth_noise(rng, shape, 40.0 / _CELL_M)
+    heights = rng.uniform(*hills_m) * smooth_noise(rng, shape, 40.0 / _CELL_M)
     heights += 0.02 * smooth_noise(rng, shape, 3.0 / _CELL_M) + 0.005 * smooth_noise(rng, shape, 0.7)
     heights += KERB_HEIGHT_M * np.clip(kerb / RISE_M, 0.0, 1.0)
     heights += 0.08 * (1.0 - (1.0 - np.clip(-kerb / plan.network.half_width_m, 0.0, 1.0)) ** 2)
     return HeightField(low, _CELL_M, heights)
 
 
-def _kerbs(solid: Builder, plan: StreetPlan, ground: HeightField) -> None:
+def lay_kerbs(solid: Builder, plan: StreetPlan, ground: HeightField) -> None:
+    """Kerb stones along all pavements."""
     for start, end in plan.network.kerb_stones():
         along = (end - start) / np.linalg.norm(end - start)
         ends = np.stack([start, end])
@@ -121,11 +122,14 @@ def _gardens(solid: Builder, green: Builder, rng: np.random.Generator, survey: L
             green.place(plants.broadleaf(rng, rng.uniform(5.0, 9.0), 0.16, 24), upright(ground, where, yaw))
 
 
-def _parked_cars(solid: Builder, rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> None:
+def park_cars(
+    solid: Builder, rng: np.random.Generator, plan: StreetPlan, ground: HeightField, taken_share: tuple[float, float]
+) -> None:
+    """Cars along the kerbs; the share of the places taken is drawn for each side of a street."""
     keep_off = plan.network.half_width_m + plan.network.fillet_m + 4.0
     for start, end, outward in plan.network.sides():
         along = (end - start) / np.linalg.norm(end - start)
-        taken = rng.uniform(0.35, 0.85)
+        taken = rng.uniform(*taken_share)
         for at in np.arange(keep_off, np.linalg.norm(end - start) - keep_off, 6.0):
             if rng.random() > taken:
                 continue
@@ -164,16 +168,16 @@ def _pavements(solid: Builder, green: Builder, rng: np.random.Generator, plan: S
                 solid.place(furnishing.bus_shelter(rng), pose)
 
 
-def _traffic(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
+def traffic(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
     """Cars on the other lane, all equally fast, so that none catches up with another."""
-    waypoints = on_ground(_lane(plan.oncoming, 0.25), ground)
+    waypoints = on_ground(lane_of(plan.oncoming, 0.25), ground)
     count, speed = int(rng.integers(3, 6)), rng.uniform(4.0, 8.0)
     length = float(np.linalg.norm(np.roll(waypoints, -1, axis=0) - waypoints, axis=1).sum())
     starts = length * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     return [Mover(furnishing.car(rng, round_wheels=False).boxes, waypoints, speed, float(at)) for at in starts]
 
 
-def _people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
+def people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
     """Pedestrians round each block, on its own pavement, so that they cross no street."""
     movers = []
     inset = plan.network.half_width_m + plan.pavement_m - 1.0

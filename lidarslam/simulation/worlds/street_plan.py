@@ -83,6 +83,16 @@ def draw_plan(rng: np.random.Generator) -> StreetPlan:
     return StreetPlan(_draw_network(rng, outline, is_double), pavement, tour, oncoming, blocks)
 
 
+def draw_terrace_plan(rng: np.random.Generator) -> StreetPlan:
+    """One long, narrow block: two streets of about 400 m, and two short ones that join them."""
+    width, height = float(rng.integers(380, 461)), float(rng.integers(56, 71))
+    outline = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+    edges = tuple((k, (k + 1) % 4) for k in range(4))
+    network = StreetNetwork(outline, edges, HALF_WIDTH_M, _FILLET_M)
+    tour = outline if rng.random() < 0.5 else outline[::-1]
+    return StreetPlan(network, rng.uniform(3.4, 4.2), tour, tour[::-1], outline[None, [0, 2]])
+
+
 def _draw_network(rng: np.random.Generator, outline: FloatArray, is_double: bool) -> StreetNetwork:
     """The streets round the outline (4, 2), counter-clockwise, with a middle street at x = 0 or none, and dead ends."""
     nodes: list[FloatArray] = []
@@ -146,6 +156,16 @@ class LotSurvey:
                     gap = Lot(start + at * along, along, rng.uniform(2.5, 7.0), 6.0)
                     self.gaps += [gap] if self._is_free(gap) else []
                     at += gap.width
+
+    def repeat(self, width_m: float, depth_m: float) -> None:
+        """Build up each side of each street with lots that are all alike, none set back."""
+        for start, length, along in self._frontages():
+            at = 0.0
+            while at + width_m <= length:
+                lot = Lot(start + at * along, along, width_m, depth_m)
+                is_free = self._is_free(lot)
+                self.lots += [lot] if is_free else []
+                at += width_m if is_free else 0.5
 
     def _frontages(self) -> Iterator[tuple[FloatArray, float, FloatArray]]:
         """Where each row of houses starts, how long it may be, and its direction."""

@@ -1,0 +1,84 @@
+"""Rays end among blades as often and as deep as Beer and Lambert's law has it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarslam.simulation.grass import ranges_in_grass
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.reference_map import reference_map
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensor import RangeModel
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.world import Grass, HeightField
+
+EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
+HEIGHT_M = 0.2
+
+
+def lawn(height_m: float = HEIGHT_M, free_path_m: float = 0.3) -> Grass:
+    return Grass(HeightField(np.array([-500.0, -500.0]), 1000.0, np.full((2, 2), height_m)), free_path_m)
+
+
+@pytest.fixture(scope="module")
+def simulation(yard):
+    motion = motion_along_route("car", yard, seed=2)
+    sensor = replace(find_sensor("vlp-16"), ranging=EXACT)
+    world = replace(yard, movers=(), grass=lawn())
+    return Simulation(world, sensor, motion, mount_pose("upright", 1.73), 50, seed=5)
+
+
+@pytest.mark.parametrize("cosine", [1.0, 0.3, 0.06])
+def test_the_law(cosine, rng):
+    count = 40_000
+    ranges, is_blade = ranges_in_grass(lawn(), np.zeros((count, 3)), np.full(count, 50.0), np.full(count, cosine), rng)
+    # Tips are evenly distributed between half the height and all of it.
+    tips = HEIGHT_M * np.linspace(0.5, 1.0, 1001) / cosine
+    assert is_blade.mean() == pytest.approx((1.0 - np.exp(-tips / 0.3)).mean(), abs=0.01)
+    assert (ranges[~is_blade] == 50.0).all()
+    depth = 50.0 - ranges[is_blade]
+    assert 0.0 <= depth.min() <= depth.max() <= tips.max()
+
+
+def test_no_grass_changes_nothing(rng):
+    ranges, is_blade = ranges_in_grass(lawn(0.0), np.zeros((100, 3)), np.full(100, 9.0), np.full(100, 0.2), rng)
+    assert not is_blade.any()
+    assert (ranges == 9.0).all()
+
+
+def test_a_scan_ends_above_the_ground_within_the_grass(simulation):
+    sweep = simulation.scan(30)
+    T = simulation.T_world_lidar_at(sweep.scan.stamp + sweep.scan.time_offsets)
+    points = np.einsum("nij,nj->ni", T[:, :3, :3], sweep.scan.points) + T[:, :3, 3]
+    ranges = np.linalg.norm(sweep.scan.points, axis=1)
+    is_shortened = ranges < sweep.true_ranges - 1e-3
+    above = points[is_shortened, 2] - simulation.world.ground_at(points[is_shortened, :2])
+    assert 0.1 < is_shortened.mean() < 0.9
+    assert above.min() > -0.05  # the hills are soft, so that the grass follows them
+    assert above.max() < HEIGHT_M + 0.05
+    assert np.median(above) > 0.05
+    is_near = ranges < 8.0
+    assert is_shortened[is_near].mean() < is_shortened[~is_near & is_shortened | (ranges < 30.0) & ~is_near].mean()
+    np.testing.assert_array_equal(simulation.scan(30).scan.points, sweep.scan.points)
+
+
+def test_walls_stand_before_grass(simulation, yard):
+    bare = replace(simulation, world=replace(yard, movers=()))
+    grown, mown = simulation.scan(10), bare.scan(10)
+    walls, behind = ({tuple(point) for point in one.scan.points if point[2] > 0.0} for one in (mown, grown))
+    assert len(walls) > 1000
+    assert len(walls & behind) > 0.98 * len(walls)  # which ones are lost is drawn anew
+
+
+def test_the_reference_map_is_of_the_ground(simulation, yard):
+    bare = replace(simulation, world=replace(yard, movers=()))
+    np.testing.assert_array_equal(reference_map(simulation, step=25).points, reference_map(bare, step=25).points)
+
+
+def test_what_is_no_grass():
+    with pytest.raises(ValueError, match="positive path"):
+        lawn(free_path_m=0.0)
+    with pytest.raises(ValueError, match="0 or more"):
+        lawn(height_m=-0.1)
