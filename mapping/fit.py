@@ -64,7 +64,9 @@ class Fit:
             return f"only {100.0 * self.overlap:.0f} % of the scan meets the map"
         if self.inlier_ratio < config.degraded_below:
             return f"only {100.0 * self.inlier_ratio:.0f} % of the scan lies on the map"
-        return f"only {100.0 * (self.support or 0.0):.0f} % of what constrains one direction lies on the map: it may slide"
+        return (
+            f"only {100.0 * (self.support or 0.0):.0f} % of what constrains one direction lies on the map: it may slide"
+        )
 
 
 def measure_fit(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, config: TrackingConfig) -> Fit:

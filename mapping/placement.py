@@ -39,8 +39,8 @@ _PLACES = 24
 # Changes of the rate of turning that are tried on a scan that lies badly, rad/s: from full speed one way round to full
 # speed the other way between two sweeps.
 _TURNS = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
-# Displacements since the last scan that are tried where the velocity is not known: as far as a car goes, no farther than
-# the median range, so many cells apart, which is in reach of the coarse cells.
+# Displacements since the last scan that are tried where the velocity is not known: as far as a car drives, but no farther
+# than the median range; so many cells apart, within reach of the coarse ones.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
 _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
@@ -151,7 +151,9 @@ def place_displaced(
         moving = State.moving(last, velocity)
         prediction = predict(moving, sampled.stamp, Prior(), Carrier(), config, sampled.seen_from_s)
         tried.append(_place_patiently(sampled, prediction, last, local_map, config))
-    return max((placed for placed in tried if placed.status is Status.OK), key=lambda placed: placed.quality, default=None)
+    return max(
+        (placed for placed in tried if placed.status is Status.OK), key=lambda placed: placed.quality, default=None
+    )
 
 
 def _place_patiently(

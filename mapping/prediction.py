@@ -159,7 +159,6 @@ class OdometryNoise:
         squared = _squared_error(prior, T_prev_curr, config) / 6.0
         return OdometryNoise(max(1.0, self.variance + _NOISE_FOLLOWING * (squared - self.variance)))
 
-
     def contradicts(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
         """Whether a registered motion (4, 4) is improbable, given the odometry's."""
         return prior.T_prev_curr is not None and _squared_error(prior, T_prev_curr, config) > _GATE * self.variance

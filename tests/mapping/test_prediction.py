@@ -167,9 +167,13 @@ def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted() -
 def test_the_noise_of_an_odometry_follows_its_errors() -> None:
     rng, noise = np.random.default_rng(0), OdometryNoise()
     for _ in range(200):
-        noise = noise.seen(Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.01, size=6)), AS_TOLD)
+        noise = noise.seen(
+            Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.01, size=6)), AS_TOLD
+        )
     assert noise.variance < 2.5
     for _ in range(200):
-        noise = noise.seen(Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.1, size=6)), AS_TOLD)
+        noise = noise.seen(
+            Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.1, size=6)), AS_TOLD
+        )
     assert 50.0 < noise.variance < 200.0
     assert noise.seen(Prior(), MOVED, AS_TOLD) == noise
