@@ -39,8 +39,8 @@ _PLACES = 24
 # Changes of the rate of turning that are tried on a scan that lies badly, rad/s: from full speed one way round to full
 # speed the other way between two sweeps.
 _TURNS = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
-# Displacements since the last scan that are tried where the velocity is not known: as far as a car drives, but no farther
-# than the median range; so many cells apart, within reach of the coarse ones.
+# Displacements since the last scan that are tried where the velocity is not known: as far as a car drives, but no
+# farther than the median range; so many cells apart, within reach of the coarse ones.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
 _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
