@@ -11,7 +11,7 @@ in one frame.
 
 import time
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from mapping.graph_config import SlamGraphConfig
 from mapping.graph_scan import GraphScan
 from mapping.keyframe import KeyframeSelector
 from mapping.loop_closure import LoopClosure, LoopDetector, Submap, closures_state, restored_closures
+from mapping.loop_refinement import DenseSubmap, refine
 from mapping.pose_graph import PoseGraph
 from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
@@ -266,13 +267,37 @@ class SlamGraph:
         self._store.append(means)
         self._graph.update()
         seen = Submap(index, self._sessions[index], self._keyframe_way_m[index], means.points)
-        found = self._detector.add(seen, self._graph.poses())
+        poses = self._graph.poses()
+        found = [self._refined(closure, poses) for closure in self._detector.add(seen, poses)]
         self._closures += found
         accepted = [closure for closure in found if closure.verdict == "accepted"]
         for closure in accepted:
             self._graph.add_edge(_loop_edge(closure))
         if accepted:
             self._graph.update()
+
+
+    def _refined(self, closure: LoopClosure, poses: FloatArray) -> LoopClosure:
+        """An accepted closure registered on all points of both places."""
+        if closure.verdict != "accepted":
+            return closure
+        cell_m = max(self._detector.cell_m(closure.first), self._detector.cell_m(closure.second))
+        target, source = (self._dense(key, poses, cell_m) for key in (closure.first, closure.second))
+        refined = refine(target, source, closure.T_first_second, closure.covariance)
+        if refined is None:
+            return closure
+        return replace(closure, T_first_second=refined.T_target_source, covariance=refined.covariance)
+
+    def _dense(self, key: int, poses: FloatArray, cell_m: float) -> DenseSubmap:
+        """A keyframe's submap with its neighbours' of the same session, where poses (K, 4, 4) have them."""
+        reach = self._config.loops.neighbours
+        around = range(max(0, key - reach), min(len(self._store), key + reach + 1))
+        submaps = [
+            (inverse(poses[key]) @ poses[k], self._store[k].points)
+            for k in around
+            if self._sessions[k] == self._sessions[key]
+        ]
+        return DenseSubmap.join(submaps, self._config.loops.max_range_m, cell_m)
 
 
 def _recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDArray[np.intp]:
