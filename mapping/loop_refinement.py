@@ -17,10 +17,8 @@ from scipy.spatial import cKDTree
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.core.thinning import central_per_cell
 
-# Planes are fitted to so many nearest points; thicker than this share of their width they are none, and narrower than
-# this share of their length they are a single ring of the sensor.
+# Planes are fitted to so many nearest points, wherever they lie: to leave out what is not flat biases the result.
 _NEIGHBOURS = 12
-_THICK, _NARROW = 0.2, 0.03
 _MAX_PLANES = 3000
 # Gate of correspondences and most Gauss-Newton iterations, level after level; scale of the robust kernel; in cells.
 _LEVELS = ((2.0, 8), (1.0, 12))
@@ -67,15 +65,13 @@ def _planes(points: FloatArray, tree: cKDTree) -> tuple[FloatArray, FloatArray]:
     """Centroids and normals (M, 3) of planes through the neighbourhoods of points (N, 3), evenly chosen."""
     if len(points) < _NEIGHBOURS:
         return np.empty((0, 3)), np.empty((0, 3))
-    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), 2 * _MAX_PLANES)).astype(np.intp))
+    chosen = np.linspace(0, len(points) - 1, min(len(points), _MAX_PLANES)).astype(np.intp)
     _, found = tree.query(points[chosen], k=_NEIGHBOURS, workers=1)
     around = points[found]
     centroids = around.mean(axis=1)
     around -= centroids[:, None]
-    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
-    planar = np.flatnonzero((spread[:, 0] < _THICK * spread[:, 1]) & (spread[:, 1] > _NARROW * spread[:, 2]))
-    planar = planar[:: max(1, len(planar) // _MAX_PLANES)]
-    return centroids[planar], axes[planar, :, 0]
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return centroids, axes[:, :, 0]
 
 
 @dataclass(frozen=True, eq=False)
