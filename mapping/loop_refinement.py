@@ -27,8 +27,6 @@ _CONVERGED_M = 5e-4
 _LEAST_PLANES = 100
 # Residuals of neighbouring points are correlated: so many count as one.
 _CORRELATION = 50.0
-# The two places themselves are bent by the drift within them: standard deviations that no number of points lowers.
-_FLOOR_SIGMAS = np.array([np.deg2rad(0.05)] * 3 + [0.008] * 3)
 # A refinement farther from the verified pose is of something else: 99 % of six degrees of freedom are less.
 _MOST_SQUARED = 16.8
 
@@ -116,11 +114,12 @@ class Refined:
 
 
 def refine(
-    target: DenseSubmap, source: DenseSubmap, T_target_source: FloatArray, covariance: FloatArray
+    target: DenseSubmap, source: DenseSubmap, T_target_source: FloatArray, covariance: FloatArray, drift: FloatArray
 ) -> Refined | None:
     """Register again from a verified pose (4, 4), which is the prior with its covariance (6, 6).
 
-    None where too few planes meet a point, or where the result contradicts the verified pose.
+    Drift (6, 6) within the two submaps is added to the covariance of the result: no number of points lowers it. None
+    where too few planes meet a point, or where the result contradicts the verified pose.
     """
     information, cell_m = np.linalg.inv(covariance), max(target.cell_m, source.cell_m)
     guess = T = T_target_source
@@ -139,7 +138,7 @@ def refine(
     away = log(inverse(guess) @ T)
     if not away @ information @ away < _MOST_SQUARED:
         return None
-    return Refined(orthonormalize(T), np.linalg.inv(normal_matrix + information) + np.diag(_FLOOR_SIGMAS**2))
+    return Refined(orthonormalize(T), np.linalg.inv(normal_matrix + information) + drift)
 
 
 def _normal_equations(system: _System, scale_m: float) -> tuple[FloatArray, FloatArray]:

@@ -31,7 +31,11 @@ from mapping.loop_refinement import DenseSubmap, refine
 from mapping.pose_graph import PoseGraph
 from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
-from mapping.trajectory_edges import Way, trajectory_edges
+from mapping.trajectory_edges import Way, trajectory_covariance, trajectory_edges
+
+# A closure is refined on submaps united with so many on either side: one alone is as sparse as the sensor, and over a
+# longer way drift bends them.
+_REACH = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +285,7 @@ class SlamGraph:
             self._graph.add_edge(_loop_edge(closure))
         if accepted:
             self._graph.update()
-        self._refine_closures(poses, until=index - self._config.loops.neighbours)
+        self._refine_closures(poses, until=index - _REACH)
 
     def _refine_closures(self, poses: FloatArray, until: int) -> None:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""
@@ -293,21 +297,26 @@ class SlamGraph:
         """A closure registered on all points of both places."""
         cell_m = max(self._detector.cell_m(key) for key in (closure.first, closure.second))
         target, source = (self._dense_submap(key, poses, cell_m) for key in (closure.first, closure.second))
-        refined = refine(target, source, closure.T_first_second, closure.covariance)
+        drift = self._drift_within(closure.first) + self._drift_within(closure.second)
+        refined = refine(target, source, closure.T_first_second, closure.covariance, drift)
         if refined is None:
             return closure
         return replace(closure, T_first_second=refined.T_target_source, covariance=refined.covariance)
 
     def _dense_submap(self, key: int, poses: FloatArray, cell_m: float) -> DenseSubmap:
         """A keyframe's submap united with its neighbours' of the same session, which poses (K, 4, 4) place."""
-        reach = self._config.loops.neighbours
-        around = range(max(0, key - reach), min(len(poses), key + reach + 1))
-        submaps = [
-            (inverse(poses[key]) @ poses[k], self._store[k].points)
-            for k in around
-            if self._sessions[k] == self._sessions[key]
-        ]
+        submaps = [(inverse(poses[key]) @ poses[k], self._store[k].points) for k in self._around(key)]
         return DenseSubmap.join(submaps, self._config.loops.max_range_m, cell_m)
+
+    def _around(self, key: int) -> list[int]:
+        """A keyframe with those beside it in its session that have submaps by now."""
+        near = range(max(0, key - _REACH), min(len(self._store), key + _REACH + 1))
+        return [k for k in near if self._sessions[k] == self._sessions[key]]
+
+    def _drift_within(self, key: int) -> FloatArray:
+        """(6, 6) of a keyframe united with those beside it; each axis has a third of the square."""
+        ways_m = [abs(self._keyframe_way_m[k] - self._keyframe_way_m[key]) for k in self._around(key)]
+        return trajectory_covariance(max(ways_m), True, False, self._config.edges) / 3.0
 
     def _with_refined_loops(self, poses: FloatArray) -> PoseGraph:
         """All edges with the closures as they are now; the graph of the run has them as they were first verified."""
