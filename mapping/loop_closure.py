@@ -123,6 +123,10 @@ class LoopDetector:
         """Memory of what is kept."""
         return self._kept.nbytes
 
+    def cell_m(self, index: int) -> float:
+        """The size of detail that suits what a keyframe saw."""
+        return self._kept.patches[index].cell_m
+
     def state(self) -> State:
         """The closures, and the estimates of keyframes; not what is kept of their submaps."""
         return {

@@ -11,7 +11,7 @@ in one frame.
 
 import time
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -27,10 +27,15 @@ from mapping.graph_config import SlamGraphConfig
 from mapping.graph_scan import GraphScan
 from mapping.keyframe import KeyframeSelector
 from mapping.loop_closure import LoopClosure, LoopDetector, Submap, closures_state, restored_closures
+from mapping.loop_refinement import DenseSubmap, refine
 from mapping.pose_graph import PoseGraph
 from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
-from mapping.trajectory_edges import Way, trajectory_edges
+from mapping.trajectory_edges import Way, trajectory_covariance, trajectory_edges
+
+# A closure is refined on submaps united with so many on either side: one alone is as sparse as the sensor, and over a
+# longer way drift bends them.
+_REACH = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +94,7 @@ class SlamGraph:
         self.keyframe_ms: list[float] = []  # wall time of each, drawing left out
         self._edges: list[Edge] = []
         self._closures: list[LoopClosure] = []
+        self._unrefined: list[int] = []  # accepted closures, neighbours of whose later keyframe are still to come
 
     def state(self) -> State:
         """All of it, but for what lies in the file of submaps.
@@ -118,6 +124,7 @@ class SlamGraph:
             "keyframe_ms": list(self.keyframe_ms),
             "edges": edges_state(self._edges),
             "closures": closures_state(self._closures),
+            "unrefined": list(self._unrefined),
         }
 
     @classmethod
@@ -147,6 +154,7 @@ class SlamGraph:
         graph._way_m, graph._session = saved.number("way_m"), saved.integer("session")
         graph._edges = restored_edges(saved.part("edges"))
         graph._closures = restored_closures(saved.part("closures"))
+        graph._unrefined = saved.integers("unrefined")
         return graph
 
     def begin_recording(self) -> None:
@@ -185,7 +193,9 @@ class SlamGraph:
             return None
         self._close_submap()
         self._closures += self._detector.finish()
-        optimised = self._graph.optimise()
+        poses = self._graph.poses()
+        self._refine_closures(poses, until=len(poses))
+        optimised = self._with_refined_loops(poses).optimise()
         weights = iter(optimised.loop_weights)
         believed = tuple(c.verdict == "accepted" and bool(next(weights) > 0.5) for c in self._closures)
         loops = [_loop_edge(c) for c, kept in zip(self._closures, believed, strict=True) if kept]
@@ -266,13 +276,57 @@ class SlamGraph:
         self._store.append(means)
         self._graph.update()
         seen = Submap(index, self._sessions[index], self._keyframe_way_m[index], means.points)
-        found = self._detector.add(seen, self._graph.poses())
+        poses = self._graph.poses()
+        found = self._detector.add(seen, poses)
+        self._unrefined += [len(self._closures) + i for i, c in enumerate(found) if c.verdict == "accepted"]
         self._closures += found
         accepted = [closure for closure in found if closure.verdict == "accepted"]
         for closure in accepted:
             self._graph.add_edge(_loop_edge(closure))
         if accepted:
             self._graph.update()
+        self._refine_closures(poses, until=index - _REACH)
+
+    def _refine_closures(self, poses: FloatArray, until: int) -> None:
+        """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""
+        for row in [row for row in self._unrefined if self._closures[row].second <= until]:
+            self._unrefined.remove(row)
+            self._closures[row] = self._refined(self._closures[row], poses)
+
+    def _refined(self, closure: LoopClosure, poses: FloatArray) -> LoopClosure:
+        """A closure registered on all points of both places."""
+        cell_m = max(self._detector.cell_m(key) for key in (closure.first, closure.second))
+        target, source = (self._dense_submap(key, poses, cell_m) for key in (closure.first, closure.second))
+        drift = self._drift_within(closure.first) + self._drift_within(closure.second)
+        refined = refine(target, source, closure.T_first_second, closure.covariance, drift)
+        if refined is None:
+            return closure
+        return replace(closure, T_first_second=refined.T_target_source, covariance=refined.covariance)
+
+    def _dense_submap(self, key: int, poses: FloatArray, cell_m: float) -> DenseSubmap:
+        """A keyframe's submap united with its neighbours' of the same session, which poses (K, 4, 4) place."""
+        submaps = [(inverse(poses[key]) @ poses[k], self._store[k].points) for k in self._around(key)]
+        return DenseSubmap.join(submaps, self._config.loops.max_range_m, cell_m)
+
+    def _around(self, key: int) -> list[int]:
+        """A keyframe with those beside it in its session that have submaps by now."""
+        near = range(max(0, key - _REACH), min(len(self._store), key + _REACH + 1))
+        return [k for k in near if self._sessions[k] == self._sessions[key]]
+
+    def _drift_within(self, key: int) -> FloatArray:
+        """(6, 6) of a keyframe united with those beside it; each axis has a third of the square."""
+        ways_m = [abs(self._keyframe_way_m[k] - self._keyframe_way_m[key]) for k in self._around(key)]
+        return trajectory_covariance(max(ways_m), True, False, self._config.edges) / 3.0
+
+    def _with_refined_loops(self, poses: FloatArray) -> PoseGraph:
+        """All edges with the closures as they are now; the graph of the run has them as they were first verified."""
+        graph = PoseGraph(self._config.optimiser)
+        for key, pose in enumerate(poses):
+            graph.add_pose(key, pose)
+        loops = [_loop_edge(closure) for closure in self._closures if closure.verdict == "accepted"]
+        for edge in (*self._edges, *loops):
+            graph.add_edge(edge)
+        return graph
 
 
 def _recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDArray[np.intp]:
