@@ -16,7 +16,7 @@ DEFAULT_SPACING_M = 0.05
 MOST_SAMPLES = 50_000
 
 # Of a sampled map: points, the edge of a block, and a hash of its coordinates (Teschner et al., VMV 2003; Knuth).
-MOST_POINTS = 300_000
+MOST_POINTS = 500_000
 _BLOCK_M = 10.0
 _PRIMES = np.array([73_856_093, 19_349_669, 83_492_791])
 _GOLDEN, _BITS = 2_654_435_761, 0xFFFF_FFFF
@@ -90,8 +90,7 @@ def map_entropy(
 def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:
     """`map_entropy` of whole blocks of a map, in a second or two however large it is.
 
-    Which blocks of 10 m are looked at depends on where they are alone, so that two maps of one place are compared in the
-    same places.
+    Blocks of 10 m are drawn by a hash of their position, so that two maps of one place are compared in the same parts.
     """
     share = most_points / max(1, len(points))
     if share < 1.0:
