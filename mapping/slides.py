@@ -35,6 +35,8 @@ _FEWEST_FACING, _MOST_FACING = 10, 800
 # Edge of a block on the ground, the width of a vehicle, and how much its surfels count at most.
 _BLOCK_M, _MOST_OF_BLOCK = 2.0, 3.0
 _GATE_M, _BIN_M, _FARTHEST_M = 0.15, 0.1, 32.0
+# A scene repeats itself where it has so large a share of its votes on itself; over shorter ways any surface does.
+_REPEATED_SHARE, _LEAST_PERIOD_M = 0.3, 1.0
 # Shifts that are remembered, for poses that are corrected later.
 _NEAR = 20
 # A pair that is closer has no direction of travel: x and y of the LiDAR are tried.
@@ -286,9 +288,26 @@ def _tests(first: _Held, second: _Held) -> list[FloatArray]:
     rows = []
     for direction in [way / length_m] if length_m > _LEAST_WAY_M else [np.eye(3)[0], np.eye(3)[1]]:
         profile = shift_profile(first.surfels, second.surfels, T_first_second, direction)
-        if profile is not None and profile.max() >= LEAST_VOTES:
+        if profile is None or profile.max() < LEAST_VOTES:
+            continue
+        profile = _unambiguous(profile, shift_profile(first.surfels, first.surfels, np.eye(4), direction))
+        if profile.max() >= LEAST_VOTES:
             rows.append(_row(first.number, second.number, direction, way, profile))
     return rows
+
+
+def _unambiguous(profile: FloatArray, of_itself: FloatArray | None) -> FloatArray:
+    """The votes (S,) for shifts of less than half the distance at which the scene repeats itself, and none for others.
+
+    Args:
+        profile: of a scan on another.
+        of_itself: of the other on itself, which repeats where surfaces stand at even distances, as columns do.
+    """
+    if of_itself is None:
+        return profile
+    shifts = np.abs(np.arange(len(profile)) - len(profile) // 2)
+    alike = (of_itself > _REPEATED_SHARE * of_itself[len(profile) // 2]) & (shifts * _BIN_M > _LEAST_PERIOD_M)
+    return np.where(2 * shifts < shifts[alike].min(initial=2 * len(profile)), profile, 0.0)
 
 
 def _row(first: int, second: int, direction: FloatArray, way: FloatArray, profile: FloatArray) -> FloatArray:
