@@ -271,7 +271,7 @@ class SlideCheck:
 
     def _is_skipped(self) -> bool:
         """Whether this scan lies between bursts: the cost grows with the logarithm of a long run's length."""
-        every = 2 ** int(math.log2(max(1.0, (self._due - 1) / _MANY + 1.0)))
+        every = 1 << int(math.log2(max(1.0, (self._due - 1) / _MANY + 1.0)))
         return (self._due - 1) // _BURST % every != 0
 
     @property
