@@ -18,7 +18,7 @@ MOST_SAMPLES = 50_000
 # Of a sampled map: points, the edge of a block, and a hash of its coordinates (Teschner et al., VMV 2003; Knuth).
 MOST_POINTS = 500_000
 _BLOCK_M = 10.0
-_PRIMES = np.array([73_856_093, 19_349_669, 83_492_791])
+_PRIMES = np.array([73_856_093, 19_349_669])
 _GOLDEN, _BITS = 2_654_435_761, 0xFFFF_FFFF
 _QUICK_SAMPLES = 10_000
 
@@ -90,11 +90,11 @@ def map_entropy(
 def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:
     """`map_entropy` of whole blocks of a map, in a second or two however large it is.
 
-    Blocks of 10 m are drawn by a hash of their position, so that two maps of one place are compared in the same parts.
+    Blocks of 10 m on the ground are drawn by a hash of their position, so that two maps of one place are compared in the same parts.
     """
     share = most_points / max(1, len(points))
     if share < 1.0:
-        cells = np.floor(points / _BLOCK_M).astype(np.int64)
+        cells = np.floor(points[:, :2] / _BLOCK_M).astype(np.int64)
         drawn = (cells @ _PRIMES) * _GOLDEN & _BITS
         points = points[drawn < share * _BITS]
     return map_entropy(points, most_samples=_QUICK_SAMPLES)
