@@ -90,7 +90,7 @@ def map_entropy(
 def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:
     """`map_entropy` of whole blocks of a map, in a second or two however large it is.
 
-    Blocks of 10 m on the ground are drawn by a hash of their position, so that two maps of one place are compared in the same parts.
+    Blocks of 10 m on the ground are drawn by a hash of their position: of two maps of one place the same ones.
     """
     share = most_points / max(1, len(points))
     if share < 1.0:
