@@ -62,7 +62,7 @@ def main() -> int:
     if outcome.stopped is not None:
         print(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", file=sys.stderr)
         return STOPPED
-    return LOST if outcome.summary.lost_scans else 0
+    return LOST if outcome.summary.went_astray else 0
 
 
 if __name__ == "__main__":

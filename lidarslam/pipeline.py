@@ -26,6 +26,7 @@ from lidarslam.localisation import Estimated, Localised, Localiser, SweepMotion
 from lidarslam.waiting_scans import Compensated, Timed
 from mapping.config import GlobalMapConfig
 from mapping.global_map import GlobalMap, voxel_size_for
+from mapping.slides import SlideCheck
 from mapping.visibility import Views
 from odometry.interface import Odometry
 
@@ -108,6 +109,7 @@ class Pipeline:
         self._measured_stamp: float | None = None  # of the last scan, unless its motion was only predicted
         self._followed = 0  # scans that are done but for the map
         self.global_map: GlobalMap | None = None
+        self.slides = SlideCheck()
         self.views = Views()  # none where the configuration does not ask for them
 
     @property
@@ -130,6 +132,7 @@ class Pipeline:
             "followed": self._followed,
             "global_map": None if self.global_map is None else self.global_map.state(),
             "views": self.views.state(),
+            "slides": self.slides.state(),
         }
 
     def restore(self, saved: Saved) -> None:
@@ -142,6 +145,7 @@ class Pipeline:
         self._followed = saved.integer("followed")
         self.global_map = saved.optional("global_map", GlobalMap.restored)
         self.views.restore(saved.part("views"))
+        self.slides.restore(saved.part("slides"))
 
     def run(self, scans: Iterable[Scan]) -> Generator[ScanResult, None, None]:
         """Process the scans in order; each result comes while later scans' odometry is at work.
@@ -180,6 +184,7 @@ class Pipeline:
             while jobs:
                 yield jobs.popleft().result()
         self._add_waiting(Status.OK)
+        self.slides.finish()
         if error is not None:
             raise error
 
@@ -251,6 +256,7 @@ class Pipeline:
         if self.global_map is None:
             self.global_map = GlobalMap(self._voxel_size_m)
         self.global_map.add(points, scan.T_world_lidar)
+        self.slides.add(points, scan.number, scan.T_world_lidar)
         if self._config.leave_out_moved:
             self.views.add(points, scan.number)
         if self._graph is not None:

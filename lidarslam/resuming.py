@@ -45,8 +45,8 @@ def describe_computed(config: Config, recording: Recording, run: dict[str, Any],
     return json.loads(json.dumps({**given, "recording": _fingerprint(recording), **tree}))  # type: ignore[no-any-return]
 
 
-def lost_before(out: Path, config: Config, run: dict[str, Any]) -> int | None:
-    """How many scans this very run lost, if a directory holds it with nothing left to do; None if it does not.
+def astray_before(out: Path, config: Config, run: dict[str, Any]) -> bool | None:
+    """Whether tracking was lost in this very run, if a directory holds it with nothing left to do; None if it does not.
 
     Raises:
         InputError: it holds another one.
@@ -57,14 +57,15 @@ def lost_before(out: Path, config: Config, run: dict[str, Any]) -> int | None:
         tree = read_yaml(out / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         was = Config.model_validate(tree).model_dump(exclude=_WITHOUT_EFFECT)
-        lost = int(json.loads((out / files.SUMMARY).read_text(encoding="utf-8"))["lost_scans"])
+        summary = json.loads((out / files.SUMMARY).read_text(encoding="utf-8"))
+        astray = int(summary["lost_scans"]) > 0 or len(summary.get("map_contradictions", [])) > 0
     except (ConfigError, OSError, KeyError, TypeError, ValueError):
         return None
     if was_run != run or was != config.model_dump(exclude=_WITHOUT_EFFECT):
         raise InputError(
             f"{out}: holds a finished run of something else; name another directory, or replace it with --overwrite"
         )
-    return lost
+    return astray
 
 
 def scans_left(scans: Iterator[Scan], held: Scan, odometry: Odometry, saved: Saved) -> Iterator[Scan]:

@@ -9,7 +9,7 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.loop_closing import close_loops
-from lidarslam.resuming import describe_computed, lost_before
+from lidarslam.resuming import astray_before, describe_computed
 from lidarslam.run_directory import RunDirectory
 from lidarslam.run_request import RunRequest, describe_run
 from lidarslam.run_results import RunOutcome, final_map, write_results
@@ -58,13 +58,13 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     return outcome
 
 
-def lost_when_finished(request: RunRequest) -> int | None:
-    """How many scans were lost, if `out` holds this very run with nothing left to resume; None if it does not.
+def astray_when_finished(request: RunRequest) -> bool | None:
+    """Whether tracking was lost, if `out` holds this very run with nothing left to resume; None if it does not.
 
     Raises:
         InputError: it holds another one.
     """
-    return lost_before(request.out, request.config, describe_run(request))
+    return astray_before(request.out, request.config, describe_run(request))
 
 
 def _claim(request: RunRequest, recording: Recording, directory: RunDirectory, stack: ExitStack) -> Unfinished | None:

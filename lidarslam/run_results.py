@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from evaluation.map_entropy import sampled_map_entropy
 from evaluation.trajectory_metrics import TrajectoryMetrics
 from lidarslam import run_directory as files
 from lidarslam.config import dump_yaml
@@ -15,6 +16,7 @@ from mapping.config import GlobalMapConfig
 from mapping.g2o import format_g2o
 from mapping.global_map import GlobalMap, PointCloud
 from mapping.map_io import write_cloud
+from mapping.slides import find_contradictions
 from mapping.visibility import PlacedViews, seen_through
 
 
@@ -75,7 +77,8 @@ def write_results(
     written = write_map(directory, drawn, request.pcd)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
-    summary = summarise(log, tracked.total_ms, written, skipped, closed)
+    contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
+    summary = summarise(log, tracked.total_ms, written, skipped, closed, contradictions)
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, tracked.stopped)
 
@@ -88,4 +91,5 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, pcd: bool) -> WrittenMap
     for name in (files.MAP_PLY, files.MAP_PCD) if pcd else (files.MAP_PLY,):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
-    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved)
+    entropy = sampled_map_entropy(cloud.points)
+    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean)

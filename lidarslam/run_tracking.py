@@ -20,6 +20,7 @@ from lidarslam.trajectory_files import ground_truth
 from lidarslam.unfinished import Unfinished
 from lidarslam.viewer import Viewer
 from mapping.global_map import GlobalMap
+from mapping.slides import PairTests
 from mapping.visibility import Views
 from odometry.interface import Odometry
 
@@ -38,6 +39,7 @@ class Tracked:
         total_ms: wall time of each scan.
         global_map: of the poses as they were found; None when no scan could be believed.
         views: of some of its scans, for what moved.
+        slides: pairs of its scans, held against one another.
         error: what ended it before its last scan, None when nothing did.
     """
 
@@ -49,6 +51,7 @@ class Tracked:
     total_ms: list[float]
     global_map: GlobalMap | None
     views: Views
+    slides: PairTests
     error: InputError | KeyboardInterrupt | None
 
     @property
@@ -106,8 +109,9 @@ def track(
     if not log.points_read:
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", isinstance(error, KeyboardInterrupt))
+    slides = pipeline.slides.tests
     return Tracked(
-        recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, pipeline.views, error
+        recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, pipeline.views, slides, error
     )
 
 

@@ -14,6 +14,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.loop_closing import GraphOutcome, LoopReport
 from lidarslam.pipeline import STAGES
 from lidarslam.scan_log import ScanLog
+from mapping.slides import Contradiction
 
 # A time between scans that is longer than usual by so much of it, and so many seconds, is a gap.
 _PAUSE_OF_STEP = 2.0
@@ -92,12 +93,14 @@ class GraphSummary:
 class WrittenMap:
     """A map as it was written: its points and the size of its voxels, None without a map; and what was left out.
 
-    `moved` counts the points where something was that had moved away.
+    `moved` counts the points where something was that had moved away. `entropy` is the mean map entropy, None where it
+    cannot be computed; see `evaluation.map_entropy`.
     """
 
     points: int
     voxel_size_m: float | None
     moved: int
+    entropy: float | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,12 @@ class RunSummary:
     graph: GraphSummary | None
     map: WrittenMap
     warnings: tuple[str, ...]
+    contradictions: tuple[Contradiction, ...] = ()
+
+    @property
+    def went_astray(self) -> bool:
+        """Whether tracking was lost: by a scan's own status, or because the map contradicts itself."""
+        return bool(self.lost_scans or self.contradictions)
 
     @property
     def lost_scans(self) -> int:
@@ -139,6 +148,7 @@ class RunSummary:
             "lost_scans": self.lost_scans,
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
+            "map_contradictions": [vars(found) for found in self.contradictions],
             **_of_graph_and_map(self),
         }
 
@@ -199,6 +209,7 @@ def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
         "map_points": summary.map.points,
         "map_voxel_size_m": summary.map.voxel_size_m,
         "map_points_moved": summary.map.moved,
+        "map_entropy": summary.map.entropy,
         "warnings": list(summary.warnings),
     }
 
@@ -209,6 +220,7 @@ def summarise(
     written: WrittenMap,
     skipped: int,
     closed: GraphOutcome | None = None,
+    contradictions: tuple[Contradiction, ...] = (),
 ) -> RunSummary:
     """Sum a run up.
 
@@ -218,6 +230,7 @@ def summarise(
         written: the map.
         skipped: scans that were asked for and did not come, for no reason that the log warns of.
         closed: what its pose graph did to it, if it had one.
+        contradictions: where its map contradicts itself.
     """
     trajectory = log.trajectory
     stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
@@ -234,7 +247,8 @@ def summarise(
         degraded_scans=log.statuses.count(Status.DEGRADED),
         graph=None if closed is None else GraphSummary.of(closed),
         map=written,
-        warnings=_warnings(log, skipped),
+        warnings=(*_warnings(log, skipped), *_contradicted(contradictions)),
+        contradictions=contradictions,
     )
 
 
@@ -261,6 +275,20 @@ def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
     if degraded := log.statuses.count(Status.DEGRADED):
         warnings.append(f"{degraded} scans are believed only in part (status degraded; scans.csv says why)")
     return tuple(warnings)
+
+
+def _contradicted(contradictions: tuple[Contradiction, ...]) -> Iterator[str]:
+    """Where the map contradicts itself, the clearest place spelt out."""
+    if not contradictions:
+        return
+    clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)
+    more = f"; {len(contradictions) - 1} more such stretches" if len(contradictions) > 1 else ""
+    farther = "farther on" if clearest.shift_m > 0.0 else "farther back"
+    yield (
+        f"the map contradicts itself between scans {clearest.first} and {clearest.last}: held against one another, they"
+        f" fit {abs(clearest.shift_m):.1f} m {farther} along the way, not at their poses, as after a slip of"
+        f" registration{more}"
+    )
 
 
 def _pauses(log: ScanLog) -> Iterator[str]:

@@ -39,7 +39,12 @@ def format_map(written: WrittenMap) -> str:
         return "no map: no scan could be believed"
     moved = f"; {_count(written.moved, 'point')} of what moved left out" if written.moved else ""
     voxel_cm = 100.0 * written.voxel_size_m
-    return f"map of {_count(written.points, 'point')}, one in every voxel of {voxel_cm:.0f} cm{moved}"
+    crisp = (
+        ""
+        if written.entropy is None
+        else f"; mean entropy {written.entropy:.2f} (of runs of one recording: lower is crisper)"
+    )
+    return f"map of {_count(written.points, 'point')}, one in every voxel of {voxel_cm:.0f} cm{moved}{crisp}"
 
 
 def _loops(graph: GraphSummary) -> str:

@@ -51,5 +51,5 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
         tell(f"{recording.directory}: not joined to the others, left out of the common map")
     if outcome.stopped or apart:
         ctx.exit(EXIT_MENDABLE)
-    if outcome.summary.lost_scans:
+    if outcome.summary.lost_scans or any(run is not None and run.summary.contradictions for run in outcome.runs):
         ctx.exit(EXIT_LOST)

@@ -59,7 +59,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.progress import show_progress
-    from lidarslam.run import execute, lost_when_finished
+    from lidarslam.run import astray_when_finished, execute
     from lidarslam.run_request import RunRequest
     from lidarslam.summary_text import format_outcome
 
@@ -75,14 +75,14 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     )
     config = take_config(options, settings, source)
     request = RunRequest(source, out, config, **options)
-    if request.resume and (lost := lost_when_finished(request)) is not None:
+    if request.resume and (astray := astray_when_finished(request)) is not None:
         say(f"{out}: is finished, nothing is left to do")
-        ctx.exit(EXIT_LOST if lost else 0)
+        ctx.exit(EXIT_LOST if astray else 0)
     with show_progress(source.name) as progress:
         outcome = execute(request, progress)
     say(format_outcome(out, outcome))
     if outcome.stopped is not None:
         tell(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; --resume goes on with it")
         ctx.exit(EXIT_MENDABLE)
-    if outcome.summary.lost_scans:
+    if outcome.summary.went_astray:
         ctx.exit(EXIT_LOST)

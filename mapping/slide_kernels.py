@@ -1,0 +1,126 @@
+"""Loops of the check for slides: normals from a spherical image of a scan, and votes for shifts between two scans."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+
+# Pixels of one degree.
+ROWS, COLUMNS = 180, 360
+# The neighbourhood of a pixel, in rows and columns to either side; beams are farther apart than points of a ring.
+_NEAR_ROWS, _NEAR_COLUMNS = 2, 1
+# Neighbours are no farther from a point than this share of its range.
+_REACH = 0.1
+# Normals of one surface, seen in two scans, have at least this cosine.
+_SAME_NORMAL = 0.9
+
+
+@compiled
+def draw_indices(points: FloatArray, min_range_m: float, image: NDArray[np.int64]) -> None:
+    """Write the index of one of the points (N, 3) into every pixel (ROWS, COLUMNS) that has any, -1 elsewhere."""
+    image[:, :] = -1
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        across = np.sqrt(x * x + y * y)
+        if not (across * across + z * z >= min_range_m * min_range_m):
+            continue
+        column = int((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * COLUMNS) % COLUMNS
+        row = int((np.arctan2(z, across) + 0.5 * np.pi) / np.pi * ROWS)
+        image[min(max(row, 0), ROWS - 1), column] = n
+
+
+@compiled
+def write_moments(
+    points: FloatArray, image: NDArray[np.int64], pixels: NDArray[np.int64], means: FloatArray,
+    covariances: FloatArray, counts: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Write the mean (M, 3), covariance (M, 3, 3) and number (M,) of the points around pixels (M, 2) of an image."""
+    for m in range(len(pixels)):
+        centre = image[pixels[m, 0], pixels[m, 1]]
+        squared_range = points[centre, 0] ** 2 + points[centre, 1] ** 2 + points[centre, 2] ** 2
+        count = 0
+        means[m, :] = 0.0
+        covariances[m, :, :] = 0.0
+        for row in range(max(pixels[m, 0] - _NEAR_ROWS, 0), min(pixels[m, 0] + _NEAR_ROWS + 1, ROWS)):
+            for step in range(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1):
+                n = image[row, (pixels[m, 1] + step) % COLUMNS]
+                if n < 0:
+                    continue
+                x, y, z = (
+                    points[n, 0] - points[centre, 0],
+                    points[n, 1] - points[centre, 1],
+                    points[n, 2] - points[centre, 2],
+                )
+                if x * x + y * y + z * z > _REACH * _REACH * squared_range:
+                    continue
+                count += 1
+                means[m, 0] += x
+                means[m, 1] += y
+                means[m, 2] += z
+                covariances[m, 0, 0] += x * x
+                covariances[m, 1, 0] += x * y
+                covariances[m, 1, 1] += y * y
+                covariances[m, 2, 0] += x * z
+                covariances[m, 2, 1] += y * z
+                covariances[m, 2, 2] += z * z
+        counts[m] = count
+        for i in range(3):
+            for j in range(i + 1):
+                value = covariances[m, i, j] / count - means[m, i] * means[m, j] / (count * count)
+                covariances[m, i, j] = value
+                covariances[m, j, i] = value
+        for i in range(3):
+            means[m, i] = points[centre, i] + means[m, i] / count
+
+
+@compiled
+def vote(
+    points: FloatArray, normals: FloatArray, blocks: NDArray[np.int64], held_points: FloatArray,
+    held_normals: FloatArray, held_radii: FloatArray, direction: FloatArray, gate_m: float, bin_m: float,
+    votes: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Add up which shifts of a scan along a direction lay its surfels on those of another.
+
+    A surfel p with a normal like that n of a held surfel a lies in its plane after the shift n.(a - p) / n.d, and votes
+    for it if it then lies within a's radius; the vote falls off to zero where it is `gate_m` off the plane. A surfel
+    has at most one vote for each shift.
+
+    Args:
+        points, normals: (M, 3) surfels of the one scan, those of a block successively.
+        blocks: (M,) ascending, which block each belongs to.
+        held_points, held_normals, held_radii: (K, 3), (K, 3), (K,) of the other, in the same frame.
+        direction: (3,) unit vector; held normals are not at right angles to it.
+        gate_m, bin_m: width of a vote, and between shifts.
+        votes: (B, S) written, of each block; the shift of zero is in the middle.
+    """
+    votes[:, :] = 0.0
+    size = votes.shape[1]
+    middle = size // 2
+    own = np.empty(size, dtype=np.float32)
+    for m in range(len(points)):
+        own[:] = 0.0
+        for k in range(len(held_points)):
+            cosine, along, gap = 0.0, 0.0, 0.0
+            for i in range(3):
+                cosine += held_normals[k, i] * normals[m, i]
+                along += held_normals[k, i] * direction[i]
+                gap += held_normals[k, i] * (held_points[k, i] - points[m, i])
+            if cosine < _SAME_NORMAL:
+                continue
+            shift = gap / along
+            if not abs(shift) < middle * bin_m:
+                continue
+            squared = 0.0
+            for i in range(3):
+                squared += (points[m, i] + shift * direction[i] - held_points[k, i]) ** 2
+            if squared > held_radii[k] * held_radii[k]:
+                continue
+            half = gate_m / abs(along)
+            first = max(int(np.ceil((shift - half) / bin_m)) + middle, 0)
+            last = min(int(np.floor((shift + half) / bin_m)) + middle, size - 1)
+            for s in range(first, last + 1):
+                weight = np.float32(1.0 - abs((s - middle) * bin_m - shift) / half)
+                own[s] = max(own[s], weight)
+        for s in range(size):
+            votes[blocks[m], s] += own[s]

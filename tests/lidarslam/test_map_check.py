@@ -1,0 +1,74 @@
+"""A run whose map contradicts itself says so, whatever its scans' statuses are."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from evaluation.map_entropy import map_entropy, sampled_map_entropy
+from lidarslam.cli import main
+from lidarslam.core.geometry import inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    """Twenty scans of a room, compensated."""
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps, fmt="%.9f")
+    return folder
+
+
+def run(recording: Path, truth: Trajectory, out: Path, scale: float, *more: str) -> tuple[Result, dict[str, Any]]:
+    """A run on the true motion, its translation scaled; and the summary."""
+    motions = inverse(truth.T_world_lidar[:-1]) @ truth.T_world_lidar[1:]
+    motions[:, :3, 3] *= scale
+    poses = [np.eye(4)]
+    for motion in motions:
+        poses.append(poses[-1] @ motion)
+    prior = out.parent / f"{scale}.tum"
+    write_tum(prior, Trajectory(truth.stamps, np.array(poses)))
+    command = ["run", str(recording), "--out", str(out), "--prior", str(prior), "--no-mapping", *more]
+    result = CliRunner().invoke(main, command)
+    return result, json.loads((out / "summary.json").read_text(encoding="utf-8"))
+
+
+def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path, room_truth: Trajectory) -> None:
+    good, fine = run(recording, room_truth, tmp_path / "good", 1.0)
+    assert good.exit_code == 0, good.output
+    assert fine["map_contradictions"] == []
+    assert not any("contradicts itself" in warning for warning in fine["warnings"])
+    assert "mean entropy" in good.output
+    slid, summary = run(recording, room_truth, tmp_path / "slid", 0.4)
+    assert slid.exit_code == 3, slid.output
+    assert summary["lost_scans"] == 0
+    assert summary["map_contradictions"][0]["shift_m"] > 0.2
+    assert any("contradicts itself" in warning for warning in summary["warnings"])
+    assert "the map contradicts itself between scans 0 and" in slid.output
+    assert summary["map_entropy"] > fine["map_entropy"]
+    again, _ = run(recording, room_truth, tmp_path / "slid", 0.4, "--resume")
+    assert again.exit_code == 3
+    assert "nothing is left to do" in again.output
+
+
+def test_a_large_map_is_sampled_by_blocks(rng: np.random.Generator) -> None:
+    ground = rng.uniform(-60.0, 60.0, (400_000, 3)) * [1.0, 1.0, 0.0005]
+    part = sampled_map_entropy(ground, 100_000)
+    assert part is not None
+    assert 2_000 < part.points <= 10_000
+    one, other = sampled_map_entropy(ground), map_entropy(ground, most_samples=10_000)
+    assert one is not None
+    assert one == other
+    assert part.mean == pytest.approx(one.mean, abs=0.1)
+
+
+def test_no_map_has_no_entropy() -> None:
+    assert sampled_map_entropy(np.empty((0, 3))) is None
