@@ -8,7 +8,7 @@ from lidarslam.core.geometry import FloatArray
 # Share of all pulls that must be felt along a direction. A corridor's noisy walls are felt along it as well: what the
 # uncertainty of the normals alone would make is not counted.
 _LEAST_SHARE = 0.0005
-_NOISE_FACTOR = 3.0
+_NOISE_FACTOR = 1.25
 
 
 def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray, lever_m: float) -> Degeneracy:

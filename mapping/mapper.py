@@ -31,7 +31,9 @@ _CAUTION = 0.8
 _UNKNOWN_M = 10.0
 # Nothing goes on as it did for ever: while lost, the velocity fades by this from scan to scan.
 _FADING = 0.7
-# A displacement that was searched for must fit so much better than the expected one.
+# What was found without the prediction must fit better than what was found with it: a little when the carrier may have
+# done anything, clearly when all displacements were searched.
+_BETTER = 1.05
 _CLEARLY_BETTER = 1.1
 # How often the first sweep is drawn anew when the second has shown how it moved.
 _BEGINNINGS = 2
@@ -201,7 +203,8 @@ class Mapper:
         self._doubt.laid(placed.status, found, placed.quality, sampled.stamp)
         interval_s = sampled.stamp - last.stamp
         if interval_s > 0.0 and self._has_velocity:
-            self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s)
+            variance = np.diag(placed.refined.covariance + last.covariance)[6:]
+            self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s, variance)
         if self._has_velocity:
             way = inverse(last.T_world_lidar) @ placed.refined.T_world_lidar
             self._noise = self._noise.seen(prior, way, self._config)
@@ -231,7 +234,7 @@ class Mapper:
         near = place(sampled, prediction, last, local_map, self._config, coarse_first)
         if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
             return near
-        if not self._has_velocity or near.status is not Status.OK:
+        if not self._has_velocity:
             poses = (prediction.T_world_lidar, last.T_world_lidar)
             displaced = place_displaced(sampled, poses, last, local_map, self._config)
             if displaced is not None and displaced.quality > _CLEARLY_BETTER * near.quality:
@@ -240,7 +243,7 @@ class Mapper:
             return near
         anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s, self._noise)
         again = place_surprised(sampled, anyhow, last, local_map, self._config)
-        return again if again.is_beyond_doubt and again.quality > near.quality else near
+        return again if again.is_beyond_doubt and again.quality > _BETTER * near.quality else near
 
     def _look(
         self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap

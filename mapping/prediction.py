@@ -124,10 +124,14 @@ class Carrier:
         """(6,) rotation first."""
         return np.array([self.rotation] * 3 + [self.translation] * 3)
 
-    def seen(self, change: FloatArray, interval_s: float) -> "Carrier":
-        """The carrier after its velocity was seen to change by (6,) in a time."""
-        seen = change / interval_s
-        squared = (float(np.mean(seen[:3] ** 2)), float(np.mean(seen[3:] ** 2)))
+    def seen(self, change: FloatArray, interval_s: float, variance: FloatArray) -> "Carrier":
+        """The carrier after its velocity was estimated to have changed by (6,) in a time.
+
+        A change that its own variance (6,) explains is no acceleration: where little is to be seen velocities scatter,
+        and a carrier thought to be wild because of it would let them scatter the more.
+        """
+        seen = np.maximum(change**2 - variance, 0.0) / interval_s**2
+        squared = (float(np.mean(seen[:3])), float(np.mean(seen[3:])))
         followed = [
             float(np.clip(np.sqrt((1.0 - _FOLLOWING) * old**2 + _FOLLOWING * _CAUTION**2 * new), least, most))
             for old, new, least, most in zip(

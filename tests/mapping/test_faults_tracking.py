@@ -40,7 +40,7 @@ from mapping.prediction import Prior
 from mapping.refinement import compensated
 
 AT = 70
-COUNT = 90
+COUNT = 100
 NOTHING = Prior()
 Start = Callable[[], Mapper]
 
@@ -151,7 +151,7 @@ def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: S
     recorded = carried_off(drive_by, AT, back, turned_deg)
     moved = recorded.truth.positions[AT] - recorded.truth.positions[AT - 1]
     assert np.linalg.norm(moved) > 3.0
-    results = process(mapper, replace(recorded, scans=recorded.scans[: AT + 10]))
+    results = process(mapper, replace(recorded, scans=recorded.scans[: AT + 18]))
     assert results[0].status is not Status.OK
     assert any("found again in the map" in result.message for result in results[:3])
     assert not any(result.way_known for result in results if "found again in the map" in result.message)
@@ -190,7 +190,7 @@ def test_dropped_scans_do_no_harm(mapper: Mapper, drive_by: Simulation, count: i
 
 
 def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive_by: Simulation) -> None:
-    recorded = dropped(replace(drive_by, scan_count=AT + 65), range(AT, AT + 50))
+    recorded = dropped(replace(drive_by, scan_count=AT + 75), range(AT, AT + 50))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded, 3)

@@ -16,7 +16,7 @@ from mapping.global_map import GlobalMap
 from mapping.graph_config import KeyframeConfig
 from mapping.keyframe import KeyframeSelector
 from mapping.mapper import MappedScan, Mapper
-from mapping.prediction import Carrier, Prior
+from mapping.prediction import Carrier, OdometryNoise, Prior
 from mapping.rings import RingFinder, RingSource
 
 ThroughDisk = Callable[[State], Saved]
@@ -160,19 +160,21 @@ def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through
     for scan in scans[:2]:
         mapper.process(scan, Prior())
     mapper._first = mapper._sampler.sample(scans[0])
-    mapper._carrier = Carrier(1.5, 7.0)
+    mapper._carrier, mapper._noise = Carrier(1.5, 7.0), OdometryNoise(3.5)
     mapper._expected_error_m, mapper._scans_in_map, mapper._has_velocity = 0.125, 7, True
     assert mapper._map is not None
     mapper._earlier.set_aside(mapper._map, 9)
-    mapper._doubt.laid(Status.OK, found=False, quality=0.75)
-    mapper._doubt.laid(Status.DEGRADED, found=True, quality=0.5)
     mapper._doubt.missed()
+    mapper._doubt.laid(Status.OK, found=False, quality=0.75, stamp=5.0)
+    mapper._doubt.laid(Status.DEGRADED, found=True, quality=0.5, stamp=5.1)
     restored.restore(through_disk(mapper.state()))
     assert set(vars(mapper)) == {
-        "_config", "_sampler", "_map", "_state", "_carrier", "_expected_error_m", "_doubt", "_earlier",
+        "_config", "_sampler", "_map", "_state", "_carrier", "_noise", "_expected_error_m", "_doubt", "_earlier",
         "_scans_in_map", "_first", "_has_velocity",
     }  # fmt: skip
-    assert set(vars(mapper._doubt)) == {"lost_in_a_row", "is_astray", "_was_degraded", "_to_confirm", "_usual"}
+    assert set(vars(mapper._doubt)) == {
+        "lost_in_a_row", "is_astray", "_was_degraded", "_to_confirm", "_found_s", "_usual",
+    }  # fmt: skip
     assert set(vars(mapper._earlier)) == {"_maps", "_scans_until_look", "_wait"}
     assert flat(restored.state()) == flat(mapper.state())
 
