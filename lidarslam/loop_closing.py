@@ -84,7 +84,7 @@ def begin_graph(config: Config, directory: Path | None = None, file: Path | None
         return None
     from mapping.slam_graph import SlamGraph
 
-    return SlamGraph(config.pose_graph, directory, file)
+    return SlamGraph(config.pose_graph, directory, file, _local_radius_m(config))
 
 
 def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph":
@@ -95,13 +95,17 @@ def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph":
     """
     from mapping.slam_graph import SlamGraph
 
-    return SlamGraph.restored(config.pose_graph, saved, file)
+    return SlamGraph.restored(config.pose_graph, saved, file, _local_radius_m(config))
 
 
 def finish_graph(graph: "SlamGraph", scans: int, voxel_size_m: float) -> GraphOutcome | None:
     """Close the loops of so many scans for good, and draw the map anew; None where no scan could be believed."""
     finished = finish_recordings(graph, [scans], voxel_size_m)
     return None if finished is None else finished.of([0])
+
+
+def _local_radius_m(config: Config) -> float:
+    return config.mapping.radius_m if config.mapping.enabled else 0.0
 
 
 def close_loops(

@@ -29,6 +29,7 @@ from mapping.keyframe import KeyframeSelector
 from mapping.loop_closure import LoopClosure, LoopDetector, Submap, closures_state, restored_closures
 from mapping.loop_refinement import DenseSubmap, refine
 from mapping.pose_graph import PoseGraph
+from mapping.revisits import as_registered
 from mapping.sessions import Sessions
 from mapping.submap_store import SubmapStore
 from mapping.trajectory_edges import Way, trajectory_covariance, trajectory_edges
@@ -74,10 +75,18 @@ class SlamGraph:
         config: how.
         directory: where submaps are kept meanwhile, in a file without a name; None: where temporary files are.
         file: where they are kept instead, so that `restore` finds them.
+        local_radius_m: of the local map that scans were registered to; 0 without one.
     """
 
-    def __init__(self, config: SlamGraphConfig, directory: Path | None = None, file: Path | None = None) -> None:
+    def __init__(
+        self,
+        config: SlamGraphConfig,
+        directory: Path | None = None,
+        file: Path | None = None,
+        local_radius_m: float = 0.0,
+    ) -> None:
         self._config = config
+        self._local_radius_m = local_radius_m
         self._selector = KeyframeSelector(config.keyframes)
         self._detector = LoopDetector(config.loops)
         self._graph = PoseGraph(config.optimiser)
@@ -128,13 +137,13 @@ class SlamGraph:
         }
 
     @classmethod
-    def restored(cls, config: SlamGraphConfig, saved: Saved, file: Path) -> "SlamGraph":
+    def restored(cls, config: SlamGraphConfig, saved: Saved, file: Path, local_radius_m: float = 0.0) -> "SlamGraph":
         """The graph with a state, whose submaps lie in a file.
 
         Raises:
             InputError: the file is damaged.
         """
-        graph = cls(config)
+        graph = cls(config, local_radius_m=local_radius_m)
         graph._store.close()
         graph._store = SubmapStore.restored(saved.part("store"), file)
         graph._selector.restore(saved.part("selector"))
@@ -299,9 +308,14 @@ class SlamGraph:
         target, source = (self._dense_submap(key, poses, cell_m) for key in (closure.first, closure.second))
         drift = self._drift_within(closure.first) + self._drift_within(closure.second)
         refined = refine(target, source, closure.T_first_second, closure.covariance, drift)
-        if refined is None:
+        if refined is not None:
+            closure = replace(closure, T_first_second=refined.T_target_source, covariance=refined.covariance)
+        if self._sessions[closure.first] != self._sessions[closure.second]:  # another recording, or lost on the way
             return closure
-        return replace(closure, T_first_second=refined.T_target_source, covariance=refined.covariance)
+        begin, end = self._keyframe_scans[closure.first], self._keyframe_scans[closure.second]
+        way = np.array(self.scan_poses[begin : end + 1])
+        registered = self._registered[closure.first], self._registered[closure.second]
+        return as_registered(closure, way, *registered, self._local_radius_m)
 
     def _dense_submap(self, key: int, poses: FloatArray, cell_m: float) -> DenseSubmap:
         """A keyframe's submap united with its neighbours' of the same session, which poses (K, 4, 4) place."""

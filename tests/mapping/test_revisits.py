@@ -1,0 +1,55 @@
+"""Closures of places that the local map still holds, and of those that it has forgotten."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse
+from mapping.loop_closure import LoopClosure
+from mapping.revisits import as_registered
+
+SIGMA = np.array([1e-3] * 3 + [5e-3] * 3)
+REGISTERED = np.diag(SIGMA**2)
+
+
+@pytest.fixture
+def round_trip() -> FloatArray:
+    """Poses (101, 4, 4) once round a circle of 40 m across, and a little farther."""
+    turn = np.array([0.0, 0.0, 2.0 * np.pi / 100.0, 2.0 * np.pi * 20.0 / 100.0, 0.0, 0.0])
+    poses = [exp([0.1, 0.0, 0.3, 5.0, -2.0, 1.0])]
+    for _ in range(100):
+        poses.append(poses[-1] @ exp(1.002 * turn))
+    return np.array(poses)
+
+
+def closure(way: FloatArray, off: FloatArray, sigma: float = 0.01) -> LoopClosure:
+    """Of its first and last pose, off by (6,) from what the way says."""
+    T_first_second = inverse(way[0]) @ way[-1] @ exp(off)
+    covariance = sigma**2 * np.eye(6)
+    return LoopClosure(0, 25, T_first_second, covariance, 0.9, 0.01, 0.9, "nearby", 3, "accepted", "")
+
+
+NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
+
+
+def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip: FloatArray) -> None:
+    found = as_registered(closure(round_trip, NEAR), round_trip, REGISTERED, REGISTERED, radius_m=100.0)
+    np.testing.assert_allclose(found.T_first_second, inverse(round_trip[0]) @ round_trip[-1], atol=1e-12)
+    assert found.verdict == "accepted"
+    assert np.linalg.eigvalsh(found.covariance - REGISTERED).min() > 0.0, "both registrations err"
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "first", "off"),
+    [
+        (50.0, REGISTERED, NEAR),
+        (0.0, REGISTERED, NEAR),
+        (100.0, None, NEAR),
+        (100.0, REGISTERED, np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0])),
+    ],
+    ids=["the way left the map", "without a map", "not registered", "drifted off its own map"],
+)
+def test_elsewhere_the_closure_counts(
+    round_trip: FloatArray, radius_m: float, first: FloatArray | None, off: FloatArray
+) -> None:
+    measured = closure(round_trip, off)
+    assert as_registered(measured, round_trip, first, REGISTERED, radius_m) is measured
