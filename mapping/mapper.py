@@ -3,6 +3,7 @@
 LOAM's mapping (Zhang and Singh, RSS 2014), with any odometry before it or none.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -155,7 +156,7 @@ class Mapper:
         Two sweeps bent alike fit one another, and hide a motion that both have in common; the way between their poses
         does not.
         """
-        carrier = self._carrier
+        carrier, noise, doubt = self._carrier, self._noise, copy(self._doubt)
         mapped = self._lay(sampled, prior, prediction, last, local_map)
         if sampled.stamp <= last.stamp:  # no time went by, and no velocity shows
             return mapped
@@ -164,7 +165,7 @@ class Mapper:
             if not mapped.registered or displacement_m(way, sampled.range_m) < local_map.cell_m:
                 break
             last = self._begin_again(first, last, mapped.state)
-            self._carrier, self._has_velocity = carrier, False
+            self._carrier, self._noise, self._doubt, self._has_velocity = carrier, noise, copy(doubt), False
             prediction = predict(last, sampled.stamp, prior, carrier, self._config, sampled.seen_from_s, self._noise)
             assert self._map is not None
             mapped = self._lay(sampled, prior, prediction, last, self._map)
@@ -192,54 +193,63 @@ class Mapper:
             local_map = self._map = local_map.resized(sampled.cell_m)
         if self._is_blind(sampled):
             return self._see_nothing(sampled, prediction)
-        near, prediction = self._place_expected(sampled, prior, prediction, last, local_map)
-        placed = self._look(near, sampled, prediction, last, local_map)
+        near, expected = self._place_expected(sampled, prior, prediction, last, local_map)
+        placed = self._look(near, sampled, expected, last, local_map)
         if placed is None:
-            return self._miss(sampled, prediction, near.fit)
+            return self._miss(sampled, expected, near.fit)
         assert placed.refined is not None
         found = placed is not near
-        if not found and self._doubt.is_unconfirmed and self._is_contradicted(placed, prior, prediction, last):
-            return self._miss(sampled, prediction, near.fit)
+        if not found and self._doubt.is_unconfirmed and self._is_contradicted(placed, prior, expected, last):
+            return self._miss(sampled, expected, near.fit)
         self._doubt.laid(placed.status, found, placed.quality, sampled.stamp)
-        interval_s = sampled.stamp - last.stamp
-        if interval_s > 0.0 and self._has_velocity:
-            variance = np.diag(placed.refined.covariance + last.covariance)[6:]
-            self._carrier = self._carrier.seen(placed.refined.velocity - last.velocity, interval_s, variance)
-        if self._has_velocity:
-            way = inverse(last.T_world_lidar) @ placed.refined.T_world_lidar
-            self._noise = self._noise.seen(prior, way, self._config)
+        if not found:
+            self._learn(placed.refined, prior, last, sampled.stamp - last.stamp)
         self._has_velocity = True
-        return self._accept(sampled, prediction, last, placed, placed.refined, found)
+        unexpected = not found and has_jumped(_correction(prediction, placed.refined), prediction)
+        return self._accept(sampled, expected, last, placed, placed.refined, found, unexpected)
+
+    def _learn(self, refined: Refined, prior: Prior, last: State, interval_s: float) -> None:
+        """Adapt the noise of carrier and odometry to a registered motion."""
+        if interval_s > 0.0 and self._has_velocity:
+            variance = np.diag(refined.covariance + last.covariance)[6:]
+            self._carrier = self._carrier.seen(refined.velocity - last.velocity, interval_s, variance)
+        self._noise = self._noise.seen(prior, inverse(last.T_world_lidar) @ refined.T_world_lidar, self._config)
 
     def _place_expected(
         self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
     ) -> tuple[Placed, Prediction]:
-        """A scan registered from where it is expected; from both expectations where odometry and motion disagree."""
-        near = self._place_near(sampled, prior, prediction, last, local_map)
-        if not (prediction.contradicted and self._has_velocity):
-            return near, prediction
-        alone = predict(last, sampled.stamp, Prior(), self._carrier, self._config, sampled.seen_from_s)
-        other = self._place_near(sampled, Prior(), alone, last, local_map)
-        return (other, alone) if other.quality > near.quality else (near, prediction)
+        """A scan registered from where it is expected, with that expectation.
+
+        Where odometry and motion contradict one another both are tried, and where the velocity is not known, or neither
+        fits, all displacements.
+        """
+        best = self._place_near(sampled, prior, prediction, last, local_map), prediction
+        if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
+            return best
+        if prediction.contradicted and self._has_velocity:
+            alone = predict(last, sampled.stamp, Prior(), self._carrier, self._config, sampled.seen_from_s)
+            other = self._place_near(sampled, Prior(), alone, last, local_map), alone
+            best = max(best, other, key=lambda tried: tried[0].quality)
+        misled = prior.T_prev_curr is not None and best[0].status is not Status.OK
+        if misled or not self._has_velocity:
+            poses = (prediction.T_world_lidar, last.T_world_lidar)
+            displaced = place_displaced(sampled, poses, last, local_map, self._config)
+            if displaced is not None and displaced[0].quality > _CLEARLY_BETTER * best[0].quality:
+                return displaced if displaced[0].is_beyond_doubt or not self._has_velocity else best
+        return best
 
     def _place_near(
         self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap
     ) -> Placed:
-        """A scan laid on the map from where it is expected; when it lies badly, as if the carrier could do anything.
+        """A scan registered from where it is expected; when it fits badly, as if the carrier could do anything.
 
-        A motion that nobody expected bends the sweep, and what is in reach of the expected one fits halfway: with the
-        velocity that comes of it, the next scan would be expected farther off still.
+        An unexpected motion bends the sweep, and what is in reach of the expected one fits halfway: with the velocity
+        that comes of it, the next scan would be expected farther off still.
         """
         coarse_first = self._expected_error_m > _FINE_ENOUGH * local_map.cell_m
         near = place(sampled, prediction, last, local_map, self._config, coarse_first)
-        if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
-            return near
-        if not self._has_velocity:
-            poses = (prediction.T_world_lidar, last.T_world_lidar)
-            displaced = place_displaced(sampled, poses, last, local_map, self._config)
-            if displaced is not None and displaced.quality > _CLEARLY_BETTER * near.quality:
-                return displaced
-        if not self._doubt.lies_badly(near.status, near.quality):
+        surprised = self._doubt.is_surprised(sampled.stamp - last.stamp)
+        if surprised or not self._doubt.lies_badly(near.status, near.quality):
             return near
         anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s, self._noise)
         again = place_surprised(sampled, anyhow, last, local_map, self._config)
@@ -266,9 +276,9 @@ class Mapper:
     def _is_contradicted(self, placed: Placed, prior: Prior, prediction: Prediction, last: State) -> bool:
         """Whether the way since the last scan contradicts the place where the sensor was found again."""
         assert placed.refined is not None
-        correction = log(inverse(prediction.T_world_lidar) @ placed.refined.T_world_lidar)
+        jumped = has_jumped(_correction(prediction, placed.refined), prediction)
         way = inverse(last.T_world_lidar) @ placed.refined.T_world_lidar
-        return has_jumped(correction, prediction) or self._noise.contradicts(prior, way, self._config)
+        return jumped or self._noise.contradicts(prior, way, self._config)
 
     def _look_everywhere(
         self, near: Placed, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap
@@ -283,11 +293,12 @@ class Mapper:
         return max(places, key=lambda placed: placed.quality, default=None)
 
     def _accept(
-        self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined, found: bool
-    ) -> MappedScan:
+        self, sampled: SampledScan, prediction: Prediction, last: State, placed: Placed, refined: Refined, found: bool,
+        unexpected: bool,
+    ) -> MappedScan:  # fmt: skip
         """A scan that lies on the map where it was expected becomes part of it."""
         interval_s = sampled.stamp - last.stamp
-        correction = log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
+        correction = _correction(prediction, refined)
         self._expected_error_m = max(_CAUTION * self._expected_error_m, displacement_m(correction, sampled.range_m))
         state = State(sampled.stamp, refined.T_world_lidar, refined.velocity, refined.covariance, sampled.seen_until_s)
         jumped = has_jumped(correction, prediction)
@@ -303,7 +314,7 @@ class Mapper:
         elif added:
             assert self._map is not None
             self._add(sampled, refined.T_world_lidar, refined.velocity, self._map)
-        now = Circumstances(found, self._doubt.is_unconfirmed, len(self._earlier) > 0)
+        now = Circumstances(found, self._doubt.is_unconfirmed, len(self._earlier) > 0, unexpected)
         status, message = judge(placed, correction, jumped, now, self._config.tracking)
         return MappedScan(
             state=state,
@@ -356,6 +367,11 @@ class Mapper:
             edges=transform_points(T_world_lidar, edges),
             sensor=T_world_lidar[:3, 3],
         )
+
+
+def _correction(prediction: Prediction, refined: Refined) -> FloatArray:
+    """(6,) from the expected pose to the registered one."""
+    return log(inverse(prediction.T_world_lidar) @ refined.T_world_lidar)
 
 
 def _little_to_see(sampled: SampledScan) -> str:

@@ -121,8 +121,9 @@ def place_surprised(
 
 def place_displaced(
     sampled: SampledScan, rotations: Sequence[FloatArray], last: State, local_map: LocalMap, config: MappingConfig
-) -> Placed | None:
-    """Register a scan from displacements since the last one in every horizontal direction; the best, if any is ok.
+) -> tuple[Placed, Prediction] | None:
+    """Register a scan from displacements since the last one in every horizontal direction; the best, if any is ok, with
+    what was expected there.
 
     A sensor that was at speed when the recording began, or whose odometry is wrong, is out of reach of the expected
     pose, and most of a street fits there too.
@@ -150,10 +151,9 @@ def place_displaced(
         velocity = body_velocity(inverse(last.T_world_lidar) @ start, interval_s)
         moving = State.moving(last, velocity)
         prediction = predict(moving, sampled.stamp, Prior(), Carrier(), config, sampled.seen_from_s)
-        tried.append(_place_patiently(sampled, prediction, last, local_map, config))
-    return max(
-        (placed for placed in tried if placed.status is Status.OK), key=lambda placed: placed.quality, default=None
-    )
+        tried.append((_place_patiently(sampled, prediction, last, local_map, config), prediction))
+    ok = (found for found in tried if found[0].status is Status.OK)
+    return max(ok, key=lambda found: found[0].quality, default=None)
 
 
 def _place_patiently(

@@ -28,6 +28,8 @@ _UNEVEN = 1.0 / 8.0
 # chi square with six degrees of freedom, one time in ten thousand.
 _NOISE_FOLLOWING = 0.2
 _GATE = 27.9
+# Motions in a row after which an odometry may contradict a registration.
+_PROVEN_BY = 10
 # No pose is better than this, whatever its residuals say.
 LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 
@@ -147,25 +149,30 @@ class OdometryNoise:
 
     Attributes:
         variance: factor on the covariance; never less than one.
+        agreed: motions in a row that were not contradicted.
     """
 
     variance: float = 1.0
+    agreed: int = 0
 
     @classmethod
     def restored(cls, saved: Saved) -> "OdometryNoise":
         """What was saved, which is all of it."""
-        return cls(saved.number("variance"))
+        return cls(saved.number("variance"), saved.integer("agreed"))
 
     def seen(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> "OdometryNoise":
         """The noise after a registered motion (4, 4), by the normalised squared error of the odometry's."""
         if prior.T_prev_curr is None:
             return self
-        squared = _squared_error(prior, T_prev_curr, config) / 6.0
-        return OdometryNoise(max(1.0, self.variance + _NOISE_FOLLOWING * (squared - self.variance)))
+        squared = _squared_error(prior, T_prev_curr, config)
+        variance = max(1.0, self.variance + _NOISE_FOLLOWING * (squared / 6.0 - self.variance))
+        return OdometryNoise(variance, self.agreed + 1 if squared < _GATE * self.variance else 0)
 
     def contradicts(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> bool:
-        """Whether a registered motion (4, 4) is improbable, given the odometry's."""
-        return prior.T_prev_curr is not None and _squared_error(prior, T_prev_curr, config) > _GATE * self.variance
+        """Whether a registered motion (4, 4) is improbable, given that of an odometry which has agreed so far."""
+        if prior.T_prev_curr is None or self.agreed < _PROVEN_BY:
+            return False
+        return _squared_error(prior, T_prev_curr, config) > _GATE * self.variance
 
 
 def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> float:

@@ -234,7 +234,7 @@ def _solve(
     J, r = system.jacobian, system.residuals
     degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
     held = _HELD * degeneracy.projector()
-    prior: FloatArray = np.linalg.inv(prediction.covariance)
+    prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
     away = np.concatenate([log(inverse(prediction.T_world_lidar) @ T_world_lidar), velocity - prediction.velocity])
     JW = J * (system.weights / _CORRELATION)[:, None]
     matched, b = np.zeros((12, 12)), -prior @ away

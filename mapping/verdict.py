@@ -24,11 +24,13 @@ class Circumstances:
         found: it was found by looking around.
         unconfirmed: too few scans since then have confirmed that.
         adrift: the map was begun anew, and nobody knows where it lies beside the one before.
+        unexpected: it was found where odometry and motion before did not lead to.
     """
 
     found: bool = False
     unconfirmed: bool = False
     adrift: bool = False
+    unexpected: bool = False
 
 
 def has_jumped(correction: FloatArray, prediction: Prediction) -> bool:
@@ -61,6 +63,8 @@ def judge(
         message = where
     elif now.unconfirmed:
         message = "found again a moment ago, and not yet confirmed"
+    elif now.unexpected:
+        message = "it fits where neither the odometry nor the motion before lead to"
     elif now.adrift:
         message = "in a map begun anew; where it lies beside the one before is a guess"
     elif names := placed.refined.degeneracy.names:

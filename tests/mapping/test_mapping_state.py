@@ -160,7 +160,7 @@ def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through
     for scan in scans[:2]:
         mapper.process(scan, Prior())
     mapper._first = mapper._sampler.sample(scans[0])
-    mapper._carrier, mapper._noise = Carrier(1.5, 7.0), OdometryNoise(3.5)
+    mapper._carrier, mapper._noise = Carrier(1.5, 7.0), OdometryNoise(3.5, 4)
     mapper._expected_error_m, mapper._scans_in_map, mapper._has_velocity = 0.125, 7, True
     assert mapper._map is not None
     mapper._earlier.set_aside(mapper._map, 9)
