@@ -1,0 +1,85 @@
+"""Cars that are at speed at the first scan, with an odometry that says nothing, the truth, or that they stand."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.worlds.registry import build_world
+from mapping.config import MappingConfig
+from mapping.deskew import move
+from mapping.mapper import MappedScan, Mapper
+from mapping.prediction import Prior
+
+COUNT = 12
+# What an odometry states of itself: a tenth of a degree and a centimetre.
+STATED = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3) ** 2)
+
+
+@pytest.fixture(scope="module")
+def at_speed() -> Simulation:
+    world = build_world("street", 0)
+    motion = motion_along_route("car-fast", world, 0)
+    return Simulation(world, find_sensor("vlp-16"), motion, mount_pose("upright", motion.sensor_height_m), COUNT)
+
+
+@pytest.fixture(scope="module")
+def scans(at_speed: Simulation) -> list[Scan]:
+    return list(at_speed.scans())
+
+
+@pytest.fixture(scope="module")
+def truth(at_speed: Simulation, scans: list[Scan]) -> FloatArray:
+    T_map_lidar = at_speed.ground_truth.at(np.array([scan.stamp for scan in scans]), 0.2)
+    return np.asarray(inverse(T_map_lidar[0]) @ T_map_lidar, dtype=np.float64)
+
+
+def process(scans: list[Scan], motions: list[FloatArray | None]) -> list[MappedScan]:
+    mapper = Mapper(MappingConfig())
+    priors = [Prior() if motion is None else Prior(motion, covariance=STATED) for motion in motions]
+    return [mapper.process(scan, prior) for scan, prior in zip(scans, priors, strict=True)]
+
+
+def worst_m(results: list[MappedScan], truth: FloatArray) -> float:
+    estimated = np.array([result.state.T_world_lidar for result in results])
+    return float(np.linalg.norm((inverse(truth) @ estimated)[:, :3, 3], axis=1).max())
+
+
+def test_the_car_is_at_speed(truth: FloatArray) -> None:
+    assert np.linalg.norm(truth[1, :3, 3]) > 0.9
+
+
+@pytest.mark.parametrize(("step", "metres"), [(1, 0.05), (3, 0.1)])
+def test_without_an_odometry_its_way_is_found(scans: list[Scan], truth: FloatArray, step: int, metres: float) -> None:
+    """Three scans apart it is three metres: out of reach of the pose expected of a car that stands."""
+    results = process(scans[::step], [None] * len(scans[::step]))
+    assert worst_m(results, truth[::step]) < metres
+    assert [result.status for result in results] == [Status.OK] * len(results)
+
+
+def test_an_odometry_that_states_that_it_stands_is_overruled(scans: list[Scan], truth: FloatArray) -> None:
+    results = process(scans, [np.eye(4)] * COUNT)
+    assert worst_m(results, truth) < 0.1
+    assert Status.LOST not in {result.status for result in results}
+    assert results[1].status is Status.DEGRADED, "the first contradiction is reported"
+    assert "neither the odometry" in results[1].message
+    assert [result.status for result in results[-6:]] == [Status.OK] * 6
+
+
+def compensated(scan: Scan, T_curr_next: FloatArray) -> Scan:
+    assert scan.time_offsets is not None
+    return Scan(move(scan.points, scan.time_offsets, log(T_curr_next) / 0.1), scan.stamp)
+
+
+def test_scans_without_times_are_no_worse(scans: list[Scan], truth: FloatArray) -> None:
+    """Compensated already, as those of KITTI odometry: nothing within a scan shows the speed."""
+    moved = inverse(truth[:-1]) @ truth[1:]
+    still = [compensated(scan, T_curr_next) for scan, T_curr_next in zip(scans[:-1], moved, strict=True)]
+    results = process(still, [np.eye(4)] * len(still))
+    assert worst_m(results, truth[:-1]) < 0.1
+    assert Status.LOST not in {result.status for result in results}
