@@ -63,6 +63,7 @@ class TrackingConfig(BaseModel):
     @model_validator(mode="after")
     def _lost_is_worse_than_degraded(self) -> Self:
         require_lost_worse(self.lost_below, self.degraded_below)
+        require_lost_worse(self.lost_below_support, self.degraded_below_support, "_support")
         return self
 
 

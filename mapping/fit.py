@@ -14,8 +14,8 @@ from mapping.local_map import LocalMap
 _FEWEST_FACING = 30
 # A scan that meets the map with less of its points has come to a new place, or is lost.
 _LEAST_OVERLAP = 0.1
-# A point so far from its surface counts half in the support, in cells; and what every direction is felt by at least, as
-# a part of the best held one, so that one which next to nothing is felt along is not judged by noise.
+# A point so far from its surface, in cells, counts half in the support; and a part of what constrains all directions
+# together that is added to each, so that one which next to nothing constrains is not judged by noise.
 _HALF_CELLS = 0.5
 _LEAST_FELT = 0.005
 

@@ -9,10 +9,10 @@ def require_range_left(min_range_m: float, max_range_m: float) -> None:
         )
 
 
-def require_lost_worse(lost_below: float, degraded_below: float) -> None:
-    """What is lost must not lie above what is degraded."""
+def require_lost_worse(lost_below: float, degraded_below: float, suffix: str = "") -> None:
+    """What is lost must not lie above what is degraded; a suffix of both names says of what."""
     if lost_below > degraded_below:
         raise ValueError(
-            f"lost_below={lost_below:g} must not exceed degraded_below={degraded_below:g},"
+            f"lost_below{suffix}={lost_below:g} must not exceed degraded_below{suffix}={degraded_below:g},"
             " as a lost scan is worse than a degraded one"
         )

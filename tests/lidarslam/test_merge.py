@@ -125,7 +125,9 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(
     assert len(common) == outcome.summary.map.points > 0
     first, foreign, second = (load_map(out / name).points for name in ("01_first", "02_foreign", "03_second"))
     ours = cKDTree(np.concatenate([first, second]))
-    assert ours.query(common)[0].max() < 0.2
+    distances = ours.query(common)[0]
+    assert np.quantile(distances, 0.999) < 0.1  # a voxel
+    assert distances.max() < 0.5  # what moved is left out of each map by its own scans
     tree = cKDTree(common)
     assert np.percentile(tree.query(first)[0], 99.0) < 0.1
     assert np.percentile(tree.query(second)[0], 99.0) < 0.1
@@ -172,7 +174,7 @@ def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) 
     keyframes = []
     for name in ("01_first", "02_foreign", "03_second"):
         summary = json.loads((out / name / "summary.json").read_text())
-        assert summary["pose_graph"]["loops"] == []  # none leads back within so short a way
+        assert summary["loop_closures"] == 0  # none leads back within so short a way
         assert summary["map_voxel_size_m"] == 0.1
         assert any("frame of its own" in warning for warning in summary["warnings"]) == (name == "02_foreign")
         graph = read_g2o(out / name / "pose_graph.g2o")
