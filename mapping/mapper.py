@@ -19,7 +19,7 @@ from mapping.doubt import Doubt
 from mapping.earlier_maps import EarlierMaps
 from mapping.fit import Fit
 from mapping.local_map import LocalMap
-from mapping.placement import Placed, place, place_displaced, place_surprised, search, search_everywhere
+from mapping.placement import Placed, is_rivalled, place, place_displaced, place_surprised, search, search_everywhere
 from mapping.prediction import Carrier, OdometryNoise, Prediction, Prior, State, predict
 from mapping.refinement import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
@@ -233,10 +233,22 @@ class Mapper:
         misled = prior.T_prev_curr is not None and best[0].status is not Status.OK
         if misled or not self._has_velocity:
             poses = (prediction.T_world_lidar, last.T_world_lidar)
-            displaced = place_displaced(sampled, poses, last, local_map, self._config)
-            if displaced is not None and displaced[0].quality > _CLEARLY_BETTER * best[0].quality:
-                return displaced if displaced[0].is_beyond_doubt or not self._has_velocity else best
+            best = self._displaced(best, place_displaced(sampled, poses, last, local_map, self._config), local_map)
         return best
+
+    def _displaced(
+        self, best: tuple[Placed, Prediction], others: list[tuple[Placed, Prediction]], local_map: LocalMap
+    ) -> tuple[Placed, Prediction]:
+        """Of a registration and those from displacements the best, and whether another fits nearly as well."""
+        for other in others:
+            sure = other[0].is_beyond_doubt or not self._has_velocity
+            if sure and other[0].quality > _CLEARLY_BETTER * best[0].quality:
+                best = other
+        placed, expected = best
+        if placed.refined is None or self._has_velocity:
+            return best
+        rivalled = is_rivalled(placed, [other for other, _ in others], local_map)
+        return replace(placed, rivalled=rivalled), expected
 
     def _place_near(
         self, sampled: SampledScan, prior: Prior, prediction: Prediction, last: State, local_map: LocalMap

@@ -48,11 +48,15 @@ _PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A scan laid on the map, and how it lies; not registered when too little of it met a surface."""
+    """A scan laid on the map, and how it lies; not registered when too little of it met a surface.
+
+    `rivalled`: another displacement since the last scan fits nearly as well, and no velocity is known to decide.
+    """
 
     refined: Refined | None
     fit: Fit
     status: Status
+    rivalled: bool = False
 
     @property
     def is_certain(self) -> bool:
@@ -121,8 +125,8 @@ def place_surprised(
 
 def place_displaced(
     sampled: SampledScan, rotations: Sequence[FloatArray], last: State, local_map: LocalMap, config: MappingConfig
-) -> tuple[Placed, Prediction] | None:
-    """Register a scan from displacements since the last one in every horizontal direction; the best, if any is ok, with
+) -> list[tuple[Placed, Prediction]]:
+    """Register a scan from displacements since the last one in every horizontal direction; those that are ok, each with
     what was expected there.
 
     A sensor that was at speed when the recording began, or whose odometry is wrong, is out of reach of the expected
@@ -138,7 +142,7 @@ def place_displaced(
     sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
     points = compensated(sweep.planes, sweep.plane_times, last.velocity)
     if not len(points) or interval_s <= 0.0:
-        return None
+        return []
     radius_m, up = min(_FASTEST_M_S * interval_s, sampled.range_m), local_map.vertical()
     step_m = _DISPLACED_CELLS * local_map.cell_m
     starts = []
@@ -152,8 +156,7 @@ def place_displaced(
         moving = State.moving(last, velocity)
         prediction = predict(moving, sampled.stamp, Prior(), Carrier(), config, sampled.seen_from_s)
         tried.append((_place_patiently(sampled, prediction, last, local_map, config), prediction))
-    ok = (found for found in tried if found[0].status is Status.OK)
-    return max(ok, key=lambda found: found[0].quality, default=None)
+    return [found for found in tried if found[0].status is Status.OK]
 
 
 def _place_patiently(
@@ -200,8 +203,7 @@ def search_everywhere(
     best = max(tried, key=lambda placed: placed.quality, default=None)
     if best is None or not best.is_beyond_doubt:
         return None
-    rivals = [placed for placed in tried if _apart_m(placed, best) > _ELSEWHERE_CELLS * local_map.cell_m]
-    return None if any(_CLEARLY * rival.quality > best.quality for rival in rivals) else best
+    return None if is_rivalled(best, tried, local_map) else best
 
 
 def _from_starts(
@@ -220,6 +222,12 @@ def _anywhere(prediction: Prediction) -> FloatArray:
     covariance = np.zeros((12, 12))
     covariance[:6, :6], covariance[6:, 6:] = _ANYWHERE, prediction.covariance[6:, 6:]
     return covariance
+
+
+def is_rivalled(best: Placed, others: Sequence[Placed], local_map: LocalMap) -> bool:
+    """Whether a scan fits nearly as well at another place."""
+    rivals = [other for other in others if _apart_m(other, best) > _ELSEWHERE_CELLS * local_map.cell_m]
+    return any(_CLEARLY * rival.quality > best.quality for rival in rivals)
 
 
 def _apart_m(one: Placed, other: Placed) -> float:

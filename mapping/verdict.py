@@ -63,6 +63,8 @@ def judge(
         message = where
     elif now.unconfirmed:
         message = "found again a moment ago, and not yet confirmed"
+    elif placed.rivalled:
+        message = "the scene repeats itself: another motion since the last scan fits nearly as well"
     elif now.unexpected:
         message = "it fits where neither the odometry nor the motion before lead to"
     elif now.adrift:
