@@ -69,7 +69,11 @@ def _killed(number: int, said: str) -> Judgement:
 
 
 def _where_lost(folder: Path) -> str:
-    first = read_summary(folder)["lost"][0]
+    summary = read_summary(folder)
+    if not summary["lost"]:
+        slid = summary["map_contradictions"][0]
+        return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"
+    first = summary["lost"][0]
     return f"first lost on scan {first['first']}: {first['reason']}"
 
 

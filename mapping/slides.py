@@ -339,7 +339,7 @@ def _contradiction(tests: PairTests, rows: list[int], fitting: FloatArray, left_
     return Contradiction(
         first=int(tests.numbers[rows, 0].min()),
         last=int(tests.numbers[rows, 1].max()),
-        shift_m=float(left_m[clearest]),
+        shift_m=round(float(left_m[clearest]), 3),
         votes=float(tests.peaks[clearest, 1]),
         votes_at_pose=float(fitting[clearest]),
         pairs=len(rows),

@@ -14,6 +14,8 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.method_ending import judge
+from lidarslam.supervised import Ending, Limits
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +56,11 @@ def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path,
     assert any("contradicts itself" in warning for warning in summary["warnings"])
     assert "the map contradicts itself between scans 0 and" in slid.output
     assert summary["map_entropy"] > fine["map_entropy"]
+    ended = judge(Ending("itself", 3, 1.0, None), tmp_path / "slid", tmp_path / "no.log", Limits())
+    assert ended == (
+        "lost",
+        f"its map contradicts itself between scans 0 and {summary['map_contradictions'][0]['last']}",
+    )
     again, _ = run(recording, room_truth, tmp_path / "slid", 0.4, "--resume")
     assert again.exit_code == 3
     assert "nothing is left to do" in again.output
