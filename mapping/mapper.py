@@ -128,11 +128,12 @@ class Mapper:
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
             self._first = sampled if sampled.times is not None and self._config.continuous_time else None
-        elif self._first is not None:
+        elif self._first is not None and (prior.velocity is None or _follows(sampled, self._first)):
             mapped = self._lay_second(sampled, prior, prediction, last, self._first, self._map)
             self._first = None
         else:
             mapped = self._lay(sampled, prior, prediction, last, self._map)
+            self._first = None
         self._state = mapped.state
         return mapped
 
@@ -379,6 +380,12 @@ class Mapper:
             edges=transform_points(T_world_lidar, edges),
             sensor=T_world_lidar[:3, 3],
         )
+
+
+def _follows(sampled: SampledScan, first: SampledScan) -> bool:
+    """Whether a sweep begins about where the first one ended, so that the way between them shows how that moved."""
+    gap_s = sampled.stamp - sampled.seen_from_s - first.stamp - first.seen_until_s
+    return gap_s < first.seen_from_s + first.seen_until_s
 
 
 def _correction(prediction: Prediction, refined: Refined) -> FloatArray:
