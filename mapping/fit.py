@@ -99,9 +99,20 @@ def directional_support(normals: FloatArray, distances: FloatArray) -> float:
         normals: (N, 3) unit, of the surfaces.
         distances: (N,) of the points from them, in units at which a point counts half.
     """
-    weights = 1.0 / (1.0 + distances**2)
-    everything = normals.T @ normals
-    held = (normals * weights[:, None]).T @ normals
+    everything, held, share = constrained(normals, distances)
     ridge = _LEAST_FELT * float(np.trace(everything)) * np.eye(3)
     # What the ridge adds to both is supported as well as the whole.
-    return float(eigh(held + float(weights.mean()) * ridge, everything + ridge, eigvals_only=True)[0])
+    return float(eigh(held + share * ridge, everything + ridge, eigvals_only=True)[0])
+
+
+def constrained(normals: FloatArray, distances: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """How points constrain each direction of translation: sums (3, 3) of `n n^T` over them, without and with inlier
+    weights, and the mean of the weights.
+
+    Args:
+        normals: (N, 3) unit, of the surfaces.
+        distances: (N,) of the points from them, in units at which a point counts half.
+    """
+    weights = 1.0 / (1.0 + distances**2)
+    share = float(weights.mean()) if len(weights) else 0.0
+    return normals.T @ normals, (normals * weights[:, None]).T @ normals, share

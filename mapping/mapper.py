@@ -124,7 +124,7 @@ class Mapper:
         """Lay the next scan on the map, and add it."""
         sampled = self._sampler.sample(scan)
         last = self._state or State.first(scan.stamp, prior.velocity)
-        prediction = predict(last, scan.stamp, prior, self._carrier, self._config, sampled.seen_from_s, self._noise)
+        prediction = self._predict(sampled, prior, last, self._carrier)
         if self._map is None:
             mapped = self._begin(sampled, prediction, last)
             self._first = sampled if sampled.times is not None and self._config.continuous_time else None
@@ -136,6 +136,9 @@ class Mapper:
             self._first = None
         self._state = mapped.state
         return mapped
+
+    def _predict(self, sampled: SampledScan, prior: Prior, last: State, carrier: Carrier) -> Prediction:
+        return predict(last, sampled.stamp, prior, carrier, self._config, sampled.seen_from_s, self._noise)
 
     def _begin(self, sampled: SampledScan, prediction: Prediction, last: State) -> MappedScan:
         """The first scan makes the map."""
@@ -167,7 +170,7 @@ class Mapper:
                 break
             last = self._begin_again(first, last, mapped.state)
             self._carrier, self._noise, self._doubt, self._has_velocity = carrier, noise, copy(doubt), False
-            prediction = predict(last, sampled.stamp, prior, carrier, self._config, sampled.seen_from_s, self._noise)
+            prediction = self._predict(sampled, prior, last, carrier)
             assert self._map is not None
             mapped = self._lay(sampled, prior, prediction, last, self._map)
         return mapped
@@ -228,7 +231,7 @@ class Mapper:
         if self._doubt.is_surprised(sampled.stamp - last.stamp):  # it may be anywhere, and what is found is confirmed
             return best
         if prediction.contradicted and self._has_velocity:
-            alone = predict(last, sampled.stamp, Prior(), self._carrier, self._config, sampled.seen_from_s)
+            alone = self._predict(sampled, Prior(), last, self._carrier)
             other = self._place_near(sampled, Prior(), alone, last, local_map), alone
             best = max(best, other, key=lambda tried: tried[0].quality)
         misled = prior.T_prev_curr is not None and best[0].status is not Status.OK
@@ -264,7 +267,7 @@ class Mapper:
         surprised = self._doubt.is_surprised(sampled.stamp - last.stamp)
         if surprised or not self._doubt.lies_badly(near.status, near.quality):
             return near
-        anyhow = predict(last, sampled.stamp, prior, Carrier.wildest(), self._config, sampled.seen_from_s, self._noise)
+        anyhow = self._predict(sampled, prior, last, Carrier.wildest())
         again = place_surprised(sampled, anyhow, last, local_map, self._config)
         return again if again.is_beyond_doubt and again.quality > _BETTER * near.quality else near
 

@@ -237,7 +237,6 @@ class _Joint:
 
     T_world_last: FloatArray
     T_world_curr: FloatArray
-    last_velocity: FloatArray
     curr_velocity: FloatArray
     covariance: FloatArray
 
@@ -252,7 +251,7 @@ class _Joint:
         joint[12:, :12] = F @ state.covariance
         joint[:12, 12:] = joint[12:, :12].T
         joint[12:, 12:] = F @ state.covariance @ F.T + _process_noise(state, interval_s, seen_from_s, carrier)
-        return cls(state.T_world_lidar, state.T_world_lidar @ T_moved, state.velocity, state.velocity, joint)
+        return cls(state.T_world_lidar, state.T_world_lidar @ T_moved, state.velocity, joint)
 
     def measured_motion(self, T_last_curr: FloatArray, covariance: FloatArray) -> "_Joint":
         return self._updated(*self._motion_innovation(T_last_curr), covariance)
@@ -283,7 +282,6 @@ class _Joint:
         return _Joint(
             self.T_world_last @ exp(step[:6]),
             self.T_world_curr @ exp(step[12:18]),
-            self.last_velocity + step[6:12],
             self.curr_velocity + step[18:],
             0.5 * (covariance + covariance.T),
         )

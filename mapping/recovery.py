@@ -4,6 +4,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, transform_points
 from mapping.deskew import move
+from mapping.fit import constrained
 from mapping.local_map import LocalMap
 
 # Points of the scan that each start is judged by, and how many starts are worth refining.
@@ -68,9 +69,8 @@ def _felt_and_held(points: FloatArray, T_world_lidar: FloatArray, local_map: Loc
     world = transform_points(T_world_lidar, points)
     matches = local_map.match_planes(world, T_world_lidar, first_level=_COARSEST)
     distances = matches.residuals(world.take(matches.index, axis=0))
-    weights = 1.0 / (1.0 + (distances / (_HALF_CELLS * local_map.cell_m)) ** 2)
-    n = matches.normals
-    return n.T @ n, (n * weights[:, None]).T @ n
+    felt, held, _ = constrained(matches.normals, distances / (_HALF_CELLS * local_map.cell_m))
+    return felt, held
 
 
 def best_velocity(
