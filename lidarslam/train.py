@@ -16,7 +16,17 @@ from lidarslam.directory_lock import only_writer
 from lidarslam.run_directory import RunDirectory
 from lidarslam.train_config import TrainConfig, dump_train_yaml
 from lidarslam.train_request import Interrupted, Material, TrainNarrator, TrainOutcome, TrainRequest
-from lidarslam.training_data import Counter, Stretch, believed_share, digest, hold_out, prepared, recorded, simulated
+from lidarslam.training_data import (
+    Counter,
+    Stretch,
+    believed_share,
+    digest,
+    draw_weights,
+    hold_out,
+    prepared,
+    recorded,
+    simulated,
+)  # fmt: skip
 from lidarslam.training_devices import Devices
 from lidarslam.training_loop import Recordings, TrainingLoop
 from lidarslam.training_state import Standing, load_state
@@ -97,7 +107,9 @@ def _recordings(
     if not devices.is_first:
         devices.wait()
     recordings = Recordings(
-        prepared(learned, config.images, cache, count), prepared(held_out, config.images, cache, count)
+        learned=prepared(learned, config, cache, count),
+        held_out=prepared(held_out, config, cache, count),
+        weights=draw_weights(learned, config.recorded_share),
     )
     if devices.is_first:
         devices.wait()
@@ -145,7 +157,7 @@ def _material(recordings: Recordings, stretches: Sequence[Stretch], devices: Dev
     held_out = recordings.held_out
     return Material(
         recordings=len(stretches),
-        simulated=sum("simulated" in stretch.identity for stretch in stretches),
+        simulated=sum(stretch.is_simulated for stretch in stretches),
         scans=sum(len(recording) for recording in recordings.learned),
         held_out_scans=sum(len(recording) for recording in held_out),
         believed_percent=100.0 * believed_share(recordings.learned),

@@ -18,15 +18,16 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.scan_order import in_order
 from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Ingredients, ingredients_of, mixture
 from lidarslam.train_config import SimulatedConfig
-from odometry.image_config import ImageConfig
+from lidarslam.training_teacher import MapTeacher
 from odometry.preparation import PreparedRecording, prepare
 from odometry.sweeps import SweepImages
 from odometry.tensor_file import Kind, read_tensor_file, write_tensor_file
+from odometry.training_config import TrainingConfig
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
 PIECE = 500
 # To be raised whenever preparation, or the simulation, computes something else than before.
-_KIND = Kind("a recording prepared for training", version=1)
+_KIND = Kind("a recording prepared for training", version=2)
 _SWEEP = ("points", "normals", "offsets", "low", "high")
 _MOTIONS = ("interval_s", "T_prev_curr", "believed", "explained")
 
@@ -53,6 +54,11 @@ class Stretch:
 
     def __len__(self) -> int:
         return self.stop - self.first
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether it is of the mixture that training draws, and not a recording that was named."""
+        return "simulated" in self.identity
 
     def pieces(self) -> Iterator["Stretch"]:
         """The same scans in parts of about equal length, none longer than `PIECE`."""
@@ -137,7 +143,25 @@ def hold_out(stretches: Sequence[Stretch], share: float, seed: int) -> tuple[lis
     return [replace(only, stop=border)], [replace(only, first=border)]
 
 
-def prepared(stretches: Sequence[Stretch], config: ImageConfig, cache: Path, count: Counter) -> list[PreparedRecording]:
+def draw_weights(stretches: Sequence[Stretch], recorded_share: float) -> list[float]:
+    """How often each prepared recording is drawn, relative to the others, in the order of `prepared`.
+
+    Where there are simulated recordings beside, the others have the given share together, by their numbers of scans.
+    """
+    pieces = [piece for stretch in stretches for piece in stretch.pieces()]
+    recorded_scans = sum(len(piece) for piece in pieces if not piece.is_simulated)
+    simulated_count = sum(piece.is_simulated for piece in pieces)
+    if not recorded_scans or not simulated_count:
+        return [1.0] * len(pieces)
+    return [
+        (1.0 - recorded_share) / simulated_count if piece.is_simulated else recorded_share * len(piece) / recorded_scans
+        for piece in pieces
+    ]
+
+
+def prepared(
+    stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, count: Counter
+) -> list[PreparedRecording]:
     """The stretches made ready for training, from the cache where they lie in it already.
 
     Raises:
@@ -147,8 +171,10 @@ def prepared(stretches: Sequence[Stretch], config: ImageConfig, cache: Path, cou
     return [_prepared(piece, config, cache, count) for stretch in stretches for piece in stretch.pieces()]
 
 
-def _prepared(piece: Stretch, config: ImageConfig, cache: Path, count: Counter) -> PreparedRecording:
-    key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": config.model_dump(mode="json")}
+def _prepared(piece: Stretch, config: TrainingConfig, cache: Path, count: Counter) -> PreparedRecording:
+    key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": config.images.model_dump(mode="json")}
+    if not piece.is_simulated:
+        key["teacher"] = config.teacher
     path = cache / f"{_digest(key)}.safetensors"
     try:
         kept = _read(path)
@@ -162,14 +188,19 @@ def _prepared(piece: Stretch, config: ImageConfig, cache: Path, count: Counter) 
     return made
 
 
-def _prepare(piece: Stretch, config: ImageConfig, count: Counter) -> PreparedRecording:
+def _prepare(piece: Stretch, config: TrainingConfig, count: Counter) -> PreparedRecording:
+    teacher = MapTeacher() if config.teacher == "map" and not piece.is_simulated else None
+
     def scans() -> Iterator[Scan]:
         for scan in in_order(piece.open().scans(piece.first, piece.stop)):
+            if teacher is not None:
+                teacher.follow(scan)
             yield scan
             count(1)
 
     try:
-        return prepare(scans(), config)
+        made = prepare(scans(), config.images)
+        return made if teacher is None else teacher.taught(made)
     except ValueError as error:
         raise InputError(f"{piece.name}: scans {piece.first} to {piece.stop} cannot be trained on: {error}") from error
 

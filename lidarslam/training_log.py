@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lidarslam import training_directory as files
-from odometry.networks import PairNetwork
+from odometry.correlation import CorrelationNetwork
 from odometry.preparation import PreparedRecording
 from odometry.training import Validation
 
@@ -52,16 +52,15 @@ class TrainingLog:
         self._curves.add_image("pair/normals", _stacked(0.5 + 0.5 * normals), step)
 
     @torch.no_grad()
-    def turn_scores(self, step: int, network: PairNetwork, recording: PreparedRecording, device: torch.device) -> None:
-        """How sure the network is of the turn: a row for each pair, bright where it believes."""
-        images = recording.images.select(slice(0, _SHOWN_PAIRS + 1))
-        features = network.encode(images.points.to(device), images.normals.float().to(device))
-        scores = network(features[:-1], features[1:]).turn_scores
-        if not scores.shape[1]:
+    def turn_scores(self, step: int, network: nn.Module, recording: PreparedRecording, device: torch.device) -> None:
+        """Probabilities of turns: a row for each pair, zero turn in the middle."""
+        if not isinstance(network, CorrelationNetwork):
             return
-        belief = scores.float().softmax(dim=1)
-        belief = (belief / belief.amax(dim=1, keepdim=True)).roll(scores.shape[1] // 2, dims=1)  # no turn: the middle
-        self._curves.add_image("pairs/turn_belief", belief.repeat_interleave(_TALL, dim=0)[None].cpu(), step)
+        images = recording.images.select(slice(0, _SHOWN_PAIRS + 1))
+        features = network.columns(images.points.to(device), images.normals.float().to(device))
+        likely = network.turn_scores(features[:-1], features[1:]).softmax(dim=1)
+        likely = (likely / likely.amax(dim=1, keepdim=True)).roll(likely.shape[1] // 2, dims=1)
+        self._curves.add_image("pairs/turn_probability", likely.repeat_interleave(_TALL, dim=0)[None].cpu(), step)
 
     def close(self) -> None:
         """Write what is left."""

@@ -32,10 +32,11 @@ _LOSS_STREAM = 7_919
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Recordings to learn from, and to validate on."""
+    """Recordings to learn from, how often each is drawn, and recordings to validate on."""
 
     learned: Sequence[PreparedRecording]
     held_out: Sequence[PreparedRecording]
+    weights: Sequence[float]
 
 
 class _LossModule(nn.Module):
@@ -82,7 +83,8 @@ class TrainingLoop:
         """
         config, standing = self._config, self._standing
         surfaces = config.geometric is not None and config.geometric_weight > 0.0
-        pairs = Pairs(recordings.learned, config.augmentation, config.seed, surfaces)
+        birds = config.network.name == "correlation"
+        pairs = Pairs(recordings.learned, config.augmentation, config.seed, surfaces, birds, recordings.weights)
         if standing.best is None:
             self._validate(recordings, narrator)
         self._clock = time.perf_counter()
@@ -142,7 +144,7 @@ class TrainingLoop:
         began = time.perf_counter()
         if self._log is not None:
             self._network.eval()
-            network, standing = cast(PairNetwork, self._network), self._standing
+            network, standing = self._network, self._standing
             shown = (recordings.held_out or recordings.learned)[0]
             if not standing.step:
                 self._log.inputs(standing.step, shown)

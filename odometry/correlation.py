@@ -1,8 +1,9 @@
-"""The default network: both scans through one encoder, then their correlation over azimuth shifts.
+"""The default network: a turn and a translation are read off correlations over all turns and all shifts.
 
-A turn about z moves an image sideways, whatever the scene; so the turn is read off a correlation volume, the features
-of the current scan are moved back by it, and what is left is small and regressed. Everything before the last layers is
-seamless in azimuth and sees points in the frame of their own column: turning a scan by one column turns the answer.
+Seen by column, a scan that is turned about z is a scan that is shifted in azimuth; seen from above, one that is
+displaced is one that is shifted in x and y. Two encoders give the features of one scan each, from its range image and
+from its bird's-eye grid; their correlations over all shifts give the scores of turns and of translations, whatever
+their size. A small head reads the standard deviations off the shape of both.
 """
 
 import math
@@ -12,32 +13,55 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from odometry.evidence import EVIDENCE_CHANNELS, PACKED_CHANNELS, evidence, pack
+from odometry import bird_eye
 from odometry.network_config import CorrelationConfig
 from odometry.normals import has_normal
-from odometry.torch_geometry import exp, full_precision, turn_about_z
+from odometry.torch_geometry import full_precision, make_transform, turn_about_z
 
 INPUT_CHANNELS = 9
+SHIFTS = 2 * bird_eye.MOST_CELLS + 1
+"""Shifts along x and along y, in cells, that are scored."""
 # Standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.
 _LOG_SIGMA = (-7.0, 3.0)
-# The peak of the turn's scores is taken as the mean over so many columns to either side.
+# A peak is the mean over so many turns or shifts to either side of the highest.
 _PEAK = 2
+# What the shape of the two peaks is described by.
+_SHAPE = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PairImages:
+    """What the network is shown of B pairs of scans.
+
+    Attributes:
+        previous, current: (B, 6, H, W) points and normals.
+        bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) seen from above, the current scan turned by about the
+            turn between the two; None for networks that do not look from above.
+    """
+
+    previous: Tensor
+    current: Tensor
+    bird_previous: Tensor | None = None
+    bird_current: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What a network says of B pairs.
+    """What a network estimates of B pairs.
 
     Attributes:
         T_prev_curr: (B, 4, 4).
         log_sigma: (B, 6) logarithm of the standard deviation along each direction of a change of `T_prev_curr` from the
             left: rotation in radians, then translation in metres.
-        turn_scores: (B, S) scores of the turns about z that are a whole number of feature columns, before a softmax.
+        turn_scores: (B, S) log-likelihoods, up to a constant, of the turns about z by a whole number of feature
+            columns; (B, 0) where the network has none.
+        shift_scores: (B, SHIFTS, SHIFTS) the same of shifts by whole cells along y and x; (B, 0, 0) without.
     """
 
     T_prev_curr: Tensor
     log_sigma: Tensor
     turn_scores: Tensor
+    shift_scores: Tensor
 
 
 class CircularConv(nn.Module):
@@ -47,44 +71,46 @@ class CircularConv(nn.Module):
         super().__init__()
         self.around = kernel[1] // 2
         self.conv = nn.Conv2d(channels_in, channels_out, kernel, stride, (kernel[0] // 2, 0), bias=False)
-        self.norm = nn.GroupNorm(8, channels_out)
+        # Statistics of the training data become part of the weights and cost nothing afterwards.
+        self.norm = nn.BatchNorm2d(channels_out)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) -> (B, C', H / stride, W / stride)."""
-        x = functional.pad(x, (self.around, self.around, 0, 0), mode="circular")
+        x = torch.cat([x[..., -self.around :], x, x[..., : self.around]], dim=-1)
         normalised: Tensor = self.norm(self.conv(x))
         return normalised
 
 
 class Block(nn.Module):
-    """Two convolutions around which the input goes by."""
+    """Two convolutions with a skip connection."""
 
-    def __init__(self, channels: int, kernel: tuple[int, int] = (3, 3)) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.first = CircularConv(channels, channels, kernel, (1, 1))
-        self.second = CircularConv(channels, channels, kernel, (1, 1))
+        self.first = CircularConv(channels, channels, (3, 3), (1, 1))
+        self.second = CircularConv(channels, channels, (3, 3), (1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) -> (B, C, H, W)."""
-        return functional.silu(x + self.second(functional.silu(self.first(x))))
+        return functional.relu(x + self.second(functional.relu(self.first(x))))
 
 
-class Encoder(nn.Module):
-    """Features of one scan, on its own."""
+class ColumnEncoder(nn.Module):
+    """Unit features of one range image, cell by cell; turning the scan shifts them and does nothing else."""
 
     def __init__(self, widths: tuple[int, int, int]) -> None:
         super().__init__()
         a, b, c = widths
         self.layers = nn.Sequential(
-            CircularConv(INPUT_CHANNELS, a, (3, 5), (1, 2)), nn.SiLU(),  # H x W/2
-            CircularConv(a, b, (3, 5), (2, 2)), nn.SiLU(), Block(b),  # H/2 x W/4
-            CircularConv(b, c, (3, 3), (2, 1)), nn.SiLU(), Block(c), Block(c),  # H/4 x W/4
+            CircularConv(INPUT_CHANNELS, a, (3, 5), (1, 2)), nn.ReLU(),  # H x W/2
+            CircularConv(a, b, (3, 5), (2, 2)), nn.ReLU(), Block(b),  # H/2 x W/4
+            CircularConv(b, c, (3, 3), (2, 1)), nn.ReLU(), Block(c),  # H/4 x W/4
+            nn.Conv2d(c, c, 1),
         )  # fmt: skip
 
     def forward(self, points: Tensor, normals: Tensor) -> Tensor:
         """(B, 3, H, W) twice -> (B, C, H/4, W/4)."""
         features: Tensor = self.layers(column_channels(points, normals))
-        return features
+        return functional.normalize(features, dim=1)
 
 
 def column_channels(points: Tensor, normals: Tensor) -> Tensor:
@@ -93,8 +119,8 @@ def column_channels(points: Tensor, normals: Tensor) -> Tensor:
     Turning the scan about z by whole columns shifts them and changes nothing else.
     """
     x, y, z = points.unbind(1)
-    level = torch.hypot(x, y)
-    r = torch.hypot(level, z)
+    level = (x * x + y * y).sqrt()
+    r = (level * level + z * z).sqrt()
     seen = (r > 0.0).to(points.dtype)
     safe = level.clamp(min=1e-6)
     outwards = (normals[:, 0] * x + normals[:, 1] * y) / safe
@@ -113,105 +139,131 @@ def column_channels(points: Tensor, normals: Tensor) -> Tensor:
     return torch.stack(channels, dim=1)
 
 
+class BirdEncoder(nn.Module):
+    """Features of one bird's-eye grid, cell by cell, from the cell's surroundings at two scales."""
+
+    def __init__(self, width: int, features: int) -> None:
+        super().__init__()
+        self.fine = _convolved(bird_eye.CHANNELS, width)
+        self.coarse = nn.Sequential(_convolved(width, 2 * width, stride=2), _convolved(2 * width, 2 * width))
+        self.from_coarse = nn.Conv2d(2 * width, features, 1)
+        self.from_fine = nn.Conv2d(width, features, 3, padding=1)
+        self.sharpness = nn.Parameter(torch.tensor(-4.0))
+
+    def forward(self, grids: Tensor) -> Tensor:
+        """(B, CHANNELS, CELLS, CELLS) -> (B, F, CELLS, CELLS)."""
+        fine = self.fine(grids)
+        coarse = functional.interpolate(self.from_coarse(self.coarse(fine)), scale_factor=2.0, mode="nearest")
+        features: Tensor = self.from_fine(fine) + coarse
+        # Cells in which nothing was seen say nothing; the first channel is the count.
+        return features * (grids[:, :1] > 0.0) * (0.5 * self.sharpness).exp()
+
+
+def _convolved(channels_in: int, channels_out: int, stride: int = 1) -> nn.Module:
+    convolution = nn.Conv2d(channels_in, channels_out, 3, stride, padding=1, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(channels_out), nn.ReLU())
+
+
+class Peaks(nn.Module):
+    """Where the scores of turns and shifts are highest, and the standard deviations that their shape speaks for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = nn.Sequential(nn.Linear(_SHAPE, 32), nn.ReLU(), nn.Linear(32, 6))
+
+    def forward(self, turn_scores: Tensor, shift_scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, S) and (B, SHIFTS, SHIFTS) -> turn (B,), radians; shift (B, 2), metres; (B, 6) log sigma."""
+        turns = turn_scores.shape[1]
+        column, turn_shape = _turn_peak(turn_scores)
+        shift, shift_shape = _shift_peak(shift_scores)
+        angle = column * (2.0 * math.pi / turns)
+        angle = torch.where(angle > math.pi, angle - 2.0 * math.pi, angle)
+        log_sigma: Tensor = self.head(torch.cat([turn_shape, shift_shape], dim=1)) - 3.0
+        return angle, shift, log_sigma.clamp(*_LOG_SIGMA)
+
+
+def _turn_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Column (B,) of the peak of scores (B, S), between columns, and its shape (B, 3).
+
+    The mean over the columns around the highest: through it the losses of a motion reach the scores, which they could
+    not through the choice of the highest.
+    """
+    width = scores.shape[1]
+    around = torch.arange(-_PEAK, _PEAK + 1, device=scores.device)
+    best = scores.argmax(dim=1)
+    likelihood = scores.log_softmax(dim=1)
+    near = likelihood.gather(1, (best[:, None] + around).remainder(width))  # (B, 2 _PEAK + 1)
+    share = near.softmax(dim=1)
+    mean = (share * around).sum(dim=1)
+    variance = (share * (around - mean[:, None]).square()).sum(dim=1)
+    entropy = -(likelihood.exp() * likelihood).sum(dim=1)
+    return best + mean, torch.stack([near.logsumexp(dim=1), (variance + 1e-3).log(), entropy], dim=1)
+
+
+def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """Shift (B, 2) along x and y, metres, of the peak of scores (B, SHIFTS, SHIFTS), and its shape (B, 5)."""
+    size, count = len(scores), scores.shape[-1]
+    likelihood = scores.flatten(1).log_softmax(dim=1)
+    # The surroundings of a peak on the border would lie beyond it.
+    inner = scores[:, _PEAK:-_PEAK, _PEAK:-_PEAK].flatten(1).argmax(dim=1)
+    row = torch.div(inner, count - 2 * _PEAK, rounding_mode="floor") + _PEAK
+    column = inner.remainder(count - 2 * _PEAK) + _PEAK
+    around = torch.arange(-_PEAK, _PEAK + 1, device=scores.device)
+    cells = (row[:, None, None] + around[:, None]) * count + column[:, None, None] + around  # (B, 5, 5)
+    near = likelihood.gather(1, cells.flatten(1))
+    share = near.softmax(dim=1).view(size, 2 * _PEAK + 1, 2 * _PEAK + 1)
+    across, along = share.sum(dim=1), share.sum(dim=2)  # over rows: along x; over columns: along y
+    mean = torch.stack([(across * around).sum(dim=1), (along * around).sum(dim=1)], dim=1)
+    squares = torch.stack([(across * around.square()).sum(dim=1), (along * around.square()).sum(dim=1)], dim=1)
+    variance = squares - mean.square()
+    cell = torch.stack([column, row], dim=1) - count // 2 + mean
+    entropy = -(likelihood.exp() * likelihood).sum(dim=1)
+    far = (cell.square().sum(dim=1) + 1.0).log()
+    shape = torch.stack([near.logsumexp(dim=1), entropy, far], dim=1)
+    return bird_eye.CELL_M * cell, torch.cat([shape, (variance + 1e-3).log()], dim=1)
+
+
 class CorrelationNetwork(nn.Module):
-    """Two scans' features -> the motion between them, and how far to believe it."""
+    """The motion between two scans, and its standard deviations."""
 
     def __init__(self, config: CorrelationConfig) -> None:
         super().__init__()
         self.config = config
-        c, reach, rows = config.widths[2], config.reach, config.rows // 4
-        self.encoder = Encoder(config.widths)
-        self.sharpness = nn.Parameter(torch.tensor(3.0))
-        mixed = config.pair_width
-        self.mix = CircularConv(2 * c + 2 * reach + 1 + EVIDENCE_CHANNELS, mixed, (1, 1), (1, 1))
-        self.pair = nn.Sequential(Block(mixed), Block(mixed))
-        self.columns = nn.Conv1d(mixed * rows, 2 * mixed, 1)
-        described = 5 * (2 * mixed + rows * EVIDENCE_CHANNELS) + 2
-        self.head = nn.Sequential(nn.Linear(described, 256), nn.SiLU(), nn.Linear(256, 256), nn.SiLU())
-        self.motion = nn.Linear(256, 6)
-        self.confidence = nn.Linear(256, 6)
-        for layer in (self.motion, self.confidence):
-            nn.init.zeros_(layer.bias)
-            nn.init.normal_(layer.weight, std=1e-3)
+        self.columns = ColumnEncoder(config.widths)
+        self.bird = BirdEncoder(config.bird_width, config.bird_features)
+        self.peaks = Peaks()
+        self.turn_sharpness = nn.Parameter(torch.tensor(3.0))
 
-    def encode(self, points: Tensor, normals: Tensor) -> Tensor:
-        """What is kept of scans, points and normals (B, 3, H, W), for all pairs they are part of.
+    def forward(self, pairs: PairImages) -> Estimate:
+        """The motions of B pairs that are seen from above as well."""
+        if pairs.bird_previous is None or pairs.bird_current is None:
+            raise ValueError("the network `correlation` needs the scans as seen from above")
+        images, birds = torch.cat([pairs.previous, pairs.current]), torch.cat([pairs.bird_previous, pairs.bird_current])
+        columns, cells = self.columns(images[:, :3], images[:, 3:]), self.bird(birds)
+        with full_precision(images.device):
+            turn_scores = self.turn_scores(*columns.float().chunk(2))
+            shift_scores = self.shift_scores(*cells.float().chunk(2))
+            angle, shift, log_sigma = self.peaks(turn_scores, shift_scores)
+            R = turn_about_z(angle)[:, :3, :3]
+            T_prev_curr = make_transform(R, torch.cat([shift, torch.zeros_like(shift[:, :1])], dim=1))
+            return Estimate(T_prev_curr, log_sigma, turn_scores, shift_scores)
 
-        Returns:
-            (B, C + PACKED_CHANNELS, H/4, W/4): features, and the points and normals themselves.
-        """
-        return torch.cat([self.encoder(points, normals), pack(points, normals)], dim=1)
-
-    def forward(self, previous: Tensor, current: Tensor) -> Estimate:
-        """The motion between scans of which `encode` gave these."""
-        previous, seen = previous[:, :-PACKED_CHANNELS], previous[:, -PACKED_CHANNELS:]
-        current, seen_now = current[:, :-PACKED_CHANNELS], current[:, -PACKED_CHANNELS:]
-        unit_previous, unit_current = (functional.normalize(f, dim=1) for f in (previous, current))
-        with full_precision(previous.device):
-            turns = self._turn_scores(unit_previous.float(), unit_current.float())  # (B, W')
-        shift = turns.argmax(dim=1)
-        turned, unit_turned = (_shift_columns(f, shift) for f in (current, unit_current))
-        with full_precision(previous.device):
-            shown = evidence(seen.float(), _shift_columns(seen_now, shift).float())  # (B, E, H', W')
-        volume = torch.cat([previous, turned, self._local(unit_previous, unit_turned), shown], dim=1)
-        x = self.pair(functional.silu(self.mix(volume)))  # (B, M, H', W')
-        x = functional.silu(self.columns(x.flatten(1, 2)))  # (B, M, H', W') -> (B, M * H', W') -> (B, 2 M, W')
-        moments = _moments(torch.cat([x, shown.flatten(1, 2)], dim=1))  # (B, 5 (2 M + E H'))
-        certainty, fraction = turns.logsumexp(1) - turns.amax(1), _fraction(turns, shift)
-        hidden = self.head(torch.cat([moments, certainty[:, None], fraction[:, None]], dim=1))
-        with full_precision(previous.device):
-            hidden = hidden.float()
-            T_turned_curr = _turn(shift + fraction, turns.shape[1])
-            log_sigma = self.confidence(hidden) - 3.0
-            return Estimate(exp(self.motion(hidden)) @ T_turned_curr, log_sigma.clamp(*_LOG_SIGMA), turns)
-
-    def _turn_scores(self, previous: Tensor, current: Tensor) -> Tensor:
-        """(B, W') mean correlation with the current scan moved by 0, 1, ... columns; unit features (B, C, H', W')."""
-        _, _, height, width = previous.shape
+    def turn_scores(self, previous: Tensor, current: Tensor) -> Tensor:
+        """(B, W') correlation with the current scan turned by 0, 1, ... columns; unit features (B, C, H', W')."""
+        height, width = previous.shape[2:]
         gram = previous.flatten(1, 2).mT @ current.flatten(1, 2)  # (B, C H', W') -> (B, W', W')
         column = torch.arange(width, device=gram.device)
         # A scan turned by s columns shows at column p what it had at p - s.
         diagonals = (column[:, None] - column[None, :]).remainder(width)  # (W' of the previous, shift)
         mean: Tensor = gram.gather(2, diagonals.expand(gram.shape[0], -1, -1)).mean(dim=1) / height
-        return mean * self.sharpness.exp()
+        return mean * self.turn_sharpness.exp()
 
-    def _local(self, previous: Tensor, current: Tensor) -> Tensor:
-        """(B, 2 reach + 1, H', W') correlation of every pixel with those nearby in its row."""
-        reach = self.config.reach
-        padded = functional.pad(current, (reach, reach, 0, 0), mode="circular")
-        width = previous.shape[-1]
-        shifted = [(previous * padded[..., s : s + width]).sum(dim=1) for s in range(2 * reach + 1)]
-        return 3.0 * torch.stack(shifted, dim=1)
+    def shift_scores(self, previous: Tensor, current: Tensor) -> Tensor:
+        """(B, SHIFTS, SHIFTS) correlation with the current scan shifted along y and x; features (B, F, CELLS, CELLS).
 
-
-def _fraction(turns: Tensor, shift: Tensor) -> Tensor:
-    """(B,) how far, in columns, the peak of scores (B, W') lies from its highest column: the mean around it.
-
-    Through it the losses reach the scores, which they could not through the choice of the highest.
-    """
-    width = turns.shape[1]
-    around = torch.arange(-_PEAK, _PEAK + 1, device=turns.device)
-    scores = turns.gather(1, (shift[:, None] + around).remainder(width))  # (B, 2 _PEAK + 1)
-    return (scores.softmax(dim=1) * around).sum(dim=1)
-
-
-def _turn(columns: Tensor, width: int) -> Tensor:
-    """(B, 4, 4) turns about z by so many of `width` columns."""
-    angle = columns * (2.0 * math.pi / width)
-    return turn_about_z(torch.where(angle > math.pi, angle - 2.0 * math.pi, angle))
-
-
-def _shift_columns(features: Tensor, shift: Tensor) -> Tensor:
-    """Features (B, C, H, W) of scans turned about z by whole columns (B,)."""
-    width = features.shape[-1]
-    source = (torch.arange(width, device=features.device) - shift[:, None]).remainder(width)
-    return features.gather(3, source[:, None, None, :].expand(features.shape))
-
-
-def _moments(x: Tensor) -> Tensor:
-    """(B, 5 C): mean, and the first two harmonics over azimuth, of columns (B, C, W)."""
-    width = x.shape[-1]
-    azimuth = (torch.arange(width, device=x.device) + 0.5) * (2.0 * math.pi / width)
-    waves = [torch.ones_like(azimuth), azimuth.cos(), azimuth.sin(), (2.0 * azimuth).cos(), (2.0 * azimuth).sin()]
-    basis = torch.stack(waves).to(x.dtype) / width  # (5, W)
-    return (x @ basis.mT).flatten(1)  # (B, C, 5) -> (B, 5 C)
+        A sum over cells, not a mean: every cell adds its log-likelihood, and what shows more is more certain.
+        """
+        spectrum = torch.fft.rfft2(previous) * torch.fft.rfft2(current).conj()
+        scores = torch.fft.irfft2(spectrum.sum(dim=1), s=previous.shape[-2:])  # shift by s at index s
+        most = bird_eye.MOST_CELLS
+        return scores.roll((most, most), (1, 2))[:, :SHIFTS, :SHIFTS]

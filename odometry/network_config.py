@@ -13,9 +13,9 @@ class CorrelationConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     rows: int = Field(16, ge=4, multiple_of=4, description="of the images")
-    widths: tuple[int, int, int] = Field((24, 48, 64), description="channels of the encoder's three stages")
-    pair_width: int = Field(64, ge=8, multiple_of=8, description="channels where two scans are compared")
-    reach: int = Field(6, ge=1, description="columns of features to either side that are compared")
+    widths: tuple[int, int, int] = Field((16, 24, 32), description="channels of the three stages of the column encoder")
+    bird_width: int = Field(16, ge=1, description="channels of the bird's-eye encoder")
+    bird_features: int = Field(8, ge=1, description="that are correlated over shifts")
 
 
 class NetworkConfig(BaseModel):

@@ -2,12 +2,15 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Generator, Tensor
 
+from odometry.bird_eye import bird_eye
+from odometry.correlation import PairImages
 from odometry.preparation import PreparedRecording, compensated
 from odometry.projection import mirror, rotate_columns
 from odometry.sweeps import SweepImages
@@ -16,6 +19,10 @@ from odometry.training_config import AugmentationConfig
 
 # A prime that keeps the random streams of steps and processes apart.
 _STREAM = 1_000_003
+# Surfaces whose normals have a vertical component of more than this count as ground.
+_LEVEL = 0.9
+# Panes of glass in a scan that has any.
+_PANES = 6
 # What a generator takes for a seed.
 _SEEDS = 2**63
 
@@ -28,8 +35,10 @@ class PairBatch:
         previous, current: (B, 6, H, W) what the network sees: points and normals of the raw sweeps.
         previous_surfaces, current_surfaces: (B, 6, H, W) the same, compensated to the middle of each sweep; None
             where nobody asked for them.
-        T_prev_curr: (B, 4, 4) the motion that alignment found.
-        believed: (B,) whether to believe it.
+        T_prev_curr: (B, 4, 4) the motion that the teacher found.
+        believed: (B,) whether it is to be learnt.
+        bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) both scans from above, the current one turned by about
+            the turn between the two; None where nobody asked for them.
     """
 
     previous: Tensor
@@ -38,6 +47,13 @@ class PairBatch:
     current_surfaces: Tensor | None
     T_prev_curr: Tensor
     believed: Tensor
+    bird_previous: Tensor | None = None
+    bird_current: Tensor | None = None
+
+    @property
+    def shown(self) -> PairImages:
+        """What the network sees."""
+        return PairImages(self.previous, self.current, self.bird_previous, self.bird_current)
 
     def to(self, device: torch.device) -> "PairBatch":
         """The same on another device."""
@@ -54,10 +70,25 @@ class PairBatch:
 
 
 class Pairs:
-    """Draws batches of pairs from recordings."""
+    """Draws batches of pairs from recordings.
+
+    Args:
+        recordings: to draw from.
+        config: how pairs are changed.
+        seed: of all draws.
+        surfaces: whether the losses ask for compensated scans.
+        birds: whether the network looks from above.
+        weights: how often each recording is drawn, relative to the others; None: equally often.
+    """
 
     def __init__(
-        self, recordings: Sequence[PreparedRecording], config: AugmentationConfig, seed: int, surfaces: bool = True
+        self,
+        recordings: Sequence[PreparedRecording],
+        config: AugmentationConfig,
+        seed: int,
+        surfaces: bool = True,
+        birds: bool = True,
+        weights: Sequence[float] | None = None,
     ) -> None:
         if not recordings:
             raise ValueError("training needs a recording or more, got none")
@@ -65,18 +96,48 @@ class Pairs:
         self._config = config
         self._seed = seed
         self._surfaces = surfaces
+        self._birds = birds
+        self._weights = torch.tensor([1.0] * len(recordings) if weights is None else weights, dtype=torch.float64)
 
     def batch(self, step: int, size: int, process: int = 0) -> PairBatch:
-        """The pairs of one step; recordings are equally likely, whatever their length."""
+        """The pairs of one step."""
         generator = torch.Generator().manual_seed((self._seed * _STREAM**2 + step * _STREAM + process) % _SEEDS)
-        return augmented(_stack([self._draw(generator) for _ in range(size)]), self._config, generator)
+        pairs = augmented(_stack([self._draw(generator) for _ in range(size)]), self._config, generator)
+        return _seen_from_above(pairs, self._config, generator) if self._birds else pairs
 
     def _draw(self, generator: Generator) -> PairBatch:
-        recording = self._recordings[_integer(generator, len(self._recordings))]
-        gap = 1 + _integer(generator, min(self._config.max_gap, len(recording) - 1))
+        recording = self._recordings[int(torch.multinomial(self._weights, 1, generator=generator))]
+        gap = _gap(generator, min(self._config.max_gap, len(recording) - 1))
         first = _integer(generator, len(recording) - gap)
         pair = pair_of(recording, first, first + gap, self._surfaces)
         return _reversed(pair) if _chance(generator, self._config.reverse) else pair
+
+
+def _gap(generator: Generator, most: int) -> int:
+    """Steps from 1 to the most, each as likely as all up to twice as many together: small ones are common."""
+    exponent = float(torch.rand((), generator=generator, dtype=torch.float64))
+    return min(int((most + 1.0) ** exponent), most)
+
+
+def _seen_from_above(batch: PairBatch, config: AugmentationConfig, generator: Generator) -> PairBatch:
+    """The pairs with bird's-eye grids; the turn between the scans is known to within an error, as it will be in use."""
+    size = len(batch.previous)
+    turns = torch.atan2(batch.T_prev_curr[:, 1, 0], batch.T_prev_curr[:, 0, 0])
+    errors = torch.randn(size, generator=generator) * math.radians(config.bird_turn_deg)
+    return replace(
+        batch,
+        bird_previous=birds(batch.previous, torch.zeros(size)),
+        bird_current=birds(batch.current, turns + errors),
+    )
+
+
+def birds(images: Tensor, headings: Tensor) -> Tensor:
+    """Bird's-eye grids (B, CHANNELS, CELLS, CELLS) of points and normals (B, 6, H, W), turned by headings (B,)."""
+    grids = [
+        bird_eye(image[:3].numpy(), image[3:].numpy(), float(heading))
+        for image, heading in zip(images, headings, strict=True)
+    ]
+    return torch.from_numpy(np.stack(grids))
 
 
 def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces: bool = True) -> PairBatch:
@@ -193,11 +254,29 @@ def _worn(images: Tensor, config: AugmentationConfig, generator: Generator) -> T
     beams = uniform(height, 1) >= 0.5 * uniform(1, 1) * (uniform(1, 1) < config.drop_beams)
     hidden = 0.25 * uniform(1, 1) * (uniform(1, 1) < config.hide_sector)
     sector = (torch.arange(width) / width + uniform(1, 1)).remainder(1.0) >= hidden
+    sparse = _missing_returns(images, config, generator)
     points = images[:, :3]
     noise = config.range_noise_m * uniform(1, 1, 1) * torch.randn(size, 1, height, width, generator=generator)
     ranges = points.square().sum(1, keepdim=True).sqrt()
     noisy = points * (1.0 + noise / ranges.clamp(min=1.0))
-    return torch.cat([noisy, images[:, 3:]], dim=1) * (kept & beams & sector)[:, None]
+    return torch.cat([noisy, images[:, 3:]], dim=1) * (kept & beams & sector & sparse)[:, None]
+
+
+def _missing_returns(images: Tensor, config: AugmentationConfig, generator: Generator) -> Tensor:
+    """(B, H, W) what returns: wet ground reflects the beam away beyond some range, panes of glass let it through."""
+    size, _, height, width = images.shape
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(size, *shape, generator=generator)
+
+    ranges = images[:, :3].square().sum(1).sqrt()
+    wet = (uniform(1, 1) < config.wet_ground) & (images[:, 5].abs() > _LEVEL) & (ranges > 5.0 + 25.0 * uniform(1, 1))
+    row, column = torch.arange(height)[:, None] / height, torch.arange(width) / width
+    pane = torch.zeros(size, height, width, dtype=torch.bool)
+    for _ in range(_PANES):
+        across = (column - uniform(1, 1)).remainder(1.0) < 0.05 * uniform(1, 1)
+        pane |= across & ((row - uniform(1, 1)).remainder(1.0) < 0.6 * uniform(1, 1))
+    return ~(wet | (pane & (uniform(1, 1) < config.glass)))
 
 
 def _integer(generator: Generator, below: int) -> int:

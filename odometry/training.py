@@ -4,14 +4,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
+from odometry.hypotheses import Search
 from odometry.networks import PairNetwork
 from odometry.objective import Objective, motion_error, objective
 from odometry.pairs import PairBatch, pair_of
 from odometry.preparation import PreparedRecording
 from odometry.torch_geometry import full_precision
+from odometry.torch_graphs import torch_search
 from odometry.training_config import TrainingConfig
 
 _LEAST_RATE = 0.01  # of the learning rate, at the end
@@ -19,7 +22,7 @@ _LEAST_RATE = 0.01  # of the learning rate, at the end
 
 @dataclass(frozen=True)
 class Validation:
-    """How far a network is from the motions that alignment found on recordings it does not learn from.
+    """How far a network is from the motions that the teacher found on recordings it does not learn from.
 
     Attributes:
         rotation_rms_deg, translation_rms_m: over all believed pairs.
@@ -53,24 +56,26 @@ def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Op
 
 
 def loss_of(network: PairNetwork, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
-    """The loss of a network on a batch; both scans go through the encoder together."""
-    images = torch.cat([batch.previous, batch.current])
-    features = network.encode(images[:, :3], images[:, 3:])
-    estimate = network(*features.chunk(2))
-    with full_precision(images.device):
+    """The loss of a network on a batch."""
+    estimate = network(batch.shown)
+    with full_precision(batch.previous.device):
         return objective(estimate, batch, config, generator)
 
 
-@torch.no_grad()
 def validate(
-    network: PairNetwork, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
+    network: nn.Module, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
 ) -> Validation:
-    """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none."""
+    """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none.
+
+    The network, in evaluation mode, is asked as in use: by its most probable hypothesis.
+    """
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
-    for recording in (recording for recording in recordings if len(recording) > gap):
-        error, sigma = _errors(network, recording, gap, device or torch.device("cpu"))
-        errors.append(error)
-        sigmas.append(sigma)
+    search = torch_search(network, device or torch.device("cpu"))
+    for recording in recordings:
+        for first in range(gap):
+            error, sigma = _errors(search, recording, range(first, len(recording), gap))
+            errors.append(error)
+            sigmas.append(sigma)
     return summarise(torch.cat(errors), torch.cat(sigmas))
 
 
@@ -87,22 +92,22 @@ def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
     )  # fmt: skip
 
 
-def _errors(
-    network: PairNetwork, recording: PreparedRecording, gap: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    images = recording.images
-    features = torch.cat(
-        [
-            network.encode(points.to(device), normals.float().to(device))
-            for points, normals in zip(torch.split(images.points, 16), torch.split(images.normals, 16), strict=True)
-        ]
-    )
-    count = len(features) - gap
-    estimate = network(features[:count], features[gap:])
-    pairs = [pair_of(recording, first, first + gap, surfaces=False) for first in range(count)]
-    target = torch.cat([pair.T_prev_curr for pair in pairs]).to(device)
-    believed = torch.cat([pair.believed for pair in pairs]).to(device)
-    return motion_error(estimate.T_prev_curr, target)[believed].cpu(), estimate.log_sigma.exp()[believed].cpu()
+def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tuple[Tensor, Tensor]:
+    """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where it is believed."""
+    errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
+    points, normals = recording.images.points.numpy(), recording.images.normals.float().numpy()
+    before = None
+    for number in chosen:
+        if before is None:
+            before = search.describe(points[number], normals[number])
+            continue
+        hypotheses, before = search.compare(before, points[number], normals[number])
+        pair = pair_of(recording, number - chosen.step, number, surfaces=False)
+        if bool(pair.believed):
+            T_prev_curr = torch.from_numpy(hypotheses[0].T_prev_curr).float()
+            errors.append(motion_error(T_prev_curr[None], pair.T_prev_curr))
+            sigmas.append(torch.from_numpy(np.sqrt(np.diag(hypotheses[0].covariance))).float()[None])
+    return torch.cat(errors), torch.cat(sigmas)
 
 
 def _rms(values: Tensor) -> float:

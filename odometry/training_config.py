@@ -9,6 +9,7 @@ from odometry.image_config import ImageConfig
 from odometry.loss_config import LossConfig
 from odometry.network_config import NetworkConfig
 
+Teacher = Literal["alignment", "map"]
 Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 
 # The least that DeLORA's network can look at.
@@ -20,7 +21,9 @@ class AugmentationConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_gap: int = Field(3, ge=1, description="steps from one scan of a pair to the other, 1 to this many")
+    max_gap: int = Field(
+        10, ge=1, description="steps from one scan of a pair to the other, 1 to this many, small ones more often"
+    )
     reverse: float = Field(0.5, ge=0.0, le=1.0, description="the later scan comes first")
     heading: float = Field(1.0, ge=0.0, le=1.0, description="both scans are turned about z by the same angle, any")
     roll: float = Field(0.8, ge=0.0, le=1.0, description="the current scan is turned about z by whole columns")
@@ -34,6 +37,11 @@ class AugmentationConfig(BaseModel):
     drop_points: float = Field(0.2, ge=0.0, lt=1.0, description="up to this part of the points, of each scan anew")
     hide_sector: float = Field(0.2, ge=0.0, le=1.0, description="up to a quarter of the turn is emptied in one scan")
     range_noise_m: float = Field(0.02, ge=0.0, description="greatest standard deviation of noise on the ranges")
+    wet_ground: float = Field(0.15, ge=0.0, le=1.0, description="level ground beyond 5 to 30 m does not return")
+    glass: float = Field(0.15, ge=0.0, le=1.0, description="several rectangles of one scan do not return")
+    bird_turn_deg: float = Field(
+        0.7, ge=0.0, description="standard deviation of the turn by which scans are brought in line seen from above"
+    )
 
 
 class TrainingConfig(BaseModel):
@@ -47,7 +55,15 @@ class TrainingConfig(BaseModel):
     geometric: LossConfig | None = Field(LossConfig(), description="the paper's losses; null: none")
     geometric_weight: float = Field(1.0, ge=0.0)
     geometric_points: int = Field(1024, ge=64, description="points of each scan that are looked up in the other")
-    alignment_weight: float = Field(1.0, ge=0.0, description="of the distance to the motion that alignment finds")
+    alignment_weight: float = Field(1.0, ge=0.0, description="of the distance to the motion that the teacher finds")
+    teacher: Teacher = Field(
+        "alignment",
+        description="of recordings: alignment of consecutive scans, or the trajectory that mapping without any network"
+        " finds where its status is ok; simulated ones are taught by alignment",
+    )
+    recorded_share: float = Field(
+        0.3, gt=0.0, lt=1.0, description="of pairs from recordings, where there are simulated ones beside"
+    )
     steps: int = Field(12_000, ge=1)
     batch: int = Field(16, ge=1, description="pairs a step, of each process")
     learning_rate: float = Field(1e-3, gt=0.0)

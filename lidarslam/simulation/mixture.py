@@ -18,15 +18,19 @@ from lidarslam.simulation.sensors import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 
 # Drawn by turns.
-MIXED_WORLDS = ("street", "office", "tunnel", "forest", "hall", "park")
+MIXED_WORLDS = ("street", "office", "tunnel", "forest", "hall", "park", "fields", "terrace")
 # How often each is drawn, relative to the others.
 SENSOR_WEIGHTS = {
-    "vlp-16": 3.0, "hdl-32e": 1.0, "hdl-64e": 2.0, "os0-64": 1.0, "os1-64": 1.5, "os1-128": 1.5, "xt32": 1.0,
-    "livox": 1.0,
+    "vlp-16": 3.0, "hdl-32e": 1.0, "hdl-64e": 1.0, "hdl-64e-calibrated": 1.0, "os0-64": 1.0, "os1-64": 1.5,
+    "os1-128": 1.5, "xt32": 1.0, "livox": 1.0,
 }  # fmt: skip
 _CARRIER_WEIGHTS = {
     "car": 1.5, "handheld": 1.5, "legged": 1.0, "tracked": 1.0, "tracked-harsh": 1.0, "drone": 1.0,
 }  # fmt: skip
+# Worlds with roads, in which a car is at speed from the first scan on.
+_ROADS = frozenset({"street", "park", "fields", "terrace"})
+_FAST_WEIGHT = 3.0
+_FAST_MPS = (5.0, 30.0)
 _MOUNT_WEIGHTS = {"upright": 0.7, "upside-down": 0.15, "tilted": 0.15}
 # A mixture's worlds are numbered from here, far from the small seeds that people try things out with.
 _FIRST_SEED = 1_000_000
@@ -66,12 +70,13 @@ class Excerpt:
 
 @dataclass(frozen=True)
 class Ingredients:
-    """What a recording of a mixture is of, by name."""
+    """What a recording of a mixture is of, by name; `speed_mps` where it is not the carrier's own."""
 
     world: str
     sensor: str
     carrier: str
     mount: str
+    speed_mps: float | None = None
 
 
 def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Excerpt]:
@@ -86,12 +91,11 @@ def ingredients_of(number: int, seed: int) -> Ingredients:
 
 
 def _ingredients(rng: np.random.Generator, number: int) -> Ingredients:
-    return Ingredients(
-        world=MIXED_WORLDS[number % len(MIXED_WORLDS)],
-        sensor=_pick(rng, SENSOR_WEIGHTS),
-        carrier=_pick(rng, _CARRIER_WEIGHTS),
-        mount=_pick(rng, _MOUNT_WEIGHTS),
-    )
+    world = MIXED_WORLDS[number % len(MIXED_WORLDS)]
+    carriers = _CARRIER_WEIGHTS | ({"car-fast": _FAST_WEIGHT} if world in _ROADS else {})
+    sensor, carrier, mount = (_pick(rng, weights) for weights in (SENSOR_WEIGHTS, carriers, _MOUNT_WEIGHTS))
+    speed_mps = float(rng.uniform(*_FAST_MPS)) if carrier == "car-fast" else None
+    return Ingredients(world, sensor, carrier, mount, speed_mps)
 
 
 def _draw(number: int, scans: int, seed: int) -> Excerpt:
@@ -100,7 +104,7 @@ def _draw(number: int, scans: int, seed: int) -> Excerpt:
     sensor = find_sensor(chosen.sensor)
     world_seed = _FIRST_SEED * (seed + 1) + number
     world = build_world(chosen.world, world_seed)
-    motion = motion_along_route(chosen.carrier, world, world_seed)
+    motion = motion_along_route(chosen.carrier, world, world_seed, chosen.speed_mps)
     lap = int(motion.duration_s * sensor.rate_hz)
     first = int(rng.integers(max(1, lap - scans)))
     T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
