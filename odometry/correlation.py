@@ -202,7 +202,7 @@ def _turn_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
 
 def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     """Shift (B, 2) along x and y, metres, of the peak of scores (B, SHIFTS, SHIFTS), and its shape (B, 5)."""
-    size, count = len(scores), scores.shape[-1]
+    count = scores.shape[-1]
     likelihood = scores.flatten(1).log_softmax(dim=1)
     # The surroundings of a peak on the border would lie beyond it.
     inner = scores[:, _PEAK:-_PEAK, _PEAK:-_PEAK].flatten(1).argmax(dim=1)
@@ -211,7 +211,7 @@ def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     around = torch.arange(-_PEAK, _PEAK + 1, device=scores.device)
     cells = (row[:, None, None] + around[:, None]) * count + column[:, None, None] + around  # (B, 5, 5)
     near = likelihood.gather(1, cells.flatten(1))
-    share = near.softmax(dim=1).view(size, 2 * _PEAK + 1, 2 * _PEAK + 1)
+    share = near.softmax(dim=1).unflatten(1, (2 * _PEAK + 1, 2 * _PEAK + 1))
     across, along = share.sum(dim=1), share.sum(dim=2)  # over rows: along x; over columns: along y
     mean = torch.stack([(across * around).sum(dim=1), (along * around).sum(dim=1)], dim=1)
     squares = torch.stack([(across * around.square()).sum(dim=1), (along * around.square()).sum(dim=1)], dim=1)

@@ -1,95 +1,127 @@
-"""A trained network for other programs: ONNX, in two graphs, because what is kept of a scan serves several pairs."""
+"""A trained network as ONNX: for inference without torch, and for other programs.
 
+The default network becomes one graph for each of its parts; between them only the fast Fourier transform is left to do,
+see `odometry.hypotheses`. Other networks are one graph of pairs.
+"""
+
+import json
 import logging
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from lidarslam.core.errors import ConfigError, OutputError
+from odometry import bird_eye
 from odometry.checkpoint import Checkpoint, network_of
-from odometry.networks import PairNetwork
+from odometry.correlation import SHIFTS, CorrelationNetwork, PairImages
+from odometry.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
 
-ENCODER, PAIR = "encoder.onnx", "pair.onnx"
 # Not a size of anything else, so that no dimension is taken for another.
 _EXAMPLE_BATCH = 2
 
 
-class EncoderGraph(nn.Module):
-    """(B, 3, H, W) points and normals -> what is kept of each scan."""
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """One file: a module, examples of its inputs, and the names of inputs and outputs."""
+
+    name: str
+    module: nn.Module
+    inputs: tuple[Tensor, ...]
+    takes: Sequence[str]
+    gives: Sequence[str]
+
+
+class _Turns(nn.Module):
+    """(B, C, H', W') features of two scans -> (B, W') scores of turns."""
+
+    def __init__(self, network: CorrelationNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Correlate."""
+        return self.network.turn_scores(previous, current)
+
+
+class _Pairs(nn.Module):
+    """(B, 6, H, W) points and normals of two scans -> motion (B, 4, 4), log sigma (B, 6)."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, points: Tensor, normals: Tensor) -> Tensor:
-        """Encode."""
-        return cast(PairNetwork, self.network).encode(points, normals)
-
-
-class PairGraph(nn.Module):
-    """What is kept of two scans -> motion (B, 4, 4), log sigma (B, 6), turn scores (B, S; none with DeLORA)."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, previous: Tensor, current: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, previous: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
         """Compare."""
-        estimate = self.network(previous, current)
-        outputs = (estimate.T_prev_curr, estimate.log_sigma, estimate.turn_scores)
-        return outputs if estimate.turn_scores.shape[1] else outputs[:2]
+        estimate = self.network(PairImages(previous, current))
+        return estimate.T_prev_curr, estimate.log_sigma
 
 
-def export_onnx(checkpoint: Checkpoint, out: Path) -> tuple[Path, Path]:
-    """Write both graphs into a folder; the number of scans and pairs stays free, the size of the images does not.
+def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
+    """Write the graphs and a description into a folder, which `--weights` takes.
+
+    The number of scans and pairs stays free, the size of the images does not.
 
     Raises:
         ConfigError: the packages for it are not installed.
         OutputError: the folder cannot be written.
     """
     _require_packages()
-    network = network_of(checkpoint)
-    shape = (_EXAMPLE_BATCH, 3, checkpoint.images.rows, checkpoint.images.columns)
-    points, normals = torch.rand(shape), torch.rand(shape)
-    encoder, pair = EncoderGraph(network).eval(), PairGraph(network).eval()
-    with torch.no_grad():
-        features = encoder(points, normals)
-        results = len(pair(features, features))
-    names = ["T_prev_curr", "log_sigma", "turn_scores"][:results]
+    graphs = _graphs(checkpoint)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=out) as workplace:
             folder = Path(workplace)
-            _write(encoder, (points, normals), ["points", "normals"], ["features"], folder / ENCODER)
-            _write(pair, (features, features.flip(0)), ["previous", "current"], names, folder / PAIR)
-            for name in (ENCODER, PAIR):
+            for graph in graphs:
+                _write(graph, folder / graph.name)
+            description = describe(checkpoint.network, checkpoint.images)
+            (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+            names = [*(graph.name for graph in graphs), DESCRIPTION]
+            for name in names:
                 (folder / name).replace(out / name)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
-    return out / ENCODER, out / PAIR
+    return [out / name for name in names]
 
 
-def _write(
-    graph: nn.Module, inputs: tuple[Tensor, ...], takes: Sequence[str], gives: Sequence[str], path: Path
-) -> None:
+def _graphs(checkpoint: Checkpoint) -> list[_Graph]:
+    network = network_of(checkpoint)
+    rows, columns = checkpoint.images.rows, checkpoint.images.columns
+    points, normals = torch.rand(2, _EXAMPLE_BATCH, 3, rows, columns)
+    if not isinstance(network, CorrelationNetwork):
+        images = torch.cat([points, normals], dim=1)
+        gives = ["T_prev_curr", "log_sigma"]
+        return [_Graph(PAIR, _Pairs(network).eval(), (images, images + 1.0), ["previous", "current"], gives)]
+    with torch.no_grad():
+        features = network.columns(points, normals)
+    grids = torch.rand(_EXAMPLE_BATCH, bird_eye.CHANNELS, bird_eye.CELLS, bird_eye.CELLS)
+    scores = torch.rand(_EXAMPLE_BATCH, features.shape[-1]), torch.rand(_EXAMPLE_BATCH, SHIFTS, SHIFTS)
+    return [
+        _Graph(COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
+        _Graph(TURNS, _Turns(network).eval(), (features, features.flip(0)), ["previous", "current"], ["scores"]),
+        _Graph(BIRD, network.bird, (grids,), ["grids"], ["features"]),
+        _Graph(PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),
+    ]
+
+
+def _write(graph: _Graph, path: Path) -> None:
     batch = torch.export.Dim("batch", min=1)
-    operators = torch.export.default_decompositions()
-    operators[torch.ops.aten.hypot.default] = _hypot
     with _quiet_exporter():
-        program = torch.export.export(graph, inputs, dynamic_shapes=tuple({0: batch} for _ in inputs))
+        program = torch.export.export(
+            graph.module, graph.inputs, dynamic_shapes=tuple({0: batch} for _ in graph.inputs)
+        )
         torch.onnx.export(
-            program.run_decompositions(operators),
+            program,
             (),
             str(path),
-            input_names=list(takes),
-            output_names=list(gives),
-            dynamic_shapes=tuple({0: "batch"} for _ in inputs),
+            input_names=list(graph.takes),
+            output_names=list(graph.gives),
+            dynamic_shapes=tuple({0: "batch"} for _ in graph.inputs),
             dynamo=True,
             external_data=False,
             verbose=False,
@@ -108,11 +140,6 @@ def _quiet_exporter() -> Iterator[None]:
             yield
     finally:
         exporter.setLevel(level)
-
-
-def _hypot(x: Tensor, y: Tensor) -> Tensor:
-    """The one operator that ONNX lacks; lengths of points are far from where squares overflow."""
-    return (x * x + y * y).sqrt()
 
 
 def _require_packages() -> None:

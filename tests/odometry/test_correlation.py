@@ -2,29 +2,31 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from odometry.correlation import INPUT_CHANNELS, CorrelationNetwork, column_channels
-from odometry.evidence import PACKED_CHANNELS
+from odometry import bird_eye
+from odometry.correlation import INPUT_CHANNELS, SHIFTS, CorrelationNetwork, PairImages, column_channels
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
 from odometry.objective import objective
-from odometry.pairs import PairBatch, pair_of
-from odometry.projection import rotate_columns
-from odometry.torch_geometry import inverse, log, rotation_angle
+from odometry.pairs import PairBatch, birds, pair_of
+from odometry.torch_geometry import inverse, log
+from odometry.torch_images import rotate_columns
 from odometry.training import loss_of
 from odometry.training_config import TrainingConfig
 
 COLUMNS = 96
 FEATURE_COLUMNS = COLUMNS // 4
+TWIST = (0.0, 0.0, 1.0, 2.0, 0.5, 0.0)
 
 
 def make(seed: int = 0, **options: object) -> CorrelationNetwork:
     torch.manual_seed(seed)
-    return CorrelationNetwork(CorrelationConfig.model_validate(options))
+    return CorrelationNetwork(CorrelationConfig.model_validate(options)).eval()
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +37,8 @@ def network() -> CorrelationNetwork:
 @pytest.fixture(scope="module")
 def scans(small_room) -> tuple[Tensor, Tensor]:
     """Points and normals (3, 3, H, W) each."""
-    images = small_room.sweeps(3, (0.0, 0.0, 1.0, 2.0, 0.5, 0.0))
-    return images.points, images.normals
+    images = small_room.sweeps(3, TWIST)
+    return torch.as_tensor(images.points), torch.as_tensor(images.normals)
 
 
 def turned(scans: tuple[Tensor, Tensor], columns: int) -> tuple[Tensor, Tensor]:
@@ -45,12 +47,15 @@ def turned(scans: tuple[Tensor, Tensor], columns: int) -> tuple[Tensor, Tensor]:
     return points, normals
 
 
-def yaw_deg(T: Tensor) -> Tensor:
-    return torch.atan2(T[:, 1, 0], T[:, 0, 0]).rad2deg()
+def pairs(previous: tuple[Tensor, Tensor], current: tuple[Tensor, Tensor], turn: float = 0.0) -> PairImages:
+    """Pairs of scans, the current ones turned by so much where they are seen from above."""
+    one, other = torch.cat(previous, dim=1), torch.cat(current, dim=1)
+    none = torch.zeros(len(one))
+    return PairImages(one, other, birds(one, none), birds(other, none + turn))
 
 
 def test_the_size_is_the_documented_one(network):
-    assert sum(p.numel() for p in network.parameters()) == 765_253
+    assert sum(p.numel() for p in network.parameters()) == 62_104
 
 
 @pytest.mark.parametrize("columns", [1, 7, -3])
@@ -70,9 +75,10 @@ def test_input_channels_are_about_one_and_empty_pixels_are_zero(scans):
 @pytest.mark.parametrize("columns", [1, 5, -11])
 @torch.no_grad()
 def test_turning_a_scan_shifts_its_features(network, scans, columns):
-    features = network.encode(*scans)
-    assert features.shape == (3, 64 + PACKED_CHANNELS, 4, FEATURE_COLUMNS)
-    shifted = network.encode(*turned(scans, columns))
+    features = network.columns(*scans)
+    assert features.shape == (3, 32, 4, FEATURE_COLUMNS)
+    torch.testing.assert_close(features.norm(dim=1), torch.ones(3, 4, FEATURE_COLUMNS))
+    shifted = network.columns(*turned(scans, columns))
     torch.testing.assert_close(shifted, features.roll(columns, -1), rtol=0, atol=1e-4)
     assert not torch.allclose(shifted, features, rtol=0, atol=0.1)
 
@@ -83,139 +89,165 @@ def test_turning_a_scan_shifts_its_features(network, scans, columns):
 def test_a_pure_turn_is_read_off_exactly(scans, columns, seed):
     """A sensor that turns to the left sees the scan turned to the right; the motion between is to the left."""
     network = make(seed)
-    previous, current = network.encode(*scans), network.encode(*turned(scans, -columns))
-    estimate = network(previous, current)
-    assert estimate.turn_scores.shape == (3, FEATURE_COLUMNS)
-    assert estimate.turn_scores.argmax(1).tolist() == [columns % FEATURE_COLUMNS] * 3
-    # What comes beyond whole columns is the same as for the scan on itself.
-    on_itself = network(previous, previous)
-    more = inverse(on_itself.T_prev_curr) @ estimate.T_prev_curr
-    apart = (yaw_deg(more) - columns * 360.0 / FEATURE_COLUMNS).remainder(360.0)
-    assert torch.minimum(apart, 360.0 - apart).max() < 0.01
-    assert more[:, :3, 3].norm(dim=1).max() < 1e-4
-    torch.testing.assert_close(estimate.log_sigma, on_itself.log_sigma, rtol=0, atol=1e-4)
-    # And those are few at first: less than the two columns around the peak, with hardly a motion on top.
-    assert rotation_angle(on_itself.T_prev_curr).rad2deg().max() < 2 * 360.0 / FEATURE_COLUMNS
+    previous, current = network.columns(*scans), network.columns(*turned(scans, -columns))
+    scores = network.turn_scores(previous, current)
+    assert scores.shape == (3, FEATURE_COLUMNS)
+    assert scores.argmax(1).tolist() == [columns % FEATURE_COLUMNS] * 3
+    torch.testing.assert_close(scores, network.turn_scores(previous, previous).roll(columns, 1), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (3, -2), (-11, 7), (18, -18)])
+@torch.no_grad()
+def test_a_pure_shift_is_read_off_exactly(network, x, y):
+    """A sensor that goes forwards sees everything come nearer; the motion is forwards."""
+    generator = torch.Generator().manual_seed(1)
+    cells, reach = bird_eye.CELLS, 20
+    previous = torch.zeros(1, 8, cells, cells)
+    inner = slice(cells // 2 - reach, cells // 2 + reach)
+    previous[:, :, inner, inner] = torch.randn(1, 8, 2 * reach, 2 * reach, generator=generator)
+    scores = network.shift_scores(previous, previous.roll((-y, -x), (2, 3)))
+    assert scores.shape == (1, SHIFTS, SHIFTS)
+    assert divmod(int(scores.argmax()), SHIFTS) == (y + bird_eye.MOST_CELLS, x + bird_eye.MOST_CELLS)
+
+
+@torch.no_grad()
+def test_peaks_between_columns_and_cells(network):
+    column = torch.arange(180.0)
+    away = (column - 20.25 + 90.0).remainder(180.0) - 90.0
+    cell = torch.arange(SHIFTS) - bird_eye.MOST_CELLS
+    squares = (cell[:, None] + 4.4) ** 2 + (cell[None, :] - 7.3) ** 2
+    angle, shift, log_sigma = network.peaks(-2.0 * away.square()[None], -2.0 * squares[None])
+    assert math.degrees(float(angle[0])) == pytest.approx(40.5, abs=0.05)
+    np.testing.assert_allclose(shift[0].numpy(), [7.3 * bird_eye.CELL_M, -4.4 * bird_eye.CELL_M], atol=0.02)
+    assert log_sigma.shape == (1, 6)
+
+
+@torch.no_grad()
+def test_angles_lie_within_half_a_turn(network):
+    scores = torch.full((1, 180), -50.0)
+    scores[0, 179] = 0.0
+    angle, _, _ = network.peaks(scores, torch.zeros(1, SHIFTS, SHIFTS))
+    assert math.degrees(float(angle[0])) == pytest.approx(-2.0, abs=0.01)
 
 
 @torch.no_grad()
 def test_turning_both_scans_turns_the_scores_not_at_all(network, scans):
     previous, current = (tuple(images[i : i + 1] for images in scans) for i in (0, 1))
-    as_is = network(network.encode(*previous), network.encode(*current))
-    both = network(network.encode(*turned(previous, 5)), network.encode(*turned(current, 5)))
-    torch.testing.assert_close(both.turn_scores, as_is.turn_scores, rtol=0, atol=1e-4)
+    as_is = network.turn_scores(network.columns(*previous), network.columns(*current))
+    both = network.turn_scores(network.columns(*turned(previous, 5)), network.columns(*turned(current, 5)))
+    torch.testing.assert_close(both, as_is, rtol=0, atol=1e-4)
 
 
 @torch.no_grad()
-def test_the_turn_is_what_the_objective_asks_for(network, scans):
-    """The sign of the scores is that of the loss that trains them."""
-    previous, current = network.encode(*scans), network.encode(*turned(scans, -5))
-    estimate = network(previous, current)
-    angle = torch.tensor(5 * 2.0 * math.pi / FEATURE_COLUMNS)
+def test_turn_and_shift_are_what_the_objective_asks_for(network, scans):
+    """The signs of the scores are those of the losses that train them."""
+    angle = 5 * 2.0 * math.pi / FEATURE_COLUMNS
     T = torch.eye(4).repeat(3, 1, 1)
-    T[:, 0, 0] = T[:, 1, 1] = angle.cos()
-    T[:, 1, 0], T[:, 0, 1] = angle.sin(), -angle.sin()
+    T[:, 0, 0] = T[:, 1, 1] = math.cos(angle)
+    T[:, 1, 0], T[:, 0, 1] = math.sin(angle), -math.sin(angle)
+    shift = torch.tensor([2.0, -1.0])
+    T[:, :2, 3] = shift
+    estimate = network(pairs(scans, turned(scans, -5), angle))
+    moved = network(PairImages(*_shifted_grids(scans, (4, -2))))
 
-    def turn_loss(target: Tensor) -> float:
+    def losses(target: Tensor) -> tuple[float, float]:
         empty = torch.zeros(3, 6, 16, COLUMNS)
         batch = PairBatch(empty, empty, None, None, target, torch.ones(3, dtype=torch.bool))
-        return float(objective(estimate, batch, TrainingConfig(geometric=None), torch.Generator()).turn)
+        config, generator = TrainingConfig(geometric=None), torch.Generator()
+        return float(objective(estimate, batch, config, generator).turn), float(
+            objective(moved, batch, config, generator).shift
+        )
 
-    assert turn_loss(T) < turn_loss(inverse(T)) - 0.1
+    right, wrong = losses(T), losses(inverse(T))
+    assert right[0] < wrong[0] - 0.1
+    assert right[1] < wrong[1]
+
+
+def _shifted_grids(scans: tuple[Tensor, Tensor], cells: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Images of the scans twice, and their grids, those of the current ones as seen from so many cells along x and y."""
+    images = torch.cat(scans, dim=1)
+    grids = birds(images, torch.zeros(len(images)))
+    return images, images, grids, grids.roll((-cells[1], -cells[0]), (2, 3))
 
 
 @torch.no_grad()
 def test_items_of_a_batch_do_not_see_each_other(network, scans):
-    features = network.encode(*scans)
-    batch = network(features[:2], features[1:])
+    both = network(pairs(tuple(x[:2] for x in scans), tuple(x[1:] for x in scans)))
     for item in range(2):
-        alone = network.encode(*(images[item : item + 2] for images in scans))
-        estimate = network(alone[:1], alone[1:])
-        for name in ("T_prev_curr", "log_sigma", "turn_scores"):
-            torch.testing.assert_close(getattr(batch, name)[item], getattr(estimate, name)[0], rtol=0, atol=1e-5)
+        alone = network(pairs(tuple(x[item : item + 1] for x in scans), tuple(x[item + 1 : item + 2] for x in scans)))
+        for name, value in vars(alone).items():
+            torch.testing.assert_close(getattr(both, name)[item], value[0], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("gain", [1.0, 1e3, 1e5])
 @torch.no_grad()
-def test_outputs_are_rigid_and_confidence_is_bounded(scans, gain):
+def test_motions_are_rigid_and_standard_deviations_are_bounded(scans, gain):
     network = make()
-    for layer in (network.motion, network.confidence):
-        layer.weight.mul_(gain)
-    features = network.encode(*scans)
-    estimate = network(features[:2], features[1:])
+    network.peaks.head[-1].weight.mul_(gain)
+    estimate = network(pairs(scans, turned(scans, 3)))
     R = estimate.T_prev_curr[:, :3, :3]
-    torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(2, 3, 3), rtol=0, atol=1e-5)
-    torch.testing.assert_close(torch.linalg.det(R), torch.ones(2), rtol=0, atol=1e-5)
-    assert torch.equal(estimate.T_prev_curr[:, 3], torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(2, 4))
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(3, 3, 3), rtol=0, atol=1e-5)
+    assert torch.equal(estimate.T_prev_curr[:, 3], torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(3, 4))
     assert estimate.log_sigma.min() >= -7.0
     assert estimate.log_sigma.max() <= 3.0
     if gain == 1e5:
         assert {-7.0, 3.0} & set(estimate.log_sigma.flatten().tolist())
-    if gain == 1.0:
-        torch.testing.assert_close(estimate.log_sigma, torch.full((2, 6), -3.0), rtol=0, atol=0.1)
 
 
 @torch.no_grad()
 def test_empty_scans_give_a_finite_answer(network):
-    nothing = network.encode(torch.zeros(1, 3, 16, COLUMNS), torch.zeros(1, 3, 16, COLUMNS))
-    estimate = network(nothing, nothing)
-    assert all(value.isfinite().all() for value in vars(estimate).values())
+    nothing = torch.zeros(1, 3, 16, COLUMNS), torch.zeros(1, 3, 16, COLUMNS)
+    assert all(value.isfinite().all() for value in vars(network(pairs(nothing, nothing))).values())
 
 
 @torch.no_grad()
 def test_half_precision_does_not_reach_the_motion(network, scans):
     """Three digits are enough for features, not for a rotation."""
-    exact = network(network.encode(*scans), network.encode(*turned(scans, -5)))
+    exact = network(pairs(scans, turned(scans, -5)))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        estimate = network(network.encode(*scans), network.encode(*turned(scans, -5)))
+        estimate = network(pairs(scans, turned(scans, -5)))
     assert {value.dtype for value in vars(estimate).values()} == {torch.float32}
     R = estimate.T_prev_curr[:, :3, :3]
     torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(3, 3, 3), rtol=0, atol=1e-5)
     assert estimate.turn_scores.argmax(1).tolist() == exact.turn_scores.argmax(1).tolist()
-    assert rotation_angle(estimate.T_prev_curr @ inverse(exact.T_prev_curr)).rad2deg().max() < 0.1
 
 
 def test_the_default_objective_reaches_every_parameter(small_room):
-    network = make()
-    pair = pair_of(small_room.recording(2, (0.0, 0.0, 1.0, 2.0, 0.5, 0.0)), 0, 1)
-    loss = loss_of(network, pair, TrainingConfig(), torch.Generator().manual_seed(0))
+    network = make().train()
+    pair = pair_of(small_room.recording(3, TWIST), 0, 1)
+    grids = birds(pair.previous, torch.zeros(1)), birds(pair.current, torch.zeros(1))
+    batch = PairBatch(**{**vars(pair), "bird_previous": grids[0], "bird_current": grids[1]})
+    loss = loss_of(network, batch, TrainingConfig(), torch.Generator().manual_seed(0))
     loss.total.backward()  # type: ignore[no-untyped-call]
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
-        assert parameter.grad.abs().max() > 0.0, name
-
-
-def test_the_alignment_reaches_the_scores_through_the_peak(small_room):
-    """Without the loss on the turns themselves."""
-    network = make()
-    pair = pair_of(small_room.recording(2, (0.0, 0.0, 1.0, 2.0, 0.5, 0.0)), 0, 1)
-    loss = loss_of(network, pair, TrainingConfig(geometric=None), torch.Generator().manual_seed(0))
-    (gradient,) = torch.autograd.grad(loss.alignment, network.sharpness)
-    assert gradient != 0.0
 
 
 @torch.no_grad()
 def test_other_sizes(scans):
-    network = make(rows=8, widths=(8, 16, 24), pair_width=16, reach=2)
+    network = make(rows=8, widths=(8, 16, 24), bird_width=8, bird_features=4)
     half = tuple(images[:, :, ::2] for images in scans)
-    features = network.encode(*half)
-    assert features.shape == (3, 24 + PACKED_CHANNELS, 2, FEATURE_COLUMNS)
-    assert network(features[:2], features[1:]).T_prev_curr.shape == (2, 4, 4)
+    assert network.columns(*half).shape == (3, 24, 2, FEATURE_COLUMNS)
+    assert network(pairs(half, half)).T_prev_curr.shape == (3, 4, 4)
     with pytest.raises(ValidationError, match="multiple of 4"):
         CorrelationConfig(rows=10)
 
 
 @pytest.mark.parametrize("name", ["correlation", "delora"])
 @torch.no_grad()
-def test_every_network_takes_scans_first_and_pairs_then(name, scans):
+def test_every_network_takes_pairs(name, scans):
     torch.manual_seed(0)
     network = make_network(NetworkConfig(name=name)).eval()
-    features = network.encode(*scans)
-    estimate = network(features[:2], features[1:])
+    estimate = network(pairs(tuple(x[:2] for x in scans), tuple(x[1:] for x in scans)))
     assert log(estimate.T_prev_curr).isfinite().all()
     assert estimate.log_sigma.shape == (2, 6)
-    assert len(estimate.turn_scores) == 2
+    assert len(estimate.turn_scores) == len(estimate.shift_scores) == 2
     if name == "delora":
         torch.testing.assert_close(estimate.log_sigma.exp(), torch.full((2, 6), 0.1))
-        torch.testing.assert_close(features[:, 3], scans[0].norm(dim=1))
+
+
+def test_grids_are_needed_where_the_network_looks_from_above(network, scans):
+    images = torch.cat(scans, dim=1)
+    with pytest.raises(ValueError, match="from above"):
+        network(PairImages(images, images))

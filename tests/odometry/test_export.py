@@ -1,24 +1,31 @@
 """Networks as ONNX answer as they do in torch."""
 
+import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional
 
-from lidarslam.core.errors import ConfigError
-from odometry.checkpoint import Checkpoint, checkpoint_of, network_of
+from lidarslam.core.errors import ConfigError, InputError
+from odometry.checkpoint import Checkpoint, checkpoint_of, default_weights, load_checkpoint, network_of
 from odometry.export import export_onnx
+from odometry.exported import DESCRIPTION, read_exported, shipped_folder
 from odometry.image_config import ImageConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
+from odometry.onnx_graphs import OnnxGraphs, onnx_search
+from odometry.torch_graphs import TorchGraphs, torch_search
 
 SHAPE = (16, 96)
+# Sums in another order differ in the last digits of float32.
+TOLERANCE = 1e-4
 
 
 def untrained(name: str) -> Checkpoint:
-    small = CorrelationConfig(rows=16, widths=(8, 16, 16), pair_width=16, reach=2)
+    small = CorrelationConfig(rows=16, widths=(8, 16, 16), bird_width=8, bird_features=4)
     config = NetworkConfig.model_validate({"name": name, "correlation": small})
     torch.manual_seed(5)
     network = make_network(config)
@@ -28,27 +35,61 @@ def untrained(name: str) -> Checkpoint:
     return checkpoint_of(network, config, ImageConfig(rows=SHAPE[0], columns=SHAPE[1]))
 
 
+def a_scan(seed: int, shape: tuple[int, int] = SHAPE) -> tuple[np.ndarray, np.ndarray]:
+    generator = torch.Generator().manual_seed(seed)
+    points = 6.0 * torch.randn(3, *shape, generator=generator)
+    return points.numpy(), functional.normalize(torch.randn(3, *shape, generator=generator), dim=0).numpy()
+
+
+def test_the_shipped_graphs_are_the_shipped_weights() -> None:
+    """Else they were exported from others: `lidarslam export --out odometry/weights/correlation` makes them again."""
+    checkpoint, exported = load_checkpoint(default_weights()), read_exported(shipped_folder())
+    assert (exported.network, exported.images) == (checkpoint.network, checkpoint.images)
+    given, expected = OnnxGraphs(exported.folder, 1), TorchGraphs(network_of(checkpoint))
+    points, normals = a_scan(0, (checkpoint.images.rows, checkpoint.images.columns))
+    rng = np.random.default_rng(0)
+    grid = rng.normal(size=(1, 8, 96, 96)).astype(np.float32) * (rng.random((1, 1, 96, 96)) > 0.6)
+    shifts = 5.0 * rng.normal(size=(1, 37, 37)).astype(np.float32)
+    features = expected.columns(points[None], normals[None])
+    other = np.ascontiguousarray(np.roll(features, 7, -1))
+    np.testing.assert_allclose(given.columns(points[None], normals[None]), features, atol=TOLERANCE)
+    turns = expected.turn_scores(features, other)
+    np.testing.assert_allclose(given.turn_scores(features, other), turns, atol=TOLERANCE * np.abs(turns).max())
+    cells = expected.bird(grid)
+    np.testing.assert_allclose(given.bird(grid), cells, atol=TOLERANCE * np.abs(cells).max())
+    for one, same in zip(given.peaks(turns, shifts), expected.peaks(turns, shifts), strict=True):
+        np.testing.assert_allclose(one, same, atol=TOLERANCE)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["correlation", "delora"])
 def test_onnx_gives_what_torch_gives(name: str, tmp_path: Path) -> None:
-    onnxruntime = pytest.importorskip("onnxruntime")
     checkpoint = untrained(name)
-    network = network_of(checkpoint)
-    encoder, pair = (onnxruntime.InferenceSession(str(path)) for path in export_onnx(checkpoint, tmp_path))
-    for scans in (1, 3):  # neither is the number that the graphs were made with
-        points = 4.0 * torch.randn(scans, 3, *SHAPE)
-        normals = functional.normalize(torch.randn(scans, 3, *SHAPE), dim=1)
-        with torch.no_grad():
-            features = network.encode(points, normals)
-            turned = features.roll(5, dims=3)
-            expected = network(features, turned)
-        (given,) = encoder.run(None, {"points": points.numpy(), "normals": normals.numpy()})
-        torch.testing.assert_close(torch.from_numpy(given), features, rtol=1e-4, atol=1e-4)
-        answers = pair.run(None, {"previous": features.numpy(), "current": turned.numpy()})
-        for output, answer in zip(pair.get_outputs(), answers, strict=True):
-            value = getattr(expected, output.name)
-            torch.testing.assert_close(torch.from_numpy(answer), value, rtol=1e-4, atol=1e-4)
-        assert len(answers) == (3 if name == "correlation" else 2)
+    written = export_onnx(checkpoint, tmp_path)
+    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
+    given, expected = onnx_search(read_exported(tmp_path), 1), torch_search(network_of(checkpoint))
+    found, _ = given.compare(given.describe(*a_scan(1)), *a_scan(2))
+    wanted, _ = expected.compare(expected.describe(*a_scan(1)), *a_scan(2))
+    assert len(found) == len(wanted)
+    np.testing.assert_allclose(found[0].T_prev_curr, wanted[0].T_prev_curr, atol=1e-3)
+    np.testing.assert_allclose(found[0].covariance, wanted[0].covariance, rtol=1e-2, atol=1e-6)
+    assert found[0].log_probability == pytest.approx(wanted[0].log_probability, abs=1e-2)
+
+
+def test_damaged_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="lidarslam export"):
+        read_exported(tmp_path)
+    for content in ("{", "[]", '{"kind": "something else"}'):
+        (tmp_path / DESCRIPTION).write_text(content)
+        with pytest.raises(InputError, match="lidarslam export"):
+            read_exported(tmp_path)
+    (tmp_path / DESCRIPTION).write_bytes((shipped_folder() / DESCRIPTION).read_bytes())
+    with pytest.raises(InputError, match=r"columns\.onnx is missing"):
+        read_exported(tmp_path)
+    for name in read_exported(shipped_folder()).graphs:
+        (tmp_path / name).write_bytes(b"no graph")
+    with pytest.raises(InputError, match=r"columns\.onnx: cannot be used"):
+        onnx_search(read_exported(tmp_path), 1)
 
 
 def test_missing_packages_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,3 +97,14 @@ def test_missing_packages_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match=r"pip install 'lidarslam\[export\]'"):
         export_onnx(untrained("correlation"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_inference_imports_no_torch() -> None:
+    code = (
+        "import sys\n"
+        "from odometry.config import OdometryConfig\n"
+        "from odometry.registry import make_odometry\n"
+        "make_odometry(OdometryConfig(method='learned'))\n"
+        "assert 'torch' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

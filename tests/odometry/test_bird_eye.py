@@ -1,0 +1,73 @@
+"""Scans seen from above."""
+
+import math
+
+import numpy as np
+import pytest
+
+from odometry.bird_eye import CELL_M, CELLS, CHANNELS, MOST_CELLS, bird_eye
+
+MIDDLE = CELLS // 2
+
+
+def image(points: list[tuple[float, float, float]], normals: list[tuple[float, float, float]] | None = None):
+    """Points and normals (3, 1, W) of a single row."""
+    given = np.array(points, dtype=np.float32).T[:, None]
+    facing = np.zeros_like(given) if normals is None else np.array(normals, dtype=np.float32).T[:, None]
+    return given, facing
+
+
+@pytest.mark.parametrize(
+    ("x", "y"), [(0.1, 0.1), (7.3, -4.9), (-19.9, 0.1), (0.2, 19.9), (-CELL_M / 2, -CELL_M / 2)]
+)
+def test_a_point_lies_in_its_cell(x, y):
+    grid = bird_eye(*image([(x, y, 0.0)]), 0.0)
+    assert grid.shape == (CHANNELS, CELLS, CELLS)
+    rows, columns = np.nonzero(grid[0])
+    assert (rows.tolist(), columns.tolist()) == (
+        [math.floor(y / CELL_M) + MIDDLE], [math.floor(x / CELL_M) + MIDDLE]
+    )  # fmt: skip
+
+
+def test_what_would_come_round_the_border_is_left_out():
+    """A shift of as much as is looked for brings no cell to where another one's shift could."""
+    assert not bird_eye(*image([(20.1, 0.0, 0.0), (15.0, 15.0, 0.0), (0.0, 0.0, 1.0)]), 0.0).any()
+    farthest = np.nonzero(bird_eye(*image([(19.99, 0.0, 0.0)]), 0.0)[0])[1][0] - MIDDLE
+    assert farthest + MOST_CELLS - CELLS < -farthest + MOST_CELLS
+
+
+@pytest.mark.parametrize("heading", [0.3, math.pi / 2, -2.0])
+def test_the_heading_turns_points_and_normals(heading):
+    c, s = math.cos(heading), math.sin(heading)
+    x, y, u, v = 6.2, -3.3, 0.6, 0.8
+    turned = image([(c * x - s * y, s * x + c * y, 0.7)], [(c * u - s * v, s * u + c * v, 0.0)])
+    np.testing.assert_allclose(
+        bird_eye(*image([(x, y, 0.7)], [(u, v, 0.0)]), heading), bird_eye(*turned, 0.0), atol=1e-5
+    )
+
+
+def test_a_displacement_by_whole_cells_shifts_the_grid(rng):
+    points = np.stack([rng.uniform(-8.0, 8.0, 300), rng.uniform(-8.0, 8.0, 300), rng.uniform(-1.0, 2.0, 300)])
+    normals = rng.normal(size=(3, 300))
+    normals = np.where(rng.random(300) < 0.3, 0.0, normals / np.linalg.norm(normals, axis=0))
+    here = bird_eye(points[:, None], normals[:, None], 0.0)
+    there = bird_eye((points + [[3 * CELL_M], [-5 * CELL_M], [0.0]])[:, None], normals[:, None], 0.0)
+    shifted = np.roll(here, (-5, 3), (1, 2))
+    # All but the density, which knows how far away the sensor is.
+    np.testing.assert_allclose(np.delete(there, 1, 0), np.delete(shifted, 1, 0), atol=1e-4)
+
+
+def test_walls_differ_from_ground_and_are_the_same_from_both_sides():
+    def cell(normal: tuple[float, float, float]):
+        return bird_eye(*image([(5.1, 5.1, 0.0)], [normal]), 0.0)[:, MIDDLE + 10, MIDDLE + 10]
+
+    ground, wall, behind, across = (cell(n) for n in ((0, 0, 1), (1, 0, 0), (-1, 0, 0), (0, 1, 0)))
+    assert ground[2] == 0.0
+    np.testing.assert_allclose(wall, behind)
+    assert wall[2] > 0.5
+    np.testing.assert_allclose(wall[3], -across[3])
+    assert wall[3] > 0.5
+
+
+def test_an_empty_scan_is_an_empty_grid():
+    assert not bird_eye(np.zeros((3, 16, 96)), np.zeros((3, 16, 96)), 1.0).any()
