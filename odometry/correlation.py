@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from odometry.evidence import EVIDENCE_CHANNELS, PACKED_CHANNELS, evidence, pack
 from odometry.network_config import CorrelationConfig
-from odometry.normals import has_normal
 from odometry.torch_geometry import exp, full_precision, turn_about_z
+from odometry.torch_images import has_normal
 
 INPUT_CHANNELS = 9
 # Standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.

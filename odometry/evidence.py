@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from odometry.normals import has_normal
+from odometry.torch_images import has_normal
 
 BLOCK = 4
 """Rows and columns of pixels that make a cell of features."""

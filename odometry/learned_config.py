@@ -18,6 +18,9 @@ class LearnedConfig(BaseModel):
     device: str = Field("cpu", min_length=1, description="torch's name of the device, such as cpu or cuda")
     threads: int = Field(1, ge=1, description="of torch; mapping works beside it")
     bfloat16: bool = Field(False, description="encode with half the digits, where the device is faster so")
+    alignment_rows: int | None = Field(
+        None, ge=4, le=256, description="null: as many as the sensor has rings, 16 to 64"
+    )
     alignment: AlignmentConfig = AlignmentConfig(column_step=3)
     caution: float = Field(
         4.0, gt=0.0, description="factor on the network's standard deviations, so that alignment leads where it can"

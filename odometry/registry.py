@@ -42,6 +42,7 @@ def _make_learned(config: LearnedConfig) -> Odometry:
     from odometry.checkpoint import default_weights, load_checkpoint, network_of
     from odometry.learned import LearnedOdometry
     from odometry.networks import PairNetwork
+    from odometry.torch_runner import TorchRunner
 
     checkpoint = load_checkpoint(config.weights or default_weights())
     network = network_of(checkpoint)
@@ -50,4 +51,5 @@ def _make_learned(config: LearnedConfig) -> Odometry:
     except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts that it has it
         reason = str(error).splitlines()[0]
         raise ConfigError(f"odometry.learned.device={config.device}: torch cannot use it ({reason})") from error
-    return LearnedOdometry(cast(PairNetwork, network), checkpoint.images, config)
+    runner = TorchRunner(cast(PairNetwork, network), config.device, config.threads, config.bfloat16)
+    return LearnedOdometry(runner, checkpoint.images, config)

@@ -13,8 +13,8 @@ from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
 from odometry.objective import objective
 from odometry.pairs import PairBatch, pair_of
-from odometry.projection import rotate_columns
 from odometry.torch_geometry import inverse, log, rotation_angle
+from odometry.torch_images import RecordedImages, rotate_columns
 from odometry.training import loss_of
 from odometry.training_config import TrainingConfig
 
@@ -35,7 +35,7 @@ def network() -> CorrelationNetwork:
 @pytest.fixture(scope="module")
 def scans(small_room) -> tuple[Tensor, Tensor]:
     """Points and normals (3, 3, H, W) each."""
-    images = small_room.sweeps(3, (0.0, 0.0, 1.0, 2.0, 0.5, 0.0))
+    images = RecordedImages.stacked(small_room.sweeps(3, (0.0, 0.0, 1.0, 2.0, 0.5, 0.0)))
     return images.points, images.normals
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from odometry.evidence import BLOCK, EVIDENCE_CHANNELS, PACKED_CHANNELS, evidence, pack
-from odometry.projection import rotate_columns
+from odometry.torch_images import RecordedImages, rotate_columns
 
 ROWS, COLUMNS = 8, 48
 FINE_WEIGHT, COARSE_WEIGHT = 6, 13  # channels
@@ -83,7 +83,7 @@ def test_surfaces_turned_otherwise_are_not_compared():
 
 @pytest.mark.parametrize("cells", [1, 5, -3])
 def test_turning_both_scans_shifts_it(small_room, cells):
-    images = small_room.sweeps(2, (0.02, 0.01, 0.0, 0.1, 0.05, 0.02))
+    images = RecordedImages.stacked(small_room.sweeps(2, (0.02, 0.01, 0.0, 0.1, 0.05, 0.02)))
     scans = [(images.points[i : i + 1], images.normals[i : i + 1]) for i in (0, 1)]
     turned = [tuple(rotate_columns(values, BLOCK * cells) for values in scan) for scan in scans]
     before, after = shown(*scans), shown(*turned)
