@@ -13,16 +13,17 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Literal
 
+import numpy as np
 import torch
 from mapping_accuracy import simulate
 
-from odometry.alignment import align
+from odometry.alignment import Hypothesis, align
 from odometry.image_config import ImageConfig
 from odometry.learned_config import LearnedConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig, NetworkName
 from odometry.networks import make_network
 from odometry.sweep_images import Imager
-from odometry.sweeps import SweepPairs
+from odometry.sweeps import SweepPair
 
 Change = Literal["", "channels last", "bfloat16"]
 _VARIANTS: tuple[tuple[str, NetworkName, Change], ...] = (
@@ -78,13 +79,11 @@ def time_pair(
 def _stages(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
     scans = simulate("office", "handheld", options.sensor, 12, 0).scans[-2:]
     imager = Imager(ImageConfig(rows=options.rows, columns=options.columns))
-    images = imager.images(list(scans))
-    previous, current = images.select(slice(0, 1)), images.select(slice(1, 2))
-    interval, T = torch.tensor([0.1]), torch.eye(4)[None]
-    config = LearnedConfig().alignment
+    previous, current = (imager.images(scan).alignment for scan in scans)
+    sweeps, config = SweepPair(current, previous, 0.1), LearnedConfig().alignment
     return {
-        "image and normals": lambda: imager.images([scans[1]]),
-        "alignment": lambda: align(T, SweepPairs(current, previous, interval), config),
+        "images and normals": lambda: imager.images(scans[1]),
+        "alignment": lambda: align(Hypothesis(np.eye(4)), sweeps, config),
     }
 
 

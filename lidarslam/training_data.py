@@ -20,8 +20,8 @@ from lidarslam.simulation.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Ingredien
 from lidarslam.train_config import SimulatedConfig
 from lidarslam.training_teacher import MapTeacher
 from odometry.preparation import PreparedRecording, prepare
-from odometry.sweeps import SweepImages
 from odometry.tensor_file import Kind, read_tensor_file, write_tensor_file
+from odometry.torch_images import RecordedImages
 from odometry.training_config import TrainingConfig
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
@@ -215,7 +215,7 @@ def _read(path: Path) -> PreparedRecording:
     tensors = read_tensor_file(path, _KIND).tensors
     if set(tensors) != {*_SWEEP, *_MOTIONS}:
         raise InputError(f"{path}: is incomplete")
-    images = SweepImages(*(tensors[name] for name in _SWEEP))
+    images = RecordedImages(*(tensors[name] for name in _SWEEP))
     return PreparedRecording(images, *(tensors[name] for name in _MOTIONS))
 
 

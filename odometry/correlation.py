@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from odometry import bird_eye
 from odometry.network_config import CorrelationConfig
-from odometry.normals import has_normal
 from odometry.torch_geometry import full_precision, make_transform, turn_about_z
+from odometry.torch_images import has_normal
 
 INPUT_CHANNELS = 9
 SHIFTS = 2 * bird_eye.MOST_CELLS + 1

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from odometry.projection import ImageGrid
+from odometry.torch_images import place
 
 # Distances held at once by the brute-force search: 256 MiB in float32.
 _MAX_DISTANCES = 1 << 26
@@ -86,7 +87,7 @@ def by_projection(query: Tensor, reference_image: Tensor, grid: ImageGrid) -> tu
     height, width = reference_image.shape[-2:]
     if (height, width) != (grid.rows, grid.columns):
         raise ValueError(f"the image is {height} x {width}, its grid {grid.rows} x {grid.columns}")
-    row, column = ((x + shift).floor() for x, shift in zip(grid.place(query), (0.5, 0.0), strict=True))
+    row, column = ((x + shift).floor() for x, shift in zip(place(query, grid), (0.5, 0.0), strict=True))
     inside = query.isfinite().all(-1) & (row >= 0) & (row < height)
     index = torch.where(inside, row * width + column, 0.0).long()
     pixels = reference_image.flatten(2)  # (B, 4, H, W) -> (B, 4, H * W)

@@ -54,7 +54,7 @@ def left_open(information: FloatArray, count: int, images: SweepImages) -> Degen
 
     Args:
         information, count: as in `find_degeneracy`.
-        images: of the one sweep (B = 1).
+        images: of the sweep.
     """
     if images.share_with_normal() < _MOST:
         return Degeneracy(np.empty((0, 6)), 1.0)

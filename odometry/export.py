@@ -1,7 +1,7 @@
 """A trained network as ONNX: for inference without torch, and for other programs.
 
 The default network becomes one graph for each of its parts; between them only the fast Fourier transform is left to do,
-see `odometry.hypotheses`. Other networks are one graph of pairs.
+see `odometry.candidates`. Other networks are one graph of pairs.
 """
 
 import json

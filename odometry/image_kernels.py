@@ -1,6 +1,7 @@
 """The loop over points behind projection on a processor, compiled; `odometry.projection` says what it computes."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,41 +72,105 @@ def write_angles(x: FloatArray, y: FloatArray, z: FloatArray, elevations: FloatA
         azimuths[i] = _arc_tangent(y[i], x[i])
 
 
-@compiled
-def nearest_in_pixels(
-    points: Floats, rows: NDArray[np.int64], low: float, rows_per_radian: float, height: int, width: int,
-    index: NDArray[np.int64], ranges: Floats,
-) -> None:  # fmt: skip
-    """Write the nearest of the points (M, 3) in each pixel (H * W,), -1 where there is none, and its range.
+class Raster(NamedTuple):
+    """The pixels of one range image, and which points they show.
 
-    Args:
-        points: those that are not finite or at the origin are left out.
-        rows: (M,) of the points where they are known, else empty: then they follow from elevations.
+    Attributes:
+        height, width: H and W; an image without rows is not made.
         low: elevation of the centre of row 0.
         rows_per_radian: of elevation.
-        height, width: H and W.
-        index: (H * W,), written.
-        ranges: (H * W,), written.
+        shown: (H * W,), written: the nearest point of each pixel, -1 where there is none.
+        ranges: (H * W,), written: its range; infinite where there is none.
     """
-    index[:] = -1
-    ranges[:] = np.inf
+
+    height: int
+    width: int
+    low: float
+    rows_per_radian: float
+    shown: NDArray[np.int64]
+    ranges: Floats
+
+
+@compiled
+def nearest_in_pixels(points: FloatArray | Floats, rows: NDArray[np.int64], first: Raster, second: Raster) -> None:
+    """Write the nearest of the points (M, 3) in each pixel of two images; of equally near ones, the first.
+
+    Both are made in one go because the angles take most of the time.
+
+    Args:
+        points: those that are not finite or at the origin are left out; taken in float32.
+        rows: (M,) of the points in the first image where they are known, else empty: then they follow from elevations.
+        first, second: the images.
+    """
+    for raster in (first, second):
+        raster.shown[:] = -1
+        raster.ranges[:] = np.inf
     x, y, z = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
     elevations, azimuths = np.empty(BLOCK), np.empty(BLOCK)
     distances = np.empty(BLOCK, dtype=np.float32)
+    pixels = np.empty(BLOCK, dtype=np.int64)
     for begin in range(0, len(points), BLOCK):
         size = min(BLOCK, len(points) - begin)
         for i in range(size):
-            a, b, c = points[begin + i, 0], points[begin + i, 1], points[begin + i, 2]
+            a, b, c = (
+                np.float32(points[begin + i, 0]),
+                np.float32(points[begin + i, 1]),
+                np.float32(points[begin + i, 2]),
+            )
             x[i], y[i], z[i] = a, b, c
             distances[i] = np.sqrt(a * a + b * b + c * c)
         write_angles(x[:size], y[:size], z[:size], elevations, azimuths)
+        _keep_nearest(begin, size, elevations, azimuths, distances, rows, first, pixels)
+        if second.height > 0:
+            _keep_nearest(begin, size, elevations, azimuths, distances, rows[:0], second, pixels)
+
+
+@compiled
+def _keep_nearest(
+    begin: int, size: int, elevations: FloatArray, azimuths: FloatArray, distances: Floats, rows: NDArray[np.int64],
+    raster: Raster, pixels: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Put a block of points into an image; `pixels` (256,) are room."""
+    height, width, low, per_radian = raster.height, raster.width, raster.low, raster.rows_per_radian
+    if len(rows) == 0:
         for i in range(size):
-            elevations[i] = row_of(elevations[i], low, rows_per_radian)
-            azimuths[i] = column_of(azimuths[i], width)
+            row = row_of(elevations[i], low, per_radian)
+            inside = row >= 0.0 and row < height and distances[i] > 0.0 and distances[i] < np.inf
+            pixels[i] = int(row) * width + int(column_of(azimuths[i], width)) if inside else -1
+    else:
         for i in range(size):
-            row, distance = elevations[i] if len(rows) == 0 else float(rows[begin + i]), distances[i]
-            if not (row >= 0.0 and row < height and distance > 0.0 and distance < np.inf):
-                continue
-            pixel = int(row) * width + int(azimuths[i])
-            if distance < ranges[pixel]:
-                index[pixel], ranges[pixel] = begin + i, distance
+            row = float(rows[begin + i])
+            inside = row >= 0.0 and row < height and distances[i] > 0.0 and distances[i] < np.inf
+            pixels[i] = int(row) * width + int(column_of(azimuths[i], width)) if inside else -1
+    shown, ranges = raster.shown, raster.ranges
+    for i in range(size):
+        pixel = pixels[i]
+        if pixel >= 0 and distances[i] < ranges[pixel]:
+            shown[pixel], ranges[pixel] = begin + i, distances[i]
+
+
+@compiled
+def write_pixels(
+    points: FloatArray | Floats, times: FloatArray, middle: float, shown: NDArray[np.int64], ranges: Floats,
+    image: Floats, offsets: Floats,
+) -> None:  # fmt: skip
+    """Write what the pixels show; zero where they show nothing.
+
+    Args:
+        points: (M, 3).
+        times: (M,) seconds, or empty where they are not known.
+        middle: of the sweep, seconds.
+        shown, ranges: (H * W,) as `nearest_in_pixels` wrote them.
+        image: (4, H * W) x, y, z and range, written.
+        offsets: (H * W,) seconds from the middle of the sweep, written.
+    """
+    timed = len(times) > 0
+    for pixel in range(len(shown)):
+        n = shown[pixel]
+        if n < 0:
+            image[0, pixel], image[1, pixel], image[2, pixel], image[3, pixel] = 0.0, 0.0, 0.0, 0.0
+            offsets[pixel] = 0.0
+            continue
+        image[0, pixel], image[1, pixel], image[2, pixel] = points[n, 0], points[n, 1], points[n, 2]
+        image[3, pixel] = ranges[pixel]
+        offsets[pixel] = times[n] - middle if timed else 0.0

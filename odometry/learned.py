@@ -1,34 +1,30 @@
-"""The learned odometry: a network's guess, laid on the previous scan by alignment, and how far to believe it.
+"""The learned odometry: the network's candidates, the best of them refined by alignment, with a covariance.
 
-Each scan is made into an image and encoded once. The network compares it with the one before; alignment refines its
-guess. Along directions of which the scans say nothing the motion goes on as before, less and less surely; the guess
-counts there only as long as nothing is known of the motion before. A pair that lies badly on one another is tried from
-the last motion as well, and reported as a failure when that does not help: what follows then goes on as it sees fit.
+Each scan is made into an image and encoded once. The network compares it with the one before; alignment chooses among
+its candidates and refines one. Along directions that the scans do not constrain the motion goes on as before, with a
+growing covariance; the candidate counts there only as long as no motion before is known. A pair of scans of which too
+little fits is tried from the last motion as well, and reported as a failure when that does not help.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, orthonormalize
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
-from odometry.alignment import Aligned, align
+from odometry.alignment import Aligned, Hypothesis, align
 from odometry.alignment_search import align_best
-from odometry.correlation import Estimate
+from odometry.candidates import Candidate, Described, Search
 from odometry.degeneracy import Expected, gone_on, holding, joined_information, left_open
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned_config import LearnedConfig
-from odometry.networks import PairNetwork
 from odometry.retiming import Retimer
-from odometry.sweep_images import Imager, middle_offset_s
-from odometry.sweeps import LastMotion, SweepImages, SweepPairs
+from odometry.sweep_images import Imager, ScanImages, middle_offset_s
+from odometry.sweeps import LastMotion, SweepImages, SweepPair
 
 # Where neither the images nor the network say anything a matrix still has an inverse.
 _LEAST_INFORMATION = 1e-6
@@ -60,44 +56,44 @@ class _Laid:
 class _Sweep:
     """A scan as the network and alignment know it; `middle` is the instant of the sweep's middle, seconds."""
 
-    images: SweepImages
-    features: Tensor
+    images: ScanImages
+    described: Described
     stamp: float
     middle: float
 
     def state(self) -> State:
-        """All of it."""
-        tensors = {**vars(self.images), "features": self.features}
-        arrays = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
-        return {**arrays, "stamp": self.stamp, "middle": self.middle}
+        """All but what follows from it."""
+        images = {"network": dict(vars(self.images.network)), "alignment": dict(vars(self.images.alignment))}
+        return {**images, "heading": self.described.heading, "stamp": self.stamp, "middle": self.middle}
 
     @classmethod
-    def restored(cls, saved: Saved, device: str) -> "_Sweep":
+    def restored(cls, saved: Saved, search: Search) -> "_Sweep":
         """The sweep with a state."""
+        images = ScanImages(_images(saved.part("network")), _images(saved.part("alignment")))
+        shown = images.network
+        described = search.describe(shown.points, shown.normals, saved.number("heading"))
+        return cls(images, described, saved.number("stamp"), saved.number("middle"))
 
-        def tensor(name: str, *shape: int | None) -> Tensor:
-            return torch.from_numpy(saved.array(name, shape, np.float32)).to(device)
 
-        points = tensor("points", 1, 3, None, None)
-        height, width = points.shape[2:]
-        offsets, normals = tensor("offsets", 1, height, width), tensor("normals", 1, 3, height, width)
-        images = SweepImages(points, normals, offsets, tensor("low", 1), tensor("high", 1))
-        features = tensor("features", 1, None, None, None)
-        return cls(images, features, saved.number("stamp"), saved.number("middle"))
+def _images(saved: Saved) -> SweepImages:
+    points = saved.array("points", (3, None, None), np.float32)
+    offsets = saved.array("offsets", points.shape[1:], np.float32)
+    normals = saved.array("normals", points.shape, np.float32)
+    return SweepImages(points, normals, offsets, saved.number("low"), saved.number("high"))
 
 
 class LearnedOdometry:
     """Motions between consecutive scans from a trained network.
 
     Args:
-        network: trained, in evaluation mode.
+        search: finds candidates with the trained network.
         images: how its images are made.
         config: how its answers are refined and judged.
     """
 
-    def __init__(self, network: PairNetwork, images: ImageConfig, config: LearnedConfig) -> None:
-        self._network = network
-        self._imager = Imager(images, config.device)
+    def __init__(self, search: Search, images: ImageConfig, config: LearnedConfig) -> None:
+        self._search = search
+        self._imager = Imager(images, config.alignment_rows)
         self._config = config
         self._last: _Sweep | None = None
         self._way = Retimer()
@@ -107,8 +103,7 @@ class LearnedOdometry:
         """The motion since the last scan that had points."""
         if not len(scan):
             return Motion(np.eye(4), 0, "the scan is empty")
-        with torch.inference_mode(), _threads(self._config.threads):
-            return self._estimate(self._sweep(scan))
+        return self._estimate(scan)
 
     def state(self) -> State:
         """The last sweep, the rows of images, and the motion up to there with its covariance."""
@@ -122,7 +117,7 @@ class LearnedOdometry:
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state, before the first scan."""
-        self._last = saved.optional("last", lambda last: _Sweep.restored(last, self._config.device))
+        self._last = saved.optional("last", lambda last: _Sweep.restored(last, self._search))
         self._imager.restore(saved.part("imager"))
         self._way.restore(saved.part("way"))
         self._last_covariance = saved.optional_array("covariance", (6, 6))
@@ -130,66 +125,57 @@ class LearnedOdometry:
     def close(self) -> None:
         """Nothing is held."""
 
-    def _sweep(self, scan: Scan) -> _Sweep:
-        images = self._imager.images([scan])
-        with torch.autocast(images.points.device.type, torch.bfloat16, enabled=self._config.bfloat16):
-            features = self._network.encode(images.points, images.normals)
-        return _Sweep(images, features.float(), scan.stamp, scan.stamp + middle_offset_s(scan))
-
-    def _estimate(self, sweep: _Sweep) -> Motion:
-        last, self._last = self._last, sweep
-        if last is None:
-            return Motion(np.eye(4), int((sweep.images.normals != 0.0).any(1).sum()))
-        interval_s = sweep.middle - last.middle
-        if interval_s <= 0.0:
+    def _estimate(self, scan: Scan) -> Motion:
+        images, middle, last = self._imager.images(scan), scan.stamp + middle_offset_s(scan), self._last
+        shown = images.network
+        interval_s = 0.0 if last is None else middle - last.middle
+        if last is None or interval_s <= 0.0:
+            self._last = _Sweep(images, self._search.describe(shown.points, shown.normals), scan.stamp, middle)
+            if last is None:
+                return Motion(np.eye(4), int((images.alignment.normals != 0.0).any(axis=0).sum()))
             return Motion(np.eye(4), 0, "the scan is not later than the one before")
-        guess = self._network(last.features, sweep.features)
-        if not _is_finite(guess):
+        candidates, described = self._search.compare(last.described, shown.points, shown.normals)
+        self._last = sweep = _Sweep(images, described, scan.stamp, middle)
+        if not all(candidate.is_motion() for candidate in candidates):
             self._forget()
             return Motion(np.eye(4), 0, "the network's answer is not a motion; try other weights")
-        laid = self._align(guess, last, sweep, interval_s)
-        aligned = laid.aligned
-        T_prev_curr = orthonormalize(_array(aligned.T_prev_curr[0]))
-        matched, explained = int(aligned.matched), float(aligned.explained)
+        laid = self._align(candidates, last, sweep, interval_s)
+        T_prev_curr = orthonormalize(laid.aligned.T_prev_curr)
+        matched, explained, bend = laid.aligned.matched, laid.aligned.explained, laid.aligned.bend
         if explained < self._config.least_explained or matched < self._config.least_points:
             self._forget()
             return Motion(np.eye(4), 0, f"the scan does not fit the last one: {_misfit(matched, explained)}")
-        bend = _array(aligned.bend[0])
         left = np.asarray(np.linalg.inv(laid.information + _LEAST_INFORMATION * np.eye(6)), dtype=np.float64)
         self._last_covariance, covariance = left, _covariance(T_prev_curr, left, bend * interval_s)
         stamps = (last.stamp, sweep.stamp)
         motion = self._way.between_stamps(T_prev_curr, bend, (last.middle, sweep.middle), stamps)
         return Motion(motion, matched, covariance=covariance, degenerate=laid.degeneracy.names)
 
-    def _align(self, guess: Estimate, last: _Sweep, sweep: _Sweep, interval_s: float) -> _Laid:
-        """From the network's guess, or going on as before, or further afield."""
-        caution = guess.log_sigma.new_tensor([self._config.turn_caution] * 3 + [self._config.caution] * 3)
-        information = torch.diag_embed((caution * guess.log_sigma.exp()) ** -2)
-        guesses = guess.T_prev_curr
-        expected = self._expected(interval_s)
-        interval, before = guesses.new_tensor([interval_s]), None
-        if self._way.last is not None and expected is not None:
-            velocity = torch.from_numpy(self._way.last.velocity).to(guesses)[None]
-            before = LastMotion(velocity, guesses.new_tensor([self._way.last.interval_s]))
-            guesses = torch.cat([guesses, torch.from_numpy(expected.T_prev_curr).to(guesses)[None]])
-        sweeps = SweepPairs(sweep.images, last.images, interval, before)
-        aligned, is_guessed = align_best(guesses, sweeps, self._config.alignment, information)
-        degeneracy = left_open(_array(aligned.information[0]), int(aligned.matched), sweep.images)
+    def _align(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep, interval_s: float) -> _Laid:
+        """From the network's candidates, or going on as before, or further afield."""
+        hypotheses = [Hypothesis(one.T_prev_curr, np.linalg.inv(one.covariance)) for one in candidates]
+        expected, leg, before = self._expected(interval_s), self._way.last, None
+        if leg is not None and expected is not None:
+            before = LastMotion(leg.velocity, leg.interval_s)
+            hypotheses.append(Hypothesis(expected.T_prev_curr))
+        sweeps = SweepPair(sweep.images.alignment, last.images.alignment, interval_s, before)
+        aligned, chosen = align_best(hypotheses, sweeps, self._config.alignment)
+        degeneracy = left_open(aligned.information, aligned.matched, sweep.images.alignment)
         if len(degeneracy) and expected is not None:
             return self._go_on(aligned, degeneracy, expected, sweeps)
         seen = self._seen(aligned)
-        return _Laid(aligned, seen + _array(information[0]) if is_guessed else seen, degeneracy)
+        told = None if chosen is None else chosen.information
+        return _Laid(aligned, seen if told is None else seen + told, degeneracy)
 
-    def _go_on(self, aligned: Aligned, degeneracy: Degeneracy, expected: Expected, sweeps: SweepPairs) -> _Laid:
+    def _go_on(self, aligned: Aligned, degeneracy: Degeneracy, expected: Expected, sweeps: SweepPair) -> _Laid:
         """As expected along the open directions, and as aligned across them."""
-        like = aligned.T_prev_curr
-        motion = gone_on(_array(like[0]), expected.T_prev_curr, degeneracy)
-        held = torch.from_numpy(holding(degeneracy))[None]
-        aligned = align(torch.from_numpy(motion).to(like)[None], sweeps, self._config.alignment, held, held)
+        motion = gone_on(aligned.T_prev_curr, expected.T_prev_curr, degeneracy)
+        held = holding(degeneracy)
+        aligned = align(Hypothesis(motion, held, held), sweeps, self._config.alignment)
         return _Laid(aligned, joined_information(self._seen(aligned), expected.covariance, degeneracy), degeneracy)
 
     def _seen(self, aligned: Aligned) -> FloatArray:
-        return _array(aligned.information[0]) * self._config.alignment.information_per_m2
+        return aligned.information * self._config.alignment.information_per_m2
 
     def _expected(self, interval_s: float) -> Expected | None:
         """The motion that goes on as before; None where nothing is known of that."""
@@ -207,16 +193,6 @@ class LearnedOdometry:
         self._last_covariance = None
 
 
-def _array(values: Tensor) -> FloatArray:
-    return values.double().numpy(force=True)
-
-
-def _is_finite(guess: Estimate) -> bool:
-    """Whether a motion follows from the guess; weights can be finite, and what they make of a scan is not."""
-    information = (-2.0 * guess.log_sigma).exp()
-    return bool(guess.T_prev_curr.isfinite().all() and information.isfinite().all() and (information > 0.0).all())
-
-
 def _misfit(matched: int, explained: float) -> str:
     return f"{matched} points do, which is {100.0 * explained:.0f} % of what it says of one direction"
 
@@ -231,14 +207,3 @@ def _covariance(T_prev_curr: FloatArray, left: FloatArray, bent: FloatArray) -> 
     covariance = A @ left @ A.T + np.diag(_LEAST_SIGMA**2)
     covariance[3:, 3:] += np.eye(3) * (_HELD_BACK * np.linalg.norm(T_prev_curr[:3, 3])) ** 2
     return np.asarray(covariance + np.diag((_HIDDEN_SHARE * bent) ** 2), dtype=np.float64)
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """So many threads for torch: with mapping at work beside it, more would wait for one another."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

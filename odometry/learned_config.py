@@ -13,16 +13,16 @@ class LearnedConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     weights: Path | None = Field(
-        None, description="a .safetensors file of `lidarslam train`; null: those that come along"
+        None,
+        description="a .safetensors file of `lidarslam train`, or a folder of `lidarslam export`, which starts faster;"
+        " null: those that come along",
     )
     device: str = Field("cpu", min_length=1, description="torch's name of the device, such as cpu or cuda")
-    threads: int = Field(1, ge=1, description="of torch; mapping works beside it")
-    bfloat16: bool = Field(False, description="encode with half the digits, where the device is faster so")
-    alignment: AlignmentConfig = AlignmentConfig(column_step=3)
-    caution: float = Field(
-        4.0, gt=0.0, description="factor on the network's standard deviations, so that alignment leads where it can"
+    threads: int = Field(1, ge=1, description="of the network; mapping works beside it")
+    alignment_rows: int | None = Field(
+        None, ge=4, le=256, description="null: as many as the sensor has rings, 16 to 64"
     )
-    turn_caution: float = Field(8.0, gt=0.0, description="and on those of the rotation")
+    alignment: AlignmentConfig = AlignmentConfig(column_step=3)
     least_explained: float = Field(
         0.3, ge=0.0, le=1.0, description="of what a scan says that must agree with the last one for it to be believed"
     )

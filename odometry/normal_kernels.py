@@ -1,4 +1,4 @@
-"""The loops over pixels and their neighbourhoods behind `odometry.normals` on a processor, compiled."""
+"""The loops over pixels and their neighbourhoods behind `odometry.normals`, compiled."""
 
 import math
 from typing import NamedTuple
@@ -11,8 +11,13 @@ from lidarslam.core.compiled import compiled
 Floats = NDArray[np.float32]
 
 _TINY = 1e-30
+# A neighbourhood that is narrower than this share of its range is narrower than the rounding of its coordinates.
 _NARROWEST = 1e-5
+# Range noise spreads the points of a single ring over a plane that holds the rays themselves. Such a plane, 2.3
+# degrees or less from the ray, says nothing of the surface, and which of its sides faces the sensor is chance.
 _MOST_GRAZING = 0.04
+# Pixels that are worked on together, so that the processor takes several at once.
+BLOCK = 256
 
 
 class Neighbourhood(NamedTuple):
@@ -28,59 +33,136 @@ class Neighbourhood(NamedTuple):
 
 
 @compiled
-def planes(image: Floats, padded: Floats, taken: NDArray[np.bool_], around: Neighbourhood, normals: Floats) -> None:
+def pad(image: Floats, rows: int, columns: int, padded: Floats) -> None:
+    """Write an image (4, H, W) with rows above and below, and columns that go on round; empty is infinitely far."""
+    height, width = image.shape[1:]
+    padded[:3, :rows], padded[3, :rows] = 0.0, np.inf
+    padded[:3, rows + height :], padded[3, rows + height :] = 0.0, np.inf
+    for channel in range(4):
+        for i in range(height):
+            row = padded[channel, rows + i]
+            row[columns : columns + width] = image[channel, i]
+            row[:columns] = image[channel, i, width - columns :]
+            row[columns + width :] = image[channel, i, :columns]
+    for i in range(height):
+        ranges = padded[3, rows + i]
+        for j in range(len(ranges)):
+            ranges[j] = ranges[j] if ranges[j] > 0.0 else np.inf
+
+
+@compiled
+def planes(padded: Floats, margin: int, around: Neighbourhood, normals: Floats) -> None:
     """Write unit normals (3, H, W) that face the sensor, of pixels that have none yet and lie on a plane.
 
     Args:
-        image: (4, H, W) of x, y, z and range; zero where empty.
-        padded: (4, H + 2 rows, W + 2 columns), the same with what lies beyond its borders; infinitely far where empty.
-        taken: (H, W) pixels that are left as they are.
+        padded: (4, H + 2 rows, W + 2 margin) of x, y, z and range, with what lies beyond the image's borders;
+            infinitely far where empty.
+        margin: columns to either side, no fewer than those of the neighbourhood.
         around: the neighbourhood.
         normals: written.
     """
-    height, width = image.shape[1:]
-    sums = np.empty(11, dtype=np.float32)
+    height, width = normals.shape[1:]
+    wanted, sums = np.empty(width, dtype=np.int64), np.empty((11, BLOCK), dtype=np.float32)
+    centre, neighbours = np.empty((4, BLOCK), dtype=np.float32), np.empty((4, BLOCK), dtype=np.float32)
     for i in range(height):
+        count, ranges = 0, padded[3, i + around.rows]
         for j in range(width):
-            if taken[i, j] or not image[3, i, j] > 0.0:
-                continue
-            _scatter(image, padded, i, j, around, sums)
-            x, y, z = _normal(image[0, i, j], image[1, i, j], image[2, i, j], image[3, i, j], sums, around)
-            normals[0, i, j], normals[1, i, j], normals[2, i, j] = x, y, z
+            if ranges[margin + j] < np.inf and not (normals[0, i, j] or normals[1, i, j] or normals[2, i, j]):
+                wanted[count] = margin + j
+                count += 1
+        for begin in range(0, count, BLOCK):
+            block = wanted[begin : min(begin + BLOCK, count)]
+            _scatter(padded, i, block, around, centre, neighbours, sums)
+            for k in range(len(block)):
+                j = block[k] - margin
+                normals[0, i, j], normals[1, i, j], normals[2, i, j] = _normal(centre[:, k], sums[:, k], around)
 
 
 @compiled
-def _scatter(image: Floats, padded: Floats, i: int, j: int, around: Neighbourhood, sums: Floats) -> None:
-    """Write what the neighbours of a pixel are like, about the pixel itself: coordinates of tens of metres would leave
-    no digits to float32.
+def _scatter(
+    padded: Floats, i: int, block: NDArray[np.int64], around: Neighbourhood, centre: Floats, neighbours: Floats,
+    sums: Floats,
+) -> None:  # fmt: skip
+    """Write what the neighbours of the pixels of a block, all of row i, are like, about the pixel itself.
 
-    Entries of `sums` (11,): number, squared distance of the nearest, sums of x, y, z, xx, yy, zz, xy, yz, xz.
+    Coordinates of tens of metres would leave no digits to float32.
+
+    Rows of `sums` (11, 256): number, squared distance of the nearest, sums of x, y, z, xx, yy, zz, xy, yz, xz. Each
+    neighbour is added for the whole block, so that the processor takes several pixels at once.
     """
-    cx, cy, cz, centre, gate_m = image[0, i, j], image[1, i, j], image[2, i, j], image[3, i, j], around.gate_m
-    zero = np.float32(0.0)
-    count, nearest, sx, sy, sz = 0, np.float32(np.inf), zero, zero, zero
-    xx, yy, zz, xy, yz, xz = zero, zero, zero, zero, zero, zero
-    for down in range(i, i + 2 * around.rows + 1):
-        for right in range(j, j + 2 * around.columns + 1):
-            if not abs(padded[3, down, right] - centre) <= gate_m:
-                continue
-            x, y, z = padded[0, down, right] - cx, padded[1, down, right] - cy, padded[2, down, right] - cz
-            x2, y2, z2 = x * x, y * y, z * z
-            if (down != i + around.rows or right != j + around.columns) and x2 + y2 + z2 < nearest:
-                nearest = x2 + y2 + z2
-            count += 1
-            sx, sy, sz = sx + x, sy + y, sz + z
-            xx, yy, zz = xx + x2, yy + y2, zz + z2
-            xy, yz, xz = xy + x * y, yz + y * z, xz + x * z
-    sums[0], sums[1], sums[2], sums[3], sums[4] = count, nearest, sx, sy, sz
-    sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = xx, yy, zz, xy, yz, xz
+    size = len(block)
+    for channel in range(4):
+        _gather(padded[channel, i + around.rows], block, 0, centre[channel])
+    sums[:] = 0.0
+    sums[1] = np.inf
+    gate_m = np.float32(around.gate_m)
+    for down in range(2 * around.rows + 1):
+        for right in range(-around.columns, around.columns + 1):
+            for channel in range(4):
+                _gather(padded[channel, i + down], block, right, neighbours[channel])
+            x, y, z = neighbours[0], neighbours[1], neighbours[2]
+            _differences(size, gate_m, centre, neighbours)
+            if down != around.rows or right != 0:
+                _keep_least(size, neighbours, sums[1])
+            near = neighbours[3]
+            _add(size, near, sums[0])
+            _add(size, x, sums[2])
+            _add(size, y, sums[3])
+            _add(size, z, sums[4])
+            _add_product(size, x, x, sums[5])
+            _add_product(size, y, y, sums[6])
+            _add_product(size, z, z, sums[7])
+            _add_product(size, x, y, sums[8])
+            _add_product(size, y, z, sums[9])
+            _add_product(size, x, z, sums[10])
 
 
 @compiled
-def _normal(
-    x: float, y: float, z: float, distance: float, sums: Floats, around: Neighbourhood
-) -> tuple[float, float, float]:
-    """The normal of a pixel that has these neighbours; zero if they lie on no plane."""
+def _gather(row: Floats, block: NDArray[np.int64], right: int, values: Floats) -> None:
+    for k in range(len(block)):
+        values[k] = row[block[k] + right]
+
+
+@compiled
+def _differences(size: int, gate_m: np.float32, centre: Floats, neighbours: Floats) -> None:
+    """Make neighbours differences to the centre, zero where they are not near; their ranges become 1 where they are."""
+    x, y, z, distance = neighbours[0], neighbours[1], neighbours[2], neighbours[3]
+    cx, cy, cz, middle = centre[0], centre[1], centre[2], centre[3]
+    for k in range(size):
+        distance[k] = np.float32(1.0) if abs(distance[k] - middle[k]) <= gate_m else np.float32(0.0)
+    for k in range(size):
+        x[k] = (x[k] - cx[k]) * distance[k]
+    for k in range(size):
+        y[k] = (y[k] - cy[k]) * distance[k]
+    for k in range(size):
+        z[k] = (z[k] - cz[k]) * distance[k]
+
+
+@compiled
+def _keep_least(size: int, neighbours: Floats, nearest: Floats) -> None:
+    x, y, z, near = neighbours[0], neighbours[1], neighbours[2], neighbours[3]
+    for k in range(size):
+        squared = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
+        squared = squared if near[k] > 0.0 else np.float32(np.inf)
+        nearest[k] = squared if squared < nearest[k] else nearest[k]
+
+
+@compiled
+def _add(size: int, values: Floats, total: Floats) -> None:
+    for k in range(size):
+        total[k] += values[k]
+
+
+@compiled
+def _add_product(size: int, values: Floats, others: Floats, total: Floats) -> None:
+    for k in range(size):
+        total[k] += values[k] * others[k]
+
+
+@compiled
+def _normal(centre: Floats, sums: Floats, around: Neighbourhood) -> tuple[float, float, float]:
+    """The normal of a pixel (4,) that has these neighbours; zero if they lie on no plane."""
+    x, y, z, distance = centre[0], centre[1], centre[2], centre[3]
     none = 0.0, 0.0, 0.0
     count = np.float64(sums[0])
     if count < around.min_neighbours or sums[1] > around.most_apart_m**2:
@@ -93,7 +175,8 @@ def _normal(
     if not size > _TINY:
         return none
     xx, yy, zz, xy, yz, xz = xx / size, yy / size, zz / size, xy / size, yz / size, xz / size
-    # Eigenvalues after Smith, 1961, as in `odometry.normals`.
+    # Smith, "Eigenvalues of a symmetric 3 x 3 matrix", 1961. Where the two larger ones are nearly equal their
+    # difference is inexact, but not the smallest.
     a, b, c = xx - 1.0 / 3.0, yy - 1.0 / 3.0, zz - 1.0 / 3.0
     radius = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + yz * yz + xz * xz)) / 6.0)
     determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)

@@ -10,9 +10,9 @@ from torch.nn import functional
 from odometry import bird_eye
 from odometry.correlation import Estimate
 from odometry.losses import Surfaces, geometric_loss
-from odometry.normals import has_normal
 from odometry.pairs import PairBatch
 from odometry.torch_geometry import inverse, log
+from odometry.torch_images import has_normal
 from odometry.training_config import TrainingConfig
 
 # Errors are squared up to this size, a degree and five centimetres, where they cost a half; beyond they cost linearly.

@@ -8,8 +8,8 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
+from odometry.candidates import Candidate, CorrelationSearch, Described, Search
 from odometry.exported import BIRD, COLUMNS, PAIR, PEAKS, TURNS, Exported
-from odometry.hypotheses import CorrelationSearch, Described, Hypothesis, Search
 
 Floats = NDArray[np.float32]
 
@@ -17,7 +17,7 @@ _ERRORS_ONLY = 3
 
 
 class OnnxGraphs:
-    """The parts of the network `correlation`; implements `odometry.hypotheses.Graphs`.
+    """The parts of the network `correlation`; implements `odometry.candidates.Graphs`.
 
     Args:
         folder: that the graphs lie in.
@@ -51,7 +51,7 @@ class OnnxGraphs:
 
 
 class OnnxPairs:
-    """A network of pairs, with its one motion as the only hypothesis; implements `Search`."""
+    """A network of pairs, with its one motion as the only candidate; implements `Search`."""
 
     def __init__(self, folder: Path, threads: int) -> None:
         self._pairs = _session(folder / PAIR, threads)
@@ -60,16 +60,16 @@ class OnnxPairs:
         """The image itself."""
         return Described(np.concatenate([points, normals])[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
 
-    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Hypothesis, ...], Described]:
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
         """See `Search`."""
         current = self.describe(points, normals)
         T_prev_curr, log_sigma = _run(self._pairs, previous=previous.columns, current=current.columns)
         variances = np.exp(2.0 * log_sigma[0].astype(np.float64))
-        return (Hypothesis(T_prev_curr[0].astype(np.float64), np.diag(variances), 0.0),), current
+        return (Candidate(T_prev_curr[0].astype(np.float64), np.diag(variances), 0.0),), current
 
 
 def onnx_search(exported: Exported, threads: int) -> Search:
-    """The search for hypotheses that an exported network is made for.
+    """The search for candidates that an exported network is made for.
 
     Raises:
         InputError: its graphs cannot be used.

@@ -1,7 +1,4 @@
-"""The loops over pairs of points and planes behind alignment on a processor, compiled.
-
-What they compute is said where torch does it for batches on any device: `odometry.pairing` and `odometry.pair_sums`.
-"""
+"""The loops over pairs of points and planes behind alignment, compiled; `odometry.pair_sums` says what they sum up."""
 
 import math
 from typing import NamedTuple
@@ -25,13 +22,10 @@ class Sweep(NamedTuple):
     """Points that are held against an image.
 
     Attributes:
-        points, normals: (N, 3).
-        offsets: (N,) seconds from the middle of the sweep.
+        points: (N, 7) point, normal and seconds from the middle of the sweep.
     """
 
     points: Floats
-    normals: Floats
-    offsets: Floats
 
 
 class Planes(NamedTuple):
@@ -69,7 +63,16 @@ class Motion(NamedTuple):
 
 
 class Held(NamedTuple):
-    """A block of points held against planes, as `odometry.pairing.Pairs` has them; each (256,)."""
+    """A block of points held against planes, each (256,).
+
+    Attributes:
+        x, y, z: points in the frame of the previous sweep at the time of their pixel.
+        u, v, w: normals of the planes.
+        residuals: distances from the planes, metres.
+        offsets_s: of both times from the middles of their sweeps together: what a bend shifts them by.
+        inside: in view of the previous sweep.
+        kept: near enough to their pixel, and turned like it.
+    """
 
     x: FloatArray
     y: FloatArray
@@ -84,8 +87,27 @@ class Held(NamedTuple):
 
 
 @compiled
+def sample(points: Floats, normals: Floats, offsets: Floats, step: int, chosen: Floats) -> int:
+    """Write every so-manieth pixel of each row that has a normal, (N, 7) as of `Sweep`, and tell how many they are."""
+    height, width = offsets.shape
+    count = 0
+    for i in range(height):
+        for j in range(0, width, step):
+            u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
+            if u * u + v * v + w * w > 0.5:
+                point = chosen[count]
+                point[0], point[1], point[2] = points[0, i, j], points[1, i, j], points[2, i, j]
+                point[3], point[4], point[5], point[6] = u, v, w, offsets[i, j]
+                count += 1
+    return count
+
+
+@compiled
 def fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels: Floats) -> None:
-    """Write the pixels (H * W, 7) of images (3, H, W), (3, H, W), (H, W); see `odometry.pairing.filled`."""
+    """Write the pixels (H * W, 7) of images (3, H, W), (3, H, W), (H, W).
+
+    Those without a normal stand for the nearest in their row that has one, up to so many columns away.
+    """
     height, width = offsets.shape
     for i in range(height):
         for j in range(width):
@@ -105,7 +127,9 @@ def fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels:
 
 @compiled
 def _compensate(x: float, y: float, z: float, t: float, velocity: FloatArray) -> tuple[float, float, float]:
-    """A point as seen from the middle of the sweep, t seconds before it was measured; see `odometry.sweeps`."""
+    """A point as seen from the middle of the sweep, t seconds before it was measured, for a body that moves
+    evenly: the exponential map to second order.
+    """
     a, b, c = velocity[0], velocity[1], velocity[2]
     u = b * z - c * y + velocity[3]
     v = c * x - a * z + velocity[4]
@@ -138,11 +162,17 @@ def _place(
 def _hold(
     begin: int, size: int, sweep: Sweep, planes: Planes, motion: Motion, scale_m: float, gates: Gates, held: Held
 ) -> None:
-    """Hold a block of points against the planes of the pixels that they fall into; see `odometry.pairing.pair`."""
+    """Hold a block of points against the planes of the pixels that they fall into.
+
+    The time is that of the pixel they would fall into if nothing moved within the previous sweep, which is right but
+    for its seam. What lies farther along the surface than pixels are wide is another surface seen past an edge. On
+    ground that the beams graze, pixels are metres wide; were they not, rings, which go along with the sensor, would
+    hold it back.
+    """
     T, angles, pixels = motion.T, (np.empty(BLOCK), np.empty(BLOCK)), np.empty(BLOCK, dtype=np.int64)
     for i in range(size):
         n = begin + i
-        a, b, c, t = sweep.points[n, 0], sweep.points[n, 1], sweep.points[n, 2], np.float64(sweep.offsets[n])
+        a, b, c, t = sweep.points[n, 0], sweep.points[n, 1], sweep.points[n, 2], np.float64(sweep.points[n, 6])
         x, y, z = _compensate(np.float64(a), np.float64(b), np.float64(c), t, motion.late)
         held.x[i] = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
         held.y[i] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
@@ -163,7 +193,7 @@ def _hold(
         squared = x * x + y * y + z * z
         across = max(abs(x * u + y * v + z * w), _MOST_GRAZING * math.sqrt(squared))
         gate = gates.gate_m + gates.gate_share * squared / max(across, 1e-6) + scale_m
-        a, b, c = sweep.normals[n, 0], sweep.normals[n, 1], sweep.normals[n, 2]
+        a, b, c = sweep.points[n, 3], sweep.points[n, 4], sweep.points[n, 5]
         cosine = (
             (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c) * u
             + (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c) * v
@@ -223,7 +253,7 @@ def judge(
             if not held.inside[i]:
                 continue
             seen += 1
-            a, b, c = sweep.normals[begin + i, 0], sweep.normals[begin + i, 1], sweep.normals[begin + i, 2]
+            a, b, c = sweep.points[begin + i, 3], sweep.points[begin + i, 4], sweep.points[begin + i, 5]
             for j in range(3):
                 turned[j] = motion.T[j, 0] * a + motion.T[j, 1] * b + motion.T[j, 2] * c
             _add_square(turned, in_view)

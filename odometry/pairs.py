@@ -11,10 +11,9 @@ from torch import Generator, Tensor
 
 from odometry.bird_eye import bird_eye
 from odometry.correlation import PairImages
-from odometry.preparation import PreparedRecording, compensated
-from odometry.projection import mirror, rotate_columns
-from odometry.sweeps import SweepImages
+from odometry.preparation import PreparedRecording
 from odometry.torch_geometry import inverse, log, turn_about_z
+from odometry.torch_images import RecordedImages, compensated, mirror, rotate_columns
 from odometry.training_config import AugmentationConfig
 
 # A prime that keeps the random streams of steps and processes apart.
@@ -158,7 +157,7 @@ def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces:
 def _compensated(recording: PreparedRecording, scan: int) -> Tensor:
     """(1, 6, H, W) a scan as seen from the middle of its sweep."""
     images = recording.images.select(slice(scan, scan + 1))
-    images = SweepImages(images.points, images.normals.float(), images.offsets.float(), images.low, images.high)
+    images = RecordedImages(images.points, images.normals.float(), images.offsets.float(), images.low, images.high)
     still = compensated(images, _velocity(recording, scan)[None])
     return torch.cat([still.points, still.normals], dim=1)
 

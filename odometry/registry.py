@@ -1,7 +1,5 @@
 """Which odometry methods there are; a method's module is imported when it is chosen."""
 
-from typing import cast
-
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
 from odometry.config import OdometryConfig
@@ -39,15 +37,22 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
 
 
 def _make_learned(config: LearnedConfig) -> Odometry:
-    from odometry.checkpoint import default_weights, load_checkpoint, network_of
+    """By ONNX Runtime, which starts at once; by torch with a file of weights, or on an accelerator."""
     from odometry.learned import LearnedOdometry
-    from odometry.networks import PairNetwork
+
+    if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
+        from odometry.exported import read_exported, shipped_folder
+        from odometry.onnx_graphs import onnx_search
+
+        exported = read_exported(config.weights or shipped_folder())
+        return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config)
+    from odometry.checkpoint import default_weights, load_checkpoint, network_of
+    from odometry.torch_graphs import torch_search
 
     checkpoint = load_checkpoint(config.weights or default_weights())
-    network = network_of(checkpoint)
     try:
-        network = network.to(config.device)
+        search = torch_search(network_of(checkpoint), config.device, config.threads)
     except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts that it has it
         reason = str(error).splitlines()[0]
         raise ConfigError(f"odometry.learned.device={config.device}: torch cannot use it ({reason})") from error
-    return LearnedOdometry(cast(PairNetwork, network), checkpoint.images, config)
+    return LearnedOdometry(search, checkpoint.images, config)

@@ -1,77 +1,119 @@
 """From scans to the images that network and alignment work on."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from odometry.image_config import ImageConfig
 from odometry.normals import surface_normals
-from odometry.projection import ImageGrid, project
+from odometry.projection import ImageGrid, Points, Projection, project_sweep
 from odometry.sweeps import SweepImages
 
 # A scan of fewer points, as of a covered sensor, does not tell which elevations the sensor sees.
 _ENOUGH_POINTS = 200
+# What alignment gets at most. Finer sensors have rings closer together than their points scatter.
+_MOST_ROWS = 64
+# Numbers of rows that are tried where they are not known, the finest first.
+_ROWS = (64, 48, 32)
+# Pixels filled in as many rows, as a share of those filled in the network's, that make them the sensor's own.
+_FILLED, _FILLED_BY_RINGS = 0.8, 0.5
+# Part of the columns in which a sensor that turns sees something. The points of one that does not lie in no rows.
+_SEEN_COLUMNS = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class ScanImages:
+    """A scan as it is shown to the network and to alignment; both may be shown the same."""
+
+    network: SweepImages
+    alignment: SweepImages
 
 
 class Imager:
-    """Makes images of one sensor's scans; the rows' elevations are those of the first scan with points enough.
+    """Makes images of one sensor's scans; the rows are those of the first scan with points enough.
 
-    Until there is one, they are those of the scan that had most.
+    Until there is one, they are those of the scan that had most. The network's images are always of the same size;
+    alignment sees as many rows as the sensor has, because an image that shows the nearest point of several rings holds
+    it back along the way.
+
+    Args:
+        config: of the network's images.
+        alignment_rows: of alignment's; None: as many as the sensor has rings, from those of the network to 64.
     """
 
-    def __init__(self, config: ImageConfig, device: torch.device | str = "cpu") -> None:
+    def __init__(self, config: ImageConfig, alignment_rows: int | None = None) -> None:
         self._config = config
-        self._device = torch.device(device)
+        self._asked_rows = alignment_rows
         self._grid: ImageGrid | None = None
+        self._alignment_rows = config.rows
         self._grid_points = 0  # of the scan that the grid is from
 
     def state(self) -> State:
-        """The elevations of the rows, and how many points they are from."""
+        """The elevations of the rows, how many alignment sees, and how many points they are from."""
         grid = self._grid
         limits = None if grid is None else {"low": grid.elevation_low, "high": grid.elevation_high}
-        return {"limits": limits, "points": self._grid_points}
+        return {"limits": limits, "alignment_rows": self._alignment_rows, "points": self._grid_points}
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state."""
         self._grid = saved.optional("limits", self._grid_between)
+        self._alignment_rows = saved.integer("alignment_rows")
         self._grid_points = saved.integer("points")
 
     def _grid_between(self, limits: Saved) -> ImageGrid:
         low, high = limits.number("low"), limits.number("high")
         return ImageGrid(self._config.rows, self._config.columns, low, high)
 
-    def images(self, scans: Sequence[Scan]) -> SweepImages:
-        """The scans as images, normals included."""
-        made = [self._image(scan) for scan in scans]
-        images = torch.stack([image for image, _, _ in made])  # (B, 4, H, W)
-        normals = surface_normals(images, self._config.normals)
-        limits = images.new_tensor([(grid.elevation_low, grid.elevation_high) for _, _, grid in made])  # (B, 2)
+    def images(self, scan: Scan) -> ScanImages:
+        """The scan as images, normals included."""
+        grid = self._grid_of(scan)
+        rings = scan.rings if self._config.order == "ring" else None
+        times, middle = scan.time_offsets, middle_offset_s(scan)
+        if self._alignment_rows == grid.rows:
+            (projection,) = project_sweep(scan.points, times, middle, (grid,), rings)
+            images = self._with_normals(projection, grid)
+            return ScanImages(images, images)
+        fine = ImageGrid(self._alignment_rows, grid.columns, grid.elevation_low, grid.elevation_high)
+        shown = project_sweep(scan.points, times, middle, (grid, fine), rings)
+        return ScanImages(*(self._with_normals(*each) for each in zip(shown, (grid, fine), strict=True)))
+
+    def _with_normals(self, projection: Projection, grid: ImageGrid) -> SweepImages:
+        normals = surface_normals(projection.image, self._config.normals)
         return SweepImages(
-            images[:, :3].contiguous(), normals, torch.stack([offsets for _, offsets, _ in made]), *limits.unbind(1)
-        )
+            projection.image[:3], normals, projection.offsets, grid.elevation_low, grid.elevation_high
+        )  # fmt: skip
 
-    def _image(self, scan: Scan) -> tuple[Tensor, Tensor, ImageGrid]:
-        """Range image (4, H, W), seconds from the middle of the sweep (H, W), and where the rows lie."""
-        points = torch.from_numpy(scan.points).to(self._device, torch.float32)
-        grid = self._grid_of(points)
-        by_ring = self._config.order == "ring" and scan.rings is not None
-        rings = torch.from_numpy(scan.rings).to(self._device) if by_ring and scan.rings is not None else None
-        projection = project(points, grid, rings=rings)
-        index = projection.index[0]
-        if scan.time_offsets is None or not len(scan):
-            return projection.images[0], points.new_zeros(index.shape), grid
-        offsets = torch.from_numpy(scan.time_offsets - middle_offset_s(scan)).to(self._device, torch.float32)
-        return projection.images[0], torch.where(index >= 0, offsets[index.clamp(min=0)], 0.0), grid
-
-    def _grid_of(self, points: Tensor) -> ImageGrid:
+    def _grid_of(self, scan: Scan) -> ImageGrid:
         """The grid for a scan, which is that of an earlier one unless this one tells more."""
-        if self._grid is None or self._grid_points < min(_ENOUGH_POINTS, len(points)):
+        if self._grid is None or self._grid_points < min(_ENOUGH_POINTS, len(scan)):
+            points = scan.points.astype(np.float32)
             self._grid = ImageGrid.around(points, self._config.rows, self._config.columns)
-            self._grid_points = len(points)
+            self._grid_points = len(scan)
+            self._alignment_rows = self._asked_rows or rows_of_sensor(points, scan.rings, self._grid)
         return self._grid
+
+
+def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageGrid) -> int:
+    """How many rows an image can have without many of its pixels being empty, from those of the grid to 64.
+
+    As many as there are rings, where these are known; else as many as are filled as well as the rows of the grid.
+    """
+    shown = _shown(points, grid, grid.rows)
+    if rings is None and shown.any(axis=0).mean() < _SEEN_COLUMNS:
+        return grid.rows
+    most = _MOST_ROWS if rings is None else min(len(np.unique(rings)), _MOST_ROWS)
+    least = (_FILLED if rings is None else _FILLED_BY_RINGS) * shown.mean()
+    fitting = (rows for rows in sorted({most, *_ROWS}, reverse=True) if grid.rows < rows <= most)
+    return next((rows for rows in fitting if _shown(points, grid, rows).mean() >= least), grid.rows)
+
+
+def _shown(points: Points, grid: ImageGrid, rows: int) -> NDArray[np.bool_]:
+    """(rows, W) which pixels have a point, in an image of so many rows."""
+    fine = ImageGrid(rows, grid.columns, grid.elevation_low, grid.elevation_high)
+    return project_sweep(points, None, 0.0, (fine,))[0].index >= 0
 
 
 def middle_offset_s(scan: Scan) -> float:

@@ -1,99 +1,71 @@
-"""Sweeps as images, pairs of them, and what a moving sensor does to a sweep."""
+"""Sweeps as images, and pairs of them."""
 
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
-from odometry.torch_geometry import skew
+from lidarslam.core.geometry import FloatArray
+
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class SweepImages:
-    """Sweeps as images, with what alignment needs of them.
+    """A sweep as images, with what alignment needs of it; float32.
 
     Attributes:
-        points: (B, 3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
-        normals: (B, 3, H, W) unit, zero where there is none.
-        offsets: (B, H, W) seconds from the middle of the sweep; all zero where unknown or already compensated.
-        low, high: (B,) elevation of the centres of the first and the last row, radians.
+        points: (3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
+        normals: (3, H, W) unit, zero where there is none.
+        offsets: (H, W) seconds from the middle of the sweep; all zero where unknown or already compensated.
+        low, high: elevation of the centres of the first and the last row, radians.
     """
 
-    points: Tensor
-    normals: Tensor
-    offsets: Tensor
-    low: Tensor
-    high: Tensor
-
-    def __len__(self) -> int:
-        return len(self.points)
+    points: Floats
+    normals: Floats
+    offsets: Floats
+    low: float
+    high: float
 
     def median_range_m(self) -> float:
         """Of all points; 0 when there are none."""
-        ranges = self.points.norm(dim=1)
-        seen = ranges[ranges > 0.0]
-        return float(seen.median()) if len(seen) else 0.0
+        x, y, z = self.points
+        squares = x * x + y * y + z * z
+        seen = squares[squares > 0.0]
+        # The lower of the two in the middle, when there are two.
+        return float(np.sqrt(np.partition(seen, (len(seen) - 1) // 2)[(len(seen) - 1) // 2])) if len(seen) else 0.0
 
     def share_with_normal(self) -> float:
         """Of the pixels that have a point; 0 when there are none."""
-        points, normals = ((part != 0.0).any(dim=1).sum() for part in (self.points, self.normals))
-        return float(normals / points.clamp(min=1))
-
-    def select(self, chosen: Tensor | slice) -> "SweepImages":
-        """Some of the sweeps."""
-        parts = (self.points, self.normals, self.offsets, self.low, self.high)
-        return SweepImages(*(part[chosen] for part in parts))
+        points, normals = (int(np.count_nonzero((part != 0.0).any(axis=0))) for part in (self.points, self.normals))
+        return normals / max(points, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class LastMotion:
-    """How B sensors moved before: mean velocity (B, 6), rotation first, in radians and metres a second; for how long.
+    """How the sensor moved before.
 
     Attributes:
-        velocity: (B, 6) between the middles of two sweeps, the later of which is the previous one now.
-        interval_s: (B,) from one of these middles to the other.
+        velocity: (6,) mean between the middles of two sweeps, the later of which is the previous one now; rotation
+            first, in radians and metres a second.
+        interval_s: from one of these middles to the other.
     """
 
-    velocity: Tensor
-    interval_s: Tensor
+    velocity: FloatArray
+    interval_s: float
 
 
 @dataclass(frozen=True, eq=False)
-class SweepPairs:
-    """B sweeps, each with the one before it.
+class SweepPair:
+    """A sweep with the one before it.
 
     Attributes:
-        current, previous: B sweeps each.
-        interval_s: (B,) from the middle of the previous one to that of the current one.
-        last: the motions before; None where they are not known.
+        current, previous: the sweeps; their images may differ in size.
+        interval_s: from the middle of the previous one to that of the current one.
+        last: the motion before; None where it is not known.
     """
 
     current: SweepImages
     previous: SweepImages
-    interval_s: Tensor
+    interval_s: float
     last: LastMotion | None = None
-
-    def repeat(self, count: int) -> "SweepPairs":
-        """The only pair so many times."""
-        same = torch.zeros(count, dtype=torch.int64, device=self.interval_s.device)
-        last = None if self.last is None else LastMotion(self.last.velocity[same], self.last.interval_s[same])
-        return SweepPairs(self.current.select(same), self.previous.select(same), self.interval_s[same], last)
-
-
-def consecutive(images: SweepImages, number: int, interval_s: Tensor, last: LastMotion | None = None) -> SweepPairs:
-    """A sweep and the one after it; interval_s (1,) is from the middle of the one to that of the other."""
-    current, previous = (images.select(slice(i, i + 1)) for i in (number + 1, number))
-    return SweepPairs(current, previous, interval_s, last)
-
-
-def compensate(points: Tensor, offsets: Tensor, velocity: Tensor, is_direction: bool = False) -> Tensor:
-    """Points (B, N, 3) as seen from the middle of the sweep, for a body that moves evenly at velocity (B, 6).
-
-    The exponential map to second order, which is exact to 0.12 mrad for a turn of 10 degrees a sweep, half of it to
-    either side of the middle, and to eight times that for 20 degrees.
-    """
-    cross = skew(velocity[:, :3]).mT  # points @ cross is the cross product of the rotation vector with them
-    t = offsets[..., None]
-    first = points @ cross if is_direction else torch.baddbmm(velocity[:, None, 3:], points, cross)
-    moved: Tensor = torch.addcmul(points, t, torch.baddbmm(first, (0.5 * t) * first, cross))
-    return moved

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from odometry.hypotheses import Search
+from odometry.candidates import Search
 from odometry.networks import PairNetwork
 from odometry.objective import Objective, motion_error, objective
 from odometry.pairs import PairBatch, pair_of
@@ -67,7 +67,7 @@ def validate(
 ) -> Validation:
     """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none.
 
-    The network, in evaluation mode, is asked as in use: by its most probable hypothesis.
+    The network, in evaluation mode, is asked as in use: by its most probable candidate.
     """
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
     search = torch_search(network, device or torch.device("cpu"))
@@ -101,12 +101,12 @@ def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tupl
         if before is None:
             before = search.describe(points[number], normals[number])
             continue
-        hypotheses, before = search.compare(before, points[number], normals[number])
+        candidates, before = search.compare(before, points[number], normals[number])
         pair = pair_of(recording, number - chosen.step, number, surfaces=False)
         if bool(pair.believed):
-            T_prev_curr = torch.from_numpy(hypotheses[0].T_prev_curr).float()
+            T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
             errors.append(motion_error(T_prev_curr[None], pair.T_prev_curr))
-            sigmas.append(torch.from_numpy(np.sqrt(np.diag(hypotheses[0].covariance))).float()[None])
+            sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
     return torch.cat(errors), torch.cat(sigmas)
 
 

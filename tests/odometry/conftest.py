@@ -11,6 +11,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from odometry.preparation import PreparedRecording
 from odometry.sweeps import SweepImages
+from odometry.torch_images import RecordedImages
 
 _LOW, _HIGH = np.deg2rad(-18.0), np.deg2rad(18.0)
 
@@ -31,20 +32,20 @@ class Scene:
 
     def sweeps(
         self, count: int, twist: Sequence[float], start: FloatArray | None = None, rolling: bool = True
-    ) -> SweepImages:
+    ) -> list[SweepImages]:
         """That many sweeps; not rolling: the pose is that of the middle of the sweep all the time."""
         T_world_start = np.eye(4) if start is None else start
         return self.sweeps_along(count, lambda times: T_world_start @ exp(np.multiply.outer(times, twist)), rolling)
 
-    def sweeps_along(self, count: int, poses: Callable[[FloatArray], FloatArray], rolling: bool = True) -> SweepImages:
+    def sweeps_along(
+        self, count: int, poses: Callable[[FloatArray], FloatArray], rolling: bool = True
+    ) -> list[SweepImages]:
         """The same on any way: poses (W, 4, 4) at times (W,)."""
         offsets = ((np.arange(self.columns) + 0.5) / self.columns - 0.5) * self.period_s * rolling  # (W,)
-        made = [self._sweep(offsets, poses(i * self.period_s + offsets)) for i in range(count)]
-        points, normals, times = (torch.stack(part).float() for part in zip(*made, strict=True))
-        return SweepImages(points, normals, times, torch.full((count,), _LOW), torch.full((count,), _HIGH))
+        return [self._sweep(offsets, poses(i * self.period_s + offsets)) for i in range(count)]
 
-    def _sweep(self, offsets: FloatArray, T: FloatArray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Points, normals and times of a sweep whose columns are seen from poses (W, 4, 4)."""
+    def _sweep(self, offsets: FloatArray, T: FloatArray) -> SweepImages:
+        """A sweep whose columns are seen from poses (W, 4, 4)."""
         elevation = np.linspace(_LOW, _HIGH, self.rows)[:, None]
         azimuth = (np.arange(self.columns) + 0.5) * (2.0 * np.pi / self.columns)
         rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -53,8 +54,8 @@ class Scene:
         seen = np.isfinite(ranges)
         points = np.where(seen[..., None], local * np.where(seen, ranges, 0.0)[..., None], 0.0)
         normals = np.einsum("wji,hwj->hwi", T[:, :3, :3], normals) * seen[..., None]
-        images = (torch.from_numpy(values).movedim(-1, 0) for values in (points, normals))
-        return *images, torch.from_numpy(offsets * seen)
+        images = (np.moveaxis(values, -1, 0).astype(np.float32) for values in (points, normals))
+        return SweepImages(*images, (offsets * seen).astype(np.float32), float(_LOW), float(_HIGH))
 
     def _cast(self, origins: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ranges (H, W), infinite without a hit, and normals (H, W, 3) that face the sensor."""
@@ -73,24 +74,24 @@ class Scene:
         """The same as scans stamped at the start of their sweeps, points in the order of time."""
         return self.as_scans(self.sweeps(count, twist, start))
 
-    def as_scans(self, images: SweepImages) -> list[Scan]:
+    def as_scans(self, sweeps: list[SweepImages]) -> list[Scan]:
         """Sweeps of this scene as scans."""
         scans = []
-        for number in range(len(images)):
-            points = images.points[number].permute(2, 1, 0).reshape(-1, 3)
-            offsets = images.offsets[number].T
+        for number, images in enumerate(sweeps):
+            points = images.points.T.reshape(-1, 3)
+            offsets = images.offsets.T
             stamp = (number - 0.5) * self.period_s
-            rings = torch.arange(self.rows).repeat(self.columns)
-            seen = points.square().sum(-1) > 0.0
+            rings = np.tile(np.arange(self.rows), self.columns)
+            seen = points.any(axis=1)
             times = offsets.reshape(-1) + 0.5 * self.period_s
-            scans.append(Scan.from_raw(points[seen].numpy(), stamp, times[seen].numpy(), rings[seen].numpy()))
+            scans.append(Scan.from_raw(points[seen], stamp, times[seen], rings[seen]))
         return scans
 
     def recording(self, count: int, twist: Sequence[float], rolling: bool = True) -> PreparedRecording:
         """The sweeps with their true motions, all believed."""
         T = torch.from_numpy(exp(self.period_s * np.asarray(twist))).float().expand(count - 1, 4, 4)
         return PreparedRecording(
-            self.sweeps(count, twist, rolling=rolling),
+            RecordedImages.stacked(self.sweeps(count, twist, rolling=rolling)),
             torch.full((count - 1,), self.period_s),
             T.clone(),
             torch.ones(count - 1, dtype=torch.bool),

@@ -5,46 +5,43 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
-from lidarslam.core.geometry import FloatArray
-from lidarslam.core.geometry import exp as exp_of
-from odometry.alignment import Aligned, align
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from odometry.alignment import Aligned, Hypothesis, align, align_each
 from odometry.alignment_config import AlignmentConfig
-from odometry.sweeps import LastMotion, SweepImages, SweepPairs, compensate, consecutive
-from odometry.torch_geometry import exp, inverse, log, transform_points
+from odometry.sweeps import LastMotion, SweepImages, SweepPair
 
 CONFIG = AlignmentConfig()
-INTERVAL_S = torch.tensor([0.1])
+INTERVAL_S = 0.1
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)  # rad/s, m/s
 TURNING = (0.1, 0.1, math.radians(80.0), 1.0, 0.3, 0.1)
 # Wrong by 2 degrees about an axis of no particular direction, and by 10 cm.
 WRONG = (0.012, -0.012, 0.030, 0.06, -0.06, 0.05)
 
 
-def moved(twist: tuple[float, ...]) -> Tensor:
-    """The true motion (1, 4, 4) from one sweep to the next."""
-    return exp(0.1 * torch.tensor([twist], dtype=torch.float64)).float()
+def moved(twist: tuple[float, ...]) -> FloatArray:
+    """The true motion (4, 4) from one sweep to the next."""
+    return exp(0.1 * np.array(twist))
 
 
-def guess(twist: tuple[float, ...], wrong: tuple[float, ...] = WRONG) -> Tensor:
-    return exp(torch.tensor([wrong])) @ moved(twist)
+def guess(twist: tuple[float, ...], wrong: tuple[float, ...] = WRONG) -> FloatArray:
+    return exp(wrong) @ moved(twist)
 
 
-def errors(T: Tensor, truth: Tensor) -> tuple[float, float]:
-    """The worst error of a batch, degrees and metres."""
-    error = log(T.double() @ inverse(truth.double()))
-    return float(error[:, :3].norm(dim=1).rad2deg().max()), float(error[:, 3:].norm(dim=1).max())
+def errors(T: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Degrees and metres."""
+    error = log(T @ inverse(truth))
+    return float(np.rad2deg(np.linalg.norm(error[:3]))), float(np.linalg.norm(error[3:]))
 
 
-def one_on_the_other(sweeps: SweepImages, T: Tensor, **options: object) -> Aligned:
+def second_on_first(sweeps: list[SweepImages], last: LastMotion | None = None) -> SweepPair:
+    """The last two of the sweeps."""
+    return SweepPair(sweeps[-1], sweeps[-2], INTERVAL_S, last)
+
+
+def one_on_the_other(sweeps: list[SweepImages], T: FloatArray, **options: object) -> Aligned:
     """The second of two sweeps on the first."""
-    return align(T, consecutive(sweeps, 0, INTERVAL_S), AlignmentConfig.model_validate(options))
-
-
-def together(sweeps: list[SweepImages]) -> SweepImages:
-    return SweepImages(*(torch.cat([getattr(one, name) for one in sweeps]) for name in vars(sweeps[0])))
+    return align(Hypothesis(T), second_on_first(sweeps), AlignmentConfig.model_validate(options))
 
 
 @pytest.mark.parametrize("rolling", [False, True])
@@ -63,7 +60,7 @@ def test_the_truth_stays_where_it_is(box_room):
 
 
 def test_an_upside_down_sensor_is_as_good(box_room):
-    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double().numpy()
+    upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
     found = one_on_the_other(box_room.sweeps(2, TWIST, upside_down), guess(TWIST))
     rotation_deg, translation_m = errors(found.T_prev_curr, moved(TWIST))
     assert rotation_deg < 0.01
@@ -73,43 +70,47 @@ def test_an_upside_down_sensor_is_as_good(box_room):
 def test_turning_sweeps_are_compensated(box_room):
     sweeps = box_room.sweeps(2, TURNING)
     assert errors(one_on_the_other(sweeps, guess(TURNING)).T_prev_curr, moved(TURNING)) < (0.03, 0.002)
-    as_if_at_once = replace(sweeps, offsets=torch.zeros_like(sweeps.offsets))
+    as_if_at_once = [replace(sweep, offsets=np.zeros_like(sweep.offsets)) for sweep in sweeps]
     assert errors(one_on_the_other(as_if_at_once, guess(TURNING)).T_prev_curr, moved(TURNING))[0] > 0.1
 
 
 def test_the_interval_tells_how_fast_the_motion_is(box_room):
     """Were the sweeps half as far apart, the body would move twice as fast in them."""
     sweeps = box_room.sweeps(2, TURNING)
-    found = align(guess(TURNING), consecutive(sweeps, 0, 0.5 * INTERVAL_S), CONFIG)
+    found = align(Hypothesis(guess(TURNING)), SweepPair(sweeps[1], sweeps[0], 0.5 * INTERVAL_S), CONFIG)
     assert errors(found.T_prev_curr, moved(TURNING))[0] > 0.1
 
 
-def test_items_of_a_batch_are_on_their_own(box_room):
-    twists = [TWIST, TURNING, (0.0, 0.0, -0.5, -2.0, 0.5, 0.0)]
-    sweeps = [box_room.sweeps(2, twist) for twist in twists]
-    current, previous = (together([one.select(slice(i, i + 1)) for one in sweeps]) for i in (1, 0))
-    guesses = torch.cat([guess(twist) for twist in twists])
-    batch = align(guesses, SweepPairs(current, previous, INTERVAL_S.expand(3)), CONFIG)
-    assert errors(batch.T_prev_curr, torch.cat([moved(twist) for twist in twists])) < (0.03, 0.002)
-    for i, twist in enumerate(twists):
-        alone = one_on_the_other(sweeps[i], guess(twist))
-        torch.testing.assert_close(batch.T_prev_curr[i], alone.T_prev_curr[0], rtol=0, atol=2e-5)
-        torch.testing.assert_close(batch.share[i], alone.share[0], rtol=0, atol=1e-3)
-        assert batch.matched[i] == pytest.approx(int(alone.matched[0]), abs=3)
+def test_several_guesses_are_on_their_own(box_room):
+    sweeps = box_room.sweeps(2, TWIST)
+    guesses = [guess(TWIST), moved(TWIST), guess(TWIST, tuple(-x for x in WRONG))]
+    for T, found in zip(
+        guesses, align_each([Hypothesis(T) for T in guesses], second_on_first(sweeps), CONFIG), strict=True
+    ):
+        assert errors(found.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
+        assert np.array_equal(found.T_prev_curr, one_on_the_other(sweeps, T).T_prev_curr)
+
+
+def test_images_may_differ_in_rows(box_room):
+    fine = replace(box_room, rows=40).sweeps(2, TWIST)
+    coarse = box_room.sweeps(2, TWIST)
+    for current, previous in ((fine[1], coarse[0]), (coarse[1], fine[0])):
+        found = align(Hypothesis(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), CONFIG)
+        assert errors(found.T_prev_curr, moved(TWIST)) < (0.02, 1e-3)
 
 
 def test_without_a_step_the_guess_is_the_answer(box_room):
     found = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST), iterations=0)
-    assert torch.equal(found.T_prev_curr, guess(TWIST))
+    assert np.array_equal(found.T_prev_curr, guess(TWIST))
     assert found.share < 0.7
 
 
 def test_a_guess_is_held_as_firmly_as_its_information_says(box_room):
     sweeps = box_room.sweeps(2, TWIST)
     close = guess(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
-    certain = align(close, consecutive(sweeps, 0, INTERVAL_S), CONFIG, 1e9 * torch.eye(6)[None])
+    certain = align(Hypothesis(close, 1e9 * np.eye(6)), second_on_first(sweeps), CONFIG)
     assert errors(certain.T_prev_curr, close) < (0.01, 5e-4)
-    uncertain = align(close, consecutive(sweeps, 0, INTERVAL_S), CONFIG, 1e-3 * torch.eye(6)[None])
+    uncertain = align(Hypothesis(close, 1e-3 * np.eye(6)), second_on_first(sweeps), CONFIG)
     assert errors(uncertain.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
 
 
@@ -118,13 +119,13 @@ def test_the_information_of_a_guess_is_of_changes_from_the_left(box_room):
     twist = (0.0, 0.0, 0.5 * math.pi / 0.1, 0.5, 0.2, 0.0)
     sweeps = box_room.sweeps(2, twist, rolling=False)
     T = guess(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
-    holds_x = torch.zeros(1, 6, 6)
-    holds_x[:, 3, 3] = 1e9
-    found = align(T, consecutive(sweeps, 0, INTERVAL_S), CONFIG, holds_x)
-    away = found.T_prev_curr[0, :3, 3] - moved(twist)[0, :3, 3]
+    holds_x = np.zeros((6, 6))
+    holds_x[3, 3] = 1e9
+    found = align(Hypothesis(T, holds_x), second_on_first(sweeps), CONFIG)
+    away = found.T_prev_curr[:3, 3] - moved(twist)[:3, 3]
     # What is held wrongly pulls a little at the rest.
-    assert float(away[0] - T[0, 0, 3] + moved(twist)[0, 0, 3]) == pytest.approx(0.0, abs=1e-4)
-    assert away[1].abs() < 0.01
+    assert away[0] - T[0, 3] + moved(twist)[0, 3] == pytest.approx(0.0, abs=1e-4)
+    assert abs(away[1]) < 0.01
 
 
 def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
@@ -132,28 +133,28 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
     twist, wrong = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0), (0.01, 0.01, 0.02, 0.10, 0.06, 0.05)
     sweeps = corridor.sweeps(2, twist)
     T = guess(twist, wrong)
-    kept = align(T, consecutive(sweeps, 0, INTERVAL_S), CONFIG, torch.eye(6)[None])
-    error = log(kept.T_prev_curr @ inverse(moved(twist)))[0]
+    kept = align(Hypothesis(T, np.eye(6)), second_on_first(sweeps), CONFIG)
+    error = log(kept.T_prev_curr @ inverse(moved(twist)))
     # Turning it back about the origin moves it along x by less than a millimetre.
-    torch.testing.assert_close(kept.T_prev_curr[0, 0, 3], T[0, 0, 3], rtol=0, atol=1e-3)
-    torch.testing.assert_close(error[:3], torch.zeros(3), rtol=0, atol=1e-5)
-    torch.testing.assert_close(error[4:], torch.zeros(2), rtol=0, atol=1e-4)
+    assert kept.T_prev_curr[0, 3] == pytest.approx(T[0, 3], abs=1e-3)
+    np.testing.assert_allclose(error[:3], 0.0, atol=1e-5)
+    np.testing.assert_allclose(error[4:], 0.0, atol=1e-4)
     assert kept.share > 0.95
 
 
 def test_information_is_weak_along_a_corridor(corridor):
     twist = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0)
     found = one_on_the_other(corridor.sweeps(2, twist, rolling=False), moved(twist))
-    information = found.information[0]
+    information = found.information
     assert information[3, 3] < 1e-6 * information[4, 4]
     assert information[5, 5] > 100.0
     # Every matched point says one metre of information along its normal: they sum up to their number.
-    assert information[3:, 3:].trace() == pytest.approx(int(found.matched), rel=1e-3)
+    assert information[3:, 3:].trace() == pytest.approx(found.matched, rel=1e-3)
 
 
 def test_share_and_residual_tell_what_does_not_fit(box_room, corridor):
-    room, street = box_room.sweeps(1, TWIST), corridor.sweeps(1, TWIST)
-    unrelated = align(torch.eye(4)[None], SweepPairs(street, room, INTERVAL_S), CONFIG)
+    room, street = box_room.sweeps(1, TWIST)[0], corridor.sweeps(1, TWIST)[0]
+    unrelated = align(Hypothesis(np.eye(4)), SweepPair(street, room, INTERVAL_S), CONFIG)
     assert unrelated.share < 0.3
     beside = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST), iterations=0)
     fits = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
@@ -164,7 +165,7 @@ def test_share_and_residual_tell_what_does_not_fit(box_room, corridor):
 def test_nearly_all_is_explained_where_scans_lie_on_one_another(box_room):
     found = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
     assert found.explained > 0.9
-    torch.testing.assert_close(found.weakest.norm(dim=1), torch.ones(1))
+    assert np.linalg.norm(found.weakest) == pytest.approx(1.0)
 
 
 def test_little_is_explained_along_the_way_that_a_scan_is_off(box_room):
@@ -174,7 +175,7 @@ def test_little_is_explained_along_the_way_that_a_scan_is_off(box_room):
         wrong[3 + axis] = 0.4
         shifted = one_on_the_other(sweeps, guess(TWIST, tuple(wrong)), iterations=0)
         assert shifted.explained < 0.3
-        assert shifted.weakest[0, axis].abs() > 0.9
+        assert abs(shifted.weakest[axis]) > 0.9
         assert shifted.share > 0.35  # the other walls go along
 
 
@@ -187,25 +188,22 @@ def test_what_a_corridor_does_not_say_is_not_missed(corridor):
 
 
 def test_explained_does_not_depend_on_the_attitude_of_the_sensor(box_room):
-    start = exp(torch.tensor([0.3, -0.2, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
+    start = exp([0.3, -0.2, 1.0, 0.0, 0.0, 0.0])
     wrong = (0.0, 0.0, 0.0, 0.4, 0.0, 0.0)
     tilted = one_on_the_other(box_room.sweeps(2, TWIST, start), guess(TWIST, wrong), iterations=0)
     assert tilted.explained < 0.4
-    torch.testing.assert_close(tilted.weakest.norm(dim=1), torch.ones(1))
+    assert np.linalg.norm(tilted.weakest) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("empty", ["current", "previous", "both"])
 def test_empty_images_move_nothing(box_room, empty):
-    full = box_room.sweeps(1, TWIST)
-    nothing = SweepImages(
-        torch.zeros_like(full.points), torch.zeros_like(full.normals), torch.zeros_like(full.offsets),
-        full.low, full.high,
-    )  # fmt: skip
+    full = box_room.sweeps(1, TWIST)[0]
+    nothing = replace(full, **{name: 0.0 * getattr(full, name) for name in ("points", "normals", "offsets")})
     current = full if empty == "previous" else nothing
     previous = full if empty == "current" else nothing
-    found = align(guess(TWIST), SweepPairs(current, previous, INTERVAL_S), CONFIG)
-    torch.testing.assert_close(found.T_prev_curr, guess(TWIST))
-    assert (float(found.share), float(found.residual_m), int(found.matched)) == (0.0, 0.0, 0)
+    found = align(Hypothesis(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), CONFIG)
+    np.testing.assert_allclose(found.T_prev_curr, guess(TWIST))
+    assert (found.share, found.residual_m, found.matched) == (0.0, 0.0, 0)
     assert not found.information.any()
 
 
@@ -215,32 +213,14 @@ def test_what_leaves_the_elevations_takes_no_part(box_room):
     sweeps = box_room.sweeps(2, twist, rolling=False)
     found = one_on_the_other(sweeps, guess(twist, (0.0, 0.01, 0.0, 0.01, 0.0, 0.0)))
     assert errors(found.T_prev_curr, moved(twist)) < (0.01, 1e-3)
-    assert 0.5 < float(found.share) < 0.85
+    assert 0.5 < found.share < 0.85
     assert found.residual_m < 2e-3
-
-
-@pytest.mark.parametrize("is_direction", [False, True])
-def test_compensation_is_the_exponential_to_second_order(is_direction):
-    g = torch.Generator().manual_seed(3)
-    points = torch.nn.functional.normalize(torch.randn(1, 500, 3, generator=g, dtype=torch.float64), dim=-1)
-    offsets = 0.1 * torch.rand(1, 500, generator=g, dtype=torch.float64) - 0.05
-    axis = torch.nn.functional.normalize(torch.randn(3, generator=g, dtype=torch.float64), dim=0)
-    v = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
-    for turn_deg, accuracy in ((10.0, 1.2e-4), (20.0, 9.5e-4)):
-        velocity = torch.cat([axis * math.radians(turn_deg) / 0.1, v])[None]
-        T = exp(offsets[0, :, None] * velocity)  # (N, 4, 4)
-        exact = transform_points(T, points[0, :, None])[:, 0]
-        if is_direction:
-            exact = exact - T[:, :3, 3]
-        difference = (compensate(points, offsets, velocity, is_direction)[0] - exact).norm(dim=-1)
-        assert difference.max() < accuracy
-        assert difference.max() > 0.5 * accuracy  # else the docstring says too little
 
 
 def speeding_up(times: FloatArray) -> FloatArray:
     """Poses on a turn and a way ahead that grow evenly, from rest at 0.1 s before the middle of the first sweep."""
     half = 0.5 * (times + 0.1) ** 2
-    return exp_of(np.multiply.outer(half, np.array(ACCELERATION)))
+    return exp(np.multiply.outer(half, np.array(ACCELERATION)))
 
 
 ACCELERATION = (1.0, 0.5, 8.0, 2.0, 0.5, 0.0)  # rad/s^2, m/s^2: 4.6 degrees more from sweep to sweep
@@ -248,47 +228,46 @@ ACCELERATION = (1.0, 0.5, 8.0, 2.0, 0.5, 0.0)  # rad/s^2, m/s^2: 4.6 degrees mor
 
 def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room):
     sweeps = box_room.sweeps_along(3, speeding_up)
-    T = torch.from_numpy(speeding_up(np.array([0.0, 0.1, 0.2]))).float()
-    before, motion = inverse(T[:1]) @ T[1:2], inverse(T[1:2]) @ T[2:]
-    velocity = log(before) / INTERVAL_S[:, None]
-    half_a_change = 0.05 * torch.tensor([ACCELERATION])
-    off = exp(torch.tensor([[0.02, 0.0, -0.02, 0.05, 0.03, 0.0]])) @ motion
+    T = speeding_up(np.array([0.0, 0.1, 0.2]))
+    before, motion = inverse(T[0]) @ T[1], inverse(T[1]) @ T[2]
+    velocity = log(before) / INTERVAL_S
+    half_a_change = 0.05 * np.array(ACCELERATION)
+    off = Hypothesis(exp([0.02, 0.0, -0.02, 0.05, 0.03, 0.0]) @ motion)
     for last in (None, LastMotion(velocity, INTERVAL_S)):
-        found = align(off, consecutive(sweeps, 1, INTERVAL_S, last), CONFIG)
+        found = align(off, second_on_first(sweeps, last), CONFIG)
         assert errors(found.T_prev_curr, motion) < (0.06, 0.004)
-        torch.testing.assert_close(found.bend, half_a_change, rtol=0, atol=0.06)
+        np.testing.assert_allclose(found.bend, half_a_change, atol=0.06)
     # Held at none, the motion is off by more.
     even = CONFIG.model_copy(update={"surprise_rad_s": 1e-4, "surprise_m_s": 1e-4})
-    stiff = align(off, consecutive(sweeps, 1, INTERVAL_S), even)
-    assert not stiff.bend.abs().max() > 1e-2
+    stiff = align(off, second_on_first(sweeps), even)
+    assert np.abs(stiff.bend).max() <= 1e-2
     assert errors(stiff.T_prev_curr, motion)[0] > 3.0 * errors(found.T_prev_curr, motion)[0]
     # Held at what the motion before tells, it is nearly as good.
-    told = align(off, consecutive(sweeps, 1, INTERVAL_S, LastMotion(velocity, INTERVAL_S)), even)
+    told = align(off, second_on_first(sweeps, LastMotion(velocity, INTERVAL_S)), even)
     assert errors(told.T_prev_curr, motion) < (0.06, 0.004)
 
 
 def test_a_bend_is_held_along_the_directions_that_are_asked_for(box_room):
     """Sweeps that a turn and a push bend: held about z alone, the bend is none there, and still some along x."""
     sweeps = box_room.sweeps_along(2, speeding_up)
-    T = torch.from_numpy(speeding_up(np.array([0.0, 0.1]))).float()
-    motion = inverse(T[:1]) @ T[1:]
-    held = torch.diag(torch.tensor([0.0, 0.0, 1e8, 0.0, 0.0, 0.0], dtype=torch.float64))[None]
-    free = align(motion, consecutive(sweeps, 0, INTERVAL_S), CONFIG)
-    found = align(motion, consecutive(sweeps, 0, INTERVAL_S), CONFIG, bend_information=held)
-    assert free.bend[0, 2] == pytest.approx(0.4, abs=0.06)
-    assert found.bend[0, 2] == pytest.approx(0.0, abs=1e-4)
-    assert abs(float(found.bend[0, 3])) > 0.05
+    T = speeding_up(np.array([0.0, 0.1]))
+    motion = inverse(T[0]) @ T[1]
+    held = np.diag([0.0, 0.0, 1e8, 0.0, 0.0, 0.0])
+    free = align(Hypothesis(motion), second_on_first(sweeps), CONFIG)
+    found = align(Hypothesis(motion, bend_information=held), second_on_first(sweeps), CONFIG)
+    assert free.bend[2] == pytest.approx(0.4, abs=0.06)
+    assert found.bend[2] == pytest.approx(0.0, abs=1e-4)
+    assert abs(found.bend[3]) > 0.05
 
 
 def test_the_last_motion_may_have_taken_longer(box_room):
     """The change of velocity is shared out by time: over 0.3 s a third as fast as over 0.1 s."""
     sweeps = box_room.sweeps(2, TWIST)
     stiff = CONFIG.model_copy(update={"surprise_rad_s": 1e-4, "surprise_m_s": 1e-4, "iterations": 0})
-    rest = torch.zeros(1, 6)
     for interval_s, share in ((0.1, 0.5), (0.3, 0.25)):
-        last = LastMotion(rest, torch.tensor([interval_s]))
-        found = align(moved(TWIST), consecutive(sweeps, 0, INTERVAL_S, last), stiff)
-        torch.testing.assert_close(found.bend, share * torch.tensor([TWIST]), rtol=0, atol=1e-5)
+        last = LastMotion(np.zeros(6), interval_s)
+        found = align(Hypothesis(moved(TWIST)), second_on_first(sweeps, last), stiff)
+        np.testing.assert_allclose(found.bend, share * np.array(TWIST), atol=1e-5)
 
 
 def test_sweeps_seen_at_once_cannot_be_bent(box_room):
@@ -300,12 +279,11 @@ def test_sweeps_seen_at_once_cannot_be_bent(box_room):
 def test_what_a_bend_could_be_as_well_is_not_known(box_room):
     """A wall that is seen for a moment tells where it is, not how fast it got there."""
     sweeps = box_room.sweeps(2, TWIST)
-    early = sweeps.offsets < -0.04
-    part = replace(sweeps, normals=sweeps.normals * early[:, None])
+    part = [replace(sweep, normals=sweep.normals * (sweep.offsets < -0.04)) for sweep in sweeps]
     options = {"iterations": 0}
     loose, firm = (
-        one_on_the_other(part, moved(TWIST), surprise_rad_s=s, surprise_m_s=s, **options).information[0]
+        one_on_the_other(part, moved(TWIST), surprise_rad_s=s, surprise_m_s=s, **options).information
         for s in (10.0, 1e-4)
     )
-    assert torch.linalg.eigvalsh(firm.double() - loose.double()).min() > -1e-3 * firm.trace()
+    assert np.linalg.eigvalsh(firm - loose).min() > -1e-3 * firm.trace()
     assert loose[5, 5] < 0.2 * firm[5, 5]

@@ -2,23 +2,20 @@
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
-from odometry.alignment import Aligned, align
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from odometry.alignment import Aligned, Hypothesis, align
 from odometry.alignment_config import AlignmentConfig
 from odometry.alignment_search import align_best, try_guesses
-from odometry.sweeps import SweepImages, consecutive
-from odometry.torch_geometry import exp, inverse, log
+from odometry.sweeps import SweepImages, SweepPair
 
 CONFIG = AlignmentConfig()
-INTERVAL_S = torch.tensor([0.1])
 TWIST = (0.0, 0.0, 0.0, 14.0, 0.0, 0.0)  # rad/s, m/s: 1.4 m from sweep to sweep
-REST = torch.eye(4)[None]
+REST = np.eye(4)
 
 
 @pytest.fixture(scope="module")
-def street(box_room) -> SweepImages:
+def street(box_room) -> list[SweepImages]:
     """Two sweeps between facades with a pilaster every 3 m; four poles tell where one is."""
     pilasters = [((x, y, -5.0), (x + 1.0, y + 1.2, 30.0)) for x in range(-36, 37, 3) for y in (-7.0, 5.8)]
     poles = [(3.1, 4.2), (-5.2, -4.0), (8.3, -4.4), (-9.6, 4.1)]
@@ -27,26 +24,34 @@ def street(box_room) -> SweepImages:
     return scene.sweeps(2, TWIST)
 
 
-def moved(along_m: float) -> Tensor:
-    """(1, 4, 4) ahead."""
-    return exp(torch.tensor([[0.0, 0.0, 0.0, along_m, 0.0, 0.0]]))
+def moved(along_m: float) -> FloatArray:
+    """(4, 4) ahead."""
+    return exp([0.0, 0.0, 0.0, along_m, 0.0, 0.0])
 
 
-def one_on_the_other(sweeps: SweepImages, guesses: Tensor, information: Tensor | None = None, **options) -> Aligned:
-    """The second of two sweeps on the first."""
-    return align_best(guesses, consecutive(sweeps, 0, INTERVAL_S), AlignmentConfig(**options), information)[0]
+def second_on_first(sweeps: list[SweepImages]) -> SweepPair:
+    return SweepPair(sweeps[1], sweeps[0], 0.1)
+
+
+def one_on_the_other(
+    sweeps: list[SweepImages], *guesses: FloatArray, information: FloatArray | None = None, **options
+) -> Aligned:
+    """The second of two sweeps on the first; the information is about the first guess."""
+    first, *others = guesses
+    hypotheses = [Hypothesis(first, information), *(Hypothesis(guess) for guess in others)]
+    return align_best(hypotheses, second_on_first(sweeps), AlignmentConfig(**options))[0]
 
 
 def wrong_by_m(aligned: Aligned) -> float:
-    return float(log(aligned.T_prev_curr @ inverse(moved(1.4)))[:, 3:].norm())
+    return float(np.linalg.norm(log(aligned.T_prev_curr @ inverse(moved(1.4)))[3:]))
 
 
 def test_alignment_from_rest_stays_there_and_knows_it(street):
-    found = align(REST, consecutive(street, 0, INTERVAL_S), CONFIG)
+    found = align(Hypothesis(REST), second_on_first(street), CONFIG)
     assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
     assert found.share > 0.3  # the ground and the walls go along
     assert found.explained < CONFIG.doubtful - 0.2
-    torch.testing.assert_close(found.weakest.abs(), torch.tensor([[1.0, 0.0, 0.0]]), rtol=0, atol=0.05)
+    np.testing.assert_allclose(np.abs(found.weakest), [1.0, 0.0, 0.0], atol=0.05)
 
 
 def test_steps_along_the_direction_in_doubt_find_the_motion(street):
@@ -61,12 +66,12 @@ def test_no_steps_are_tried_where_there_are_none(street):
 
 def test_a_good_alignment_is_not_searched_around(street):
     found = one_on_the_other(street, moved(1.35))
-    alone = align(moved(1.35), consecutive(street, 0, INTERVAL_S), CONFIG)
-    assert torch.equal(found.T_prev_curr, alone.T_prev_curr)
+    alone = align(Hypothesis(moved(1.35)), second_on_first(street), CONFIG)
+    assert np.array_equal(found.T_prev_curr, alone.T_prev_curr)
 
 
 def test_a_later_guess_that_explains_more_is_taken(street):
-    found = one_on_the_other(street, torch.cat([REST, moved(1.3)]), search_m=())
+    found = one_on_the_other(street, REST, moved(1.3), search_m=())
     assert wrong_by_m(found) < 0.02
 
 
@@ -74,34 +79,41 @@ def test_of_guesses_that_explain_as_much_the_first_is_taken(corridor):
     """Nothing tells how far ahead one is, and all guesses lie well."""
     sweeps = corridor.sweeps(2, (0.0,) * 6)
     for first, second in ((-0.2, 0.2), (0.2, -0.2)):
-        found = one_on_the_other(sweeps, torch.cat([moved(first), moved(second)]))
-        assert float(found.T_prev_curr[0, 0, 3]) == pytest.approx(first, abs=0.01)
+        found = one_on_the_other(sweeps, moved(first), moved(second))
+        assert found.T_prev_curr[0, 3] == pytest.approx(first, abs=0.01)
 
 
 def test_guesses_that_are_alike_are_as_good_as_the_first(street):
-    both = one_on_the_other(street, torch.cat([moved(1.3), moved(1.45)]))
-    assert torch.equal(both.T_prev_curr, one_on_the_other(street, moved(1.3)).T_prev_curr)
+    both = one_on_the_other(street, moved(1.3), moved(1.45))
+    assert np.array_equal(both.T_prev_curr, one_on_the_other(street, moved(1.3)).T_prev_curr)
 
 
 def test_information_is_about_the_first_guess_alone(street, corridor):
     """It holds the first guess along the corridor, and says nothing of another that is taken instead."""
-    firm = 1e9 * torch.eye(6)[None]
-    held = one_on_the_other(corridor.sweeps(2, TWIST), moved(1.0), firm)
-    torch.testing.assert_close(held.T_prev_curr, moved(1.0), rtol=0, atol=1e-4)
-    other = one_on_the_other(street, torch.cat([REST, moved(1.3)]), firm, search_m=())
+    firm = 1e9 * np.eye(6)
+    held = one_on_the_other(corridor.sweeps(2, TWIST), moved(1.0), information=firm)
+    np.testing.assert_allclose(held.T_prev_curr, moved(1.0), atol=1e-4)
+    other = one_on_the_other(street, REST, moved(1.3), information=firm, search_m=())
     assert wrong_by_m(other) < 0.02
 
 
 @pytest.mark.parametrize(("sigma_m", "found"), [(0.7, True), (0.03, False)])
 def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m, found):
     """The motion is 1.4 m from the guess: two standard deviations, or fifty."""
-    information = torch.eye(6)[None] / sigma_m**2
-    searched = one_on_the_other(street, REST, information)
+    information = np.eye(6) / sigma_m**2
+    searched = one_on_the_other(street, REST, information=information)
     assert (wrong_by_m(searched) < 0.02) == found
 
 
 def test_the_best_of_many_guesses_is_found_roughly(street):
-    guesses = torch.cat([moved(0.1 * x) for x in (-20, -10, 0, 13, 25)])
-    found = try_guesses(guesses, consecutive(street, 0, INTERVAL_S), CONFIG)
-    assert found.shape == (1, 4, 4)
-    assert float(found[0, 0, 3]) == pytest.approx(1.4, abs=0.05)
+    guesses = [moved(0.1 * x) for x in (-20, -10, 0, 13, 25)]
+    found = try_guesses(guesses, second_on_first(street), CONFIG)
+    assert found[0, 3] == pytest.approx(1.4, abs=0.05)
+
+
+def test_it_is_told_which_guess_the_alignment_began_from(street):
+    """With what is known of that guess: of what a search found, nothing is."""
+    near, far = Hypothesis(moved(1.3), np.eye(6)), Hypothesis(REST, 2.0 * np.eye(6))
+    assert align_best([near, far], second_on_first(street), CONFIG)[1] is near
+    assert align_best([far, near], second_on_first(street), CONFIG)[1] is near
+    assert align_best([Hypothesis(REST)], second_on_first(street), CONFIG)[1] is None

@@ -17,9 +17,7 @@ def image(points: list[tuple[float, float, float]], normals: list[tuple[float, f
     return given, facing
 
 
-@pytest.mark.parametrize(
-    ("x", "y"), [(0.1, 0.1), (7.3, -4.9), (-19.9, 0.1), (0.2, 19.9), (-CELL_M / 2, -CELL_M / 2)]
-)
+@pytest.mark.parametrize(("x", "y"), [(0.1, 0.1), (7.3, -4.9), (-19.9, 0.1), (0.2, 19.9), (-CELL_M / 2, -CELL_M / 2)])
 def test_a_point_lies_in_its_cell(x, y):
     grid = bird_eye(*image([(x, y, 0.0)]), 0.0)
     assert grid.shape == (CHANNELS, CELLS, CELLS)

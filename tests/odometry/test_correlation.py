@@ -15,7 +15,7 @@ from odometry.networks import make_network
 from odometry.objective import objective
 from odometry.pairs import PairBatch, birds, pair_of
 from odometry.torch_geometry import inverse, log
-from odometry.torch_images import rotate_columns
+from odometry.torch_images import RecordedImages, rotate_columns
 from odometry.training import loss_of
 from odometry.training_config import TrainingConfig
 
@@ -37,8 +37,8 @@ def network() -> CorrelationNetwork:
 @pytest.fixture(scope="module")
 def scans(small_room) -> tuple[Tensor, Tensor]:
     """Points and normals (3, 3, H, W) each."""
-    images = small_room.sweeps(3, TWIST)
-    return torch.as_tensor(images.points), torch.as_tensor(images.normals)
+    images = RecordedImages.stacked(small_room.sweeps(3, TWIST))
+    return images.points, images.normals
 
 
 def turned(scans: tuple[Tensor, Tensor], columns: int) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ def test_it_is_the_share_of_the_points_that_counts(corridor):
 
 @pytest.mark.parametrize(("bare_share", "count"), [(1.0, 1), (0.85, 1), (0.75, 0), (0.0, 0)])
 def test_where_much_has_no_normal_nothing_is_left_open_for_all_one_knows(corridor, box_room, bare_share, count):
-    images = box_room.sweeps(1, [0.0] * 6)
+    images = box_room.sweeps(1, [0.0] * 6)[0]
     images.normals[..., round(bare_share * images.normals.shape[-1]) :] = 0.0
     assert len(left_open(corridor, 4000, images)) == count
 

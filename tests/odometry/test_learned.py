@@ -6,20 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
 from odometry.alignment_config import AlignmentConfig
 from odometry.config import OdometryConfig
-from odometry.correlation import Estimate
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned import LearnedOdometry
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
+from odometry.runner import Floats, Guess
 
 IMAGES = ImageConfig(rows=16, columns=360)
 TWIST = (0.05, -0.05, 0.5, 1.0, 0.3, 0.1)  # rad/s, m/s
@@ -32,16 +30,14 @@ class Told:
     """Answers with one guess, or with one after the other; the last goes on."""
 
     def __init__(self, *guesses: FloatArray, log_sigma: float = math.log(0.1)) -> None:
-        self.guesses, self.log_sigma, self.threads = list(guesses), log_sigma, 0
+        self.guesses, self.sigma = list(guesses), math.exp(log_sigma)
 
-    def encode(self, points: Tensor, normals: Tensor) -> Tensor:  # noqa: ARG002
-        self.threads = torch.get_num_threads()
+    def encode(self, points: Floats, normals: Floats) -> Floats:  # noqa: ARG002
         return points
 
-    def __call__(self, previous: Tensor, current: Tensor) -> Estimate:  # noqa: ARG002
+    def compare(self, previous: Floats, current: Floats) -> Guess:  # noqa: ARG002
         guess = self.guesses.pop(0) if len(self.guesses) > 1 else self.guesses[0]
-        sigmas = torch.full((1, 6), self.log_sigma)
-        return Estimate(torch.from_numpy(guess).float()[None], sigmas, torch.zeros(1, 0))
+        return Guess(guess, np.full(6, self.sigma))
 
 
 def estimates(scans: list[Scan], network: Told, **options: object) -> list[Motion]:
@@ -284,18 +280,6 @@ def sigmas(scans: list[Scan], network: Told) -> FloatArray:
     return np.sqrt(np.diag(motion.covariance))
 
 
-def test_the_number_of_threads_is_as_it_was_before(box_room):
-    network = Told(moved())
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        estimates(box_room.scans(2, TWIST), network, threads=1)
-        assert network.threads == 1
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-
-
 def test_two_runs_are_alike(box_room):
     scans = box_room.scans(3, TWIST)
     first, second = (estimates(scans, Told(moved(wrong=WRONG))) for _ in range(2))
@@ -313,9 +297,20 @@ def test_motions_are_rigid_to_the_last_digit(box_room):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_half_precision_reaches_the_network_alone(box_room):
-    motions = estimates(box_room.scans(2, TWIST), Told(moved(wrong=WRONG)), bfloat16=True)
-    assert_close(motions[1], moved())
+def test_a_guess_that_is_no_motion_is_a_failure_and_the_next_pair_works_again(box_room):
+    nothing = np.full((4, 4), np.nan)
+    motions = estimates(box_room.scans(4, TWIST), Told(moved(), nothing, moved()))
+    assert motions[2].failure == "the network's answer is not a motion; try other weights"
+    assert_close(motions[3], moved())
+    unsure = estimates(box_room.scans(2, TWIST), Told(moved(), log_sigma=math.inf))
+    assert unsure[1].failure is not None
+
+
+def test_a_sensor_of_many_rings_is_aligned_with_all_of_them(box_room):
+    scans = replace(box_room, rows=64).scans(3, TWIST)
+    many, few = (estimates(scans, Told(moved(wrong=WRONG)), alignment_rows=rows) for rows in (None, 16))
+    assert_close(many[2], moved())
+    assert many[2].points_used > 2 * few[2].points_used
 
 
 def test_the_learned_odometry_is_the_default(box_room):

@@ -8,8 +8,7 @@ import torch
 
 from lidarslam.core.scan import Scan
 from odometry.image_config import ImageConfig
-from odometry.preparation import compensated, prepare
-from odometry.sweeps import SweepImages
+from odometry.preparation import prepare
 from odometry.torch_geometry import exp, inverse, log
 
 CONFIG = ImageConfig(rows=16, columns=360)
@@ -41,9 +40,8 @@ def test_motions_are_found_from_scratch(box_room, twist):
 def test_sudden_turns_are_found_from_rest(box_room):
     """More than alignment finds its way over by itself, with other motions on top."""
     fast = (0.0, 0.0, math.radians(-250.0), 1.0, 0.3, 0.0)
-    images = box_room.sweeps(2, fast, rolling=False)
-    points = images.points.flatten(2).mT.double().numpy()
-    recording = prepare([Scan(points[i], 0.1 * i) for i in range(2)], CONFIG)
+    clouds = [sweep.points.reshape(3, -1).T.astype(np.float64) for sweep in box_room.sweeps(2, fast, rolling=False)]
+    recording = prepare([Scan(cloud, 0.1 * i) for i, cloud in enumerate(clouds)], CONFIG)
     assert recording.believed.all()
     assert errors(recording, fast)[0].max() < 0.15
     assert errors(recording, fast)[1].max() < 0.003
@@ -85,49 +83,3 @@ def test_scans_at_one_time_do_not_move_infinitely_fast(box_room):
     recording = prepare([scan, scan], CONFIG)
     assert recording.interval_s > 0.0
     assert recording.T_prev_curr.isfinite().all()
-
-
-def test_a_compensated_sweep_is_what_would_be_seen_at_rest(box_room):
-    """Its points lie on the walls as seen from the middle of the sweep; its times are gone."""
-    raw = box_room.sweeps(1, TURNING)
-    still = compensated(raw, torch.tensor([TURNING]))
-    assert not still.offsets.any()
-    assert wall_distance(raw) > 0.2
-    assert wall_distance(still) < 0.002
-    along_axis = still.normals.abs().amax(1)[still.normals.square().sum(1) > 0.5]
-    assert along_axis.min() > math.cos(math.radians(0.1))
-
-
-def wall_distance(images):
-    """The greatest distance, metres, of points with a normal along x or y from the walls of the room and its boxes."""
-    x, y = images.points[:, 0], images.points[:, 1]
-    sides = [
-        (x, (-7.0, 7.0, 2.6, 3.4, -4.6, -3.4, -2.3, -1.7, 4.5, 5.5)),
-        (y, (-5.0, 5.0, 1.6, 2.4, -3.6, -2.4, 3.2, 3.8, -2.5, -1.5)),
-    ]
-    normals = images.normals.abs()
-    worst = 0.0
-    for axis, (values, planes) in enumerate(sides):
-        here = normals[:, axis] > 0.9
-        worst = max(worst, float((values[here][:, None] - torch.tensor(planes)).abs().amin(1).max()))
-    return worst
-
-
-def test_compensation_back_and_forth_is_none(box_room):
-    raw = box_room.sweeps(2, TURNING)
-    velocity = torch.tensor([TURNING, SLOW])
-    still = compensated(raw, velocity)
-    back = compensated(SweepImages(still.points, still.normals, -raw.offsets, raw.low, raw.high), velocity)
-    torch.testing.assert_close(back.points, raw.points, rtol=0, atol=3e-4)
-    torch.testing.assert_close(back.normals, raw.normals, rtol=0, atol=4e-5)
-
-
-def test_compensation_of_nothing_stays_nothing(box_room):
-    full = box_room.sweeps(1, TURNING)
-    seen = torch.rand(1, 1, 16, 360, generator=torch.Generator().manual_seed(0)) < 0.5
-    raw = SweepImages(full.points * seen, full.normals * seen, full.offsets, full.low, full.high)
-    empty = ~seen[:, 0]
-    still = compensated(raw, torch.tensor([TURNING]))
-    assert torch.equal(still.points.square().sum(1) == 0.0, empty)
-    assert torch.equal(still.normals.square().sum(1) == 0.0, empty)
-    assert torch.equal(compensated(raw, torch.zeros(1, 6)).points, raw.points)

@@ -1,14 +1,30 @@
 """Range images against clouds whose pixels are known."""
 
 import math
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from odometry.projection import ImageGrid, mirror, project, rotate_columns
+from odometry import projection
+from odometry.projection import ImageGrid
+from odometry.torch_images import mirror, place, rotate_columns
 
 GRID = ImageGrid(16, 90, math.radians(-15.0), math.radians(15.0))
+
+
+class Shown(NamedTuple):
+    """A projection in the tensors that these tests reckon with: images (1, 4, H, W) and index (1, H, W)."""
+
+    images: Tensor
+    index: Tensor
+
+
+def project(points: Tensor, grid: ImageGrid, rings: Tensor | None = None) -> Shown:
+    found = projection.project(points.numpy(), grid, None if rings is None else rings.numpy())
+    return Shown(torch.from_numpy(found.image)[None], torch.from_numpy(found.index)[None])
 
 
 def polar(azimuth: Tensor, elevation: Tensor, ranges: Tensor) -> Tensor:
@@ -54,9 +70,10 @@ def test_a_point_is_in_the_pixel_of_its_angles() -> None:
 
 
 def test_columns_begin_at_whole_coordinates_and_rows_are_centred_on_them() -> None:
-    row, column = GRID.place(torch.cat([one(0.0, -15.0, 3.0), one(10.0, 15.0, 3.0), one(359.0, -14.0, 3.0)]))
-    torch.testing.assert_close(row, torch.tensor([0.0, 15.0, 0.5], dtype=torch.float64))
-    torch.testing.assert_close(column, torch.tensor([0.0, 2.5, 89.75], dtype=torch.float64))
+    points = torch.cat([one(0.0, -15.0, 3.0), one(10.0, 15.0, 3.0), one(359.0, -14.0, 3.0)])
+    for row, column in (GRID.place(points.numpy()), place(points, GRID)):
+        np.testing.assert_allclose(row, [0.0, 15.0, 0.5], atol=1e-9)
+        np.testing.assert_allclose(column, [0.0, 2.5, 89.75], atol=1e-9)
 
 
 def test_the_nearest_point_is_kept() -> None:
@@ -74,7 +91,7 @@ def test_of_equally_near_points_the_first_is_kept() -> None:
 
 def test_every_pixel_holds_the_nearest_of_a_dense_cloud() -> None:
     points = random_cloud(20_000)
-    row, column = GRID.place(points)
+    row, column = place(points, GRID)
     pixel = (row + 0.5).floor().long() * GRID.columns + column.long()
     ranges = points.norm(dim=1).float()
     expected = torch.full((GRID.rows * GRID.columns,), math.inf)
@@ -128,29 +145,11 @@ def test_columns_are_inside_the_image_however_close_to_the_seam(dtype: torch.dty
     points = torch.stack([torch.ones_like(y), y, torch.zeros_like(y)], dim=1)
     points = torch.cat([points, points * torch.tensor([-1.0, 1.0, 1.0], dtype=dtype)])
     for columns in (1, 7, 90, 720, 1800, 2083):
-        _, column = ImageGrid(2, columns, -0.2, 0.2).place(points)
-        assert column.min() >= 0.0
-        assert column.max() < columns
-        assert int(column[0]) == int(column[1]) == 0
-
-
-def test_batches_equal_single_images() -> None:
-    clouds = [random_cloud(300, seed).float() for seed in range(4)]
-    clouds.insert(2, torch.empty(0, 3))
-    image = torch.cat([torch.full((len(cloud),), i) for i, cloud in enumerate(clouds)])
-    order = torch.randperm(len(image), generator=torch.Generator().manual_seed(1))
-    points = torch.cat(clouds)[order]
-    batch = project(points, GRID, image[order], count=5)
-    assert torch.equal(batch.images, torch.cat([project(cloud, GRID).images for cloud in clouds]))
-    for i in range(5):
-        shown = batch.index[i][batch.index[i] >= 0]
-        assert torch.equal(image[order][shown], torch.full_like(shown, i))
-        assert torch.equal(batch.images[i, :3, batch.index[i] >= 0].T, points[shown])
-
-
-def test_points_of_an_image_that_is_not_there_are_left_out() -> None:
-    points = one(2.0, 1.0, 7.0).repeat(3, 1)
-    assert (project(points, GRID, torch.tensor([-1, 2, 2]), count=2).index == -1).all()
+        grid = ImageGrid(2, columns, -0.2, 0.2)
+        for _, column in (grid.place(points.numpy()), place(points, grid)):
+            assert column.min() >= 0.0
+            assert column.max() < columns
+            assert int(column[0]) == int(column[1]) == 0
 
 
 def test_points_above_and_below_are_left_out() -> None:
@@ -177,9 +176,9 @@ def test_a_point_with_a_coordinate_of_zero_stays(point: list[float]) -> None:
 
 def test_no_points_give_empty_images() -> None:
     for rings in (None, torch.empty(0, dtype=torch.int64)):
-        result = project(torch.empty(0, 3), GRID, count=2, rings=rings)
-        assert torch.equal(result.images, torch.zeros(2, 4, 16, 90))
-        assert torch.equal(result.index, torch.full((2, 16, 90), -1))
+        result = project(torch.empty(0, 3), GRID, rings=rings)
+        assert torch.equal(result.images, torch.zeros(1, 4, 16, 90))
+        assert torch.equal(result.index, torch.full((1, 16, 90), -1))
 
 
 @pytest.mark.parametrize(
@@ -208,11 +207,11 @@ def test_a_grid_around_a_scan_puts_its_rings_in_rows() -> None:
     azimuth = torch.arange(100).repeat(16) * 3.6 + 0.1
     points = polar(azimuth, 2.0 * rings - 15.0, torch.full((1600,), 8.0))
     strays = torch.cat([one(10.0, 80.0, 5.0), one(20.0, -70.0, 5.0), torch.tensor([[math.nan] * 3, [0.0] * 3])])
-    grid = ImageGrid.around(torch.cat([points, strays]), 16, 90)
+    grid = ImageGrid.around(torch.cat([points, strays]).numpy(), 16, 90)
     assert math.degrees(grid.elevation_low) == pytest.approx(-15.0, abs=1e-9)
     assert math.degrees(grid.elevation_high) == pytest.approx(15.0, abs=1e-9)
-    row, _ = grid.place(points)
-    torch.testing.assert_close(row, rings.double(), rtol=0.0, atol=1e-9)
+    row, _ = grid.place(points.numpy())
+    np.testing.assert_allclose(row, rings, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
@@ -220,7 +219,7 @@ def test_a_grid_around_few_points_holds_them(count: int) -> None:
     # A single ring with noise, which must not be spread over many rows.
     elevation = 3.0 + 1e-3 * torch.randn(count, generator=torch.Generator().manual_seed(0))
     points = polar(7.0 * torch.arange(count) + 2.0, elevation, torch.full((count,), 5.0))
-    grid = ImageGrid.around(points, 8, 90)
+    grid = ImageGrid.around(points.numpy(), 8, 90)
     assert math.degrees(grid.elevation_high - grid.elevation_low) >= 1.0 - 1e-9
     result = project(points, grid)
     assert (result.index[0, 0] >= 0).sum() == min(count, 50)
@@ -267,24 +266,14 @@ def test_mirrored_images_are_of_mirrored_clouds() -> None:
     assert torch.equal(mirror(before.images), mirrored.images)
 
 
-@pytest.mark.parametrize("by_ring", [False, True])
-def test_the_compiled_loop_shows_the_points_that_torch_shows(by_ring: bool) -> None:
-    """Images of processors' memory are made by a loop, others and batches by torch: here as the first of two."""
-    points = random_cloud(30_000).float()
-    points[::50] *= 0.5  # nearer than others in their pixel
-    points[5], points[6], points[7] = math.nan, math.inf, 0.0
-    points[8] = torch.tensor([1.0, 0.0, 9.0])  # above the grid
-    points[-1000:] = points[100:1100]  # as near as others
-    rings = torch.arange(len(points)) % 29 - 2 if by_ring else None
-    one = project(points, GRID, rings=rings)
-    two = project(points, GRID, torch.zeros(len(points), dtype=torch.int64), 2, rings)
-    assert (one.index >= 0).sum() > 1000
-    torch.testing.assert_close(one.index[0], two.index[0], rtol=0.0, atol=0.0)
-    torch.testing.assert_close(one.images[0], two.images[0], rtol=0.0, atol=0.0)
-
-
-def test_a_row_of_one_shows_what_torch_shows() -> None:
-    grid = ImageGrid(1, 90, math.radians(-15.0), math.radians(15.0))
-    points = random_cloud(3_000).float()
-    one, two = project(points, grid), project(points, grid, torch.zeros(len(points), dtype=torch.int64), 2)
-    torch.testing.assert_close(one.index[0], two.index[0], rtol=0.0, atol=0.0)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_two_images_made_in_one_go_are_those_made_one_by_one(dtype: torch.dtype) -> None:
+    points, fine = random_cloud(5000).to(dtype).numpy(), ImageGrid(40, 90, GRID.elevation_low, GRID.elevation_high)
+    times = np.linspace(0.0, 0.1, 5000)
+    both = projection.project_sweep(points, times, 0.05, (GRID, fine))
+    for found, grid in zip(both, (GRID, fine), strict=True):
+        alone = projection.project(points, grid)
+        assert np.array_equal(found.index, alone.index)
+        assert np.array_equal(found.image, alone.image)
+        expected = np.where(found.index >= 0, times[found.index] - 0.05, 0.0)
+        np.testing.assert_allclose(found.offsets, expected, atol=1e-8)

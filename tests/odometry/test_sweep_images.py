@@ -1,36 +1,42 @@
 """Images of scans whose points are known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from lidarslam.core.scan import Scan
 from odometry.image_config import ImageConfig
 from odometry.sweep_images import Imager, middle_offset_s
+from odometry.sweeps import SweepImages
 
 CONFIG = ImageConfig(rows=16, columns=360)
 TWIST = (0.0, 0.0, 0.5, 1.0, 0.0, 0.0)
 EMPTY = Scan(np.zeros((0, 3)), 0.0, np.zeros(0))
 
 
+def images_of(scan: Scan, imager: Imager | None = None) -> SweepImages:
+    """What the network sees."""
+    return (imager or Imager(CONFIG)).images(scan).network
+
+
 def test_pixels_are_the_points_with_their_times(box_room):
-    exact = box_room.sweeps(2, TWIST)
-    images = Imager(CONFIG).images(box_room.scans(2, TWIST))
-    assert torch.equal(images.points, exact.points)
-    torch.testing.assert_close(images.offsets, exact.offsets, rtol=0, atol=1e-7)
-    torch.testing.assert_close(images.low, exact.low)
-    torch.testing.assert_close(images.high, exact.high)
+    imager = Imager(CONFIG)
+    for exact, scan in zip(box_room.sweeps(2, TWIST), box_room.scans(2, TWIST), strict=True):
+        images = images_of(scan, imager)
+        assert np.array_equal(images.points, exact.points)
+        np.testing.assert_allclose(images.offsets, exact.offsets, atol=1e-7)
+        assert (images.low, images.high) == pytest.approx((exact.low, exact.high), abs=1e-7)
 
 
 def test_normals_are_those_of_the_walls(box_room):
-    exact = box_room.sweeps(1, (0.0,) * 6)
-    images = Imager(CONFIG).images(box_room.scans(1, (0.0,) * 6))
-    there = images.normals.square().sum(1) > 0.5
-    agree = (images.normals * exact.normals).sum(1) > math.cos(math.radians(0.5))
-    assert there.float().mean() > 0.85
-    assert agree[there].float().mean() > 0.8  # the others are near edges
+    (exact,) = box_room.sweeps(1, (0.0,) * 6)
+    images = images_of(box_room.scans(1, (0.0,) * 6)[0])
+    there = images.normals.any(axis=0)
+    agree = (images.normals * exact.normals).sum(axis=0) > math.cos(math.radians(0.5))
+    assert there.mean() > 0.85
+    assert agree[there].mean() > 0.8  # the others are near edges
 
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
@@ -39,8 +45,7 @@ def test_offsets_are_from_the_middle_of_the_sweep_wherever_the_stamp_is(box_room
     assert scan.time_offsets is not None
     stamped = Scan(scan.points, scan.stamp, scan.time_offsets - stamp_at * 0.1)
     assert middle_offset_s(stamped) == pytest.approx(0.05 - stamp_at * 0.1, abs=1e-8)
-    offsets = Imager(CONFIG).images([stamped]).offsets
-    torch.testing.assert_close(offsets, box_room.sweeps(1, TWIST).offsets, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(images_of(stamped).offsets, box_room.sweeps(1, TWIST)[0].offsets, atol=1e-7)
 
 
 def test_the_middle_of_a_sweep_is_between_its_ends_however_its_points_are_spread():
@@ -52,57 +57,97 @@ def test_scans_without_times_have_no_offsets(box_room):
     scan = box_room.scans(1, TWIST)[0]
     untimed = Scan(scan.points, scan.stamp)
     assert middle_offset_s(untimed) == 0.0
-    images = Imager(CONFIG).images([untimed])
+    images = images_of(untimed)
     assert not images.offsets.any()
-    assert torch.equal(images.points, box_room.sweeps(1, TWIST).points)
+    assert np.array_equal(images.points, box_room.sweeps(1, TWIST)[0].points)
 
 
 def test_an_empty_scan_is_an_empty_image():
     assert middle_offset_s(EMPTY) == 0.0
-    images = Imager(CONFIG).images([EMPTY])
-    assert images.points.shape == (1, 3, 16, 360)
-    assert images.offsets.shape == (1, 16, 360)
+    images = images_of(EMPTY)
+    assert images.points.shape == (3, 16, 360)
+    assert images.offsets.shape == (16, 360)
     assert not images.points.any()
     assert not images.normals.any()
     assert not images.offsets.any()
     assert images.low < images.high
 
 
-@pytest.mark.parametrize("in_one_call", [True, False])
-def test_the_rows_are_those_of_the_first_scan_that_has_points(box_room, in_one_call):
+def test_the_rows_are_those_of_the_first_scan_that_has_points(box_room):
     full = box_room.scans(1, TWIST)[0]
     level = np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.1]])
     other = Scan(level, 0.2)  # on its own, its rows would span a single degree
     imager = Imager(CONFIG)
-    if not in_one_call:
-        imager.images([EMPTY])
-        imager.images([full])
-    images = imager.images([EMPTY, full, other])
-    assert images.low[1:].rad2deg().tolist() == pytest.approx([-18.0] * 2, abs=1e-4)
-    assert images.high[1:].rad2deg().tolist() == pytest.approx([18.0] * 2, abs=1e-4)
-    torch.testing.assert_close(images.points[1], box_room.sweeps(1, TWIST).points[0])
+    _, images, later = (images_of(scan, imager) for scan in (EMPTY, full, other))
+    for one in (images, later):
+        assert np.rad2deg([one.low, one.high]).tolist() == pytest.approx([-18.0, 18.0], abs=1e-4)
+    np.testing.assert_allclose(images.points, box_room.sweeps(1, TWIST)[0].points)
 
 
-@pytest.mark.parametrize("in_one_call", [True, False])
-def test_a_scan_of_few_points_does_not_fix_the_rows(box_room, in_one_call):
+def test_a_scan_of_few_points_does_not_fix_the_rows(box_room):
     """Each image says where its own rows lie; those of the scan with most points, until one has enough."""
     full = box_room.scans(1, TWIST)[0]
     elevation = np.rad2deg(np.arcsin(full.points[:, 2] / np.linalg.norm(full.points, axis=1)))
     fewer, few = (full.select(np.flatnonzero(elevation > above)[:most]) for above, most in ((10.0, 20), (3.0, 150)))
-    imager, scans = Imager(CONFIG), [fewer, few, fewer, full, few]
-    made = [imager.images(scans)] if in_one_call else [imager.images([scan]) for scan in scans]
-    low, high = (torch.cat([getattr(one, name) for one in made]).rad2deg() for name in ("low", "high"))
+    imager = Imager(CONFIG)
+    made = [images_of(scan, imager) for scan in (fewer, few, fewer, full, few)]
+    low, high = (np.rad2deg([getattr(one, name) for one in made]) for name in ("low", "high"))
     assert 10.0 < low[0] < 18.0
     assert 3.0 < low[1] == low[2] < 10.0
-    torch.testing.assert_close(low[3:], torch.full((2,), -18.0), rtol=0, atol=1e-4)
-    torch.testing.assert_close(high[3:], torch.full((2,), 18.0), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(low[3:], -18.0, atol=1e-4)
+    np.testing.assert_allclose(high[3:], 18.0, atol=1e-4)
 
 
 def test_an_imager_begins_anew(box_room):
     """Two sensors' imagers do not share their rows."""
-    Imager(CONFIG).images(box_room.scans(1, TWIST))
-    narrow = Imager(CONFIG).images([Scan(np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 1.0]]), 0.0)])
-    assert float(narrow.high.rad2deg()) == pytest.approx(math.degrees(math.atan(0.1)), abs=1e-4)
+    images_of(box_room.scans(1, TWIST)[0])
+    narrow = images_of(Scan(np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 1.0]]), 0.0))
+    assert np.rad2deg(narrow.high) == pytest.approx(math.degrees(math.atan(0.1)), abs=1e-4)
+
+
+def rows_for(scan: Scan, asked: int | None = None) -> int:
+    return Imager(CONFIG, asked).images(scan).alignment.points.shape[1]
+
+
+@pytest.mark.parametrize("with_rings", [True, False])
+@pytest.mark.parametrize(("rings", "rows"), [(16, 16), (32, 32), (64, 64), (128, 64)])
+def test_alignment_sees_as_many_rows_as_there_are_rings(box_room, rings, rows, with_rings):
+    (scan,) = replace(box_room, rows=rings, columns=720).scans(1, TWIST)
+    assert rows_for(scan if with_rings else replace(scan, rings=None)) == rows
+
+
+@pytest.mark.parametrize("azimuth_deg", [360.0, 70.0])
+def test_points_that_lie_in_no_rows_are_shown_to_alignment_as_to_the_network(azimuth_deg):
+    """As of a scanner that draws rosettes, all around or ahead alone."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = np.deg2rad(rng.uniform((0.0, -25.0), (azimuth_deg, 25.0), (24_000, 2))).T
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+    images = Imager(ImageConfig()).images(Scan(5.0 * rays, 0.0))
+    assert images.alignment is images.network
+
+
+def test_the_rows_of_alignment_may_be_asked_for(box_room):
+    (scan,) = box_room.scans(1, TWIST)
+    assert [rows_for(scan, asked) for asked in (8, 16, 40)] == [8, 16, 40]
+
+
+def test_more_rows_for_alignment_leave_the_images_of_the_network_as_they_are(box_room):
+    (scan,) = replace(box_room, rows=64, columns=720).scans(1, TWIST)
+    both, alone = Imager(CONFIG).images(scan), Imager(CONFIG, CONFIG.rows).images(scan)
+    assert both.alignment.points.shape == (3, 64, 360)
+    for name in ("points", "normals", "offsets"):
+        assert np.array_equal(getattr(both.network, name), getattr(alone.network, name))
+
+
+def test_the_rows_are_remembered(box_room, through_disk):
+    (scan,) = replace(box_room, rows=64, columns=720).scans(1, TWIST)
+    first, second = Imager(CONFIG), Imager(CONFIG)
+    first.images(scan)
+    second.restore(through_disk(first.state()))
+    few = scan.select(np.arange(0, len(scan), 5))
+    one, other = first.images(few).alignment, second.images(few).alignment
+    assert np.array_equal(one.points, other.points)
+    assert one.points.shape[1] == 64
 
 
 def _two_rings():
@@ -111,17 +156,17 @@ def _two_rings():
 
 
 def test_rows_are_rings_where_asked_for():
-    images = Imager(ImageConfig(columns=360, order="ring")).images([_two_rings()])
-    (rows, _) = images.points[0].square().sum(0).nonzero(as_tuple=True)
+    images = images_of(_two_rings(), Imager(ImageConfig(columns=360, order="ring")))
+    rows, _ = images.points.any(axis=0).nonzero()
     assert rows.tolist() == [3, 12]
-    assert images.points[0, 2, 3].max() == 0.5
-    by_elevation = Imager(ImageConfig(columns=360)).images([_two_rings()])
-    (rows, _) = by_elevation.points[0].square().sum(0).nonzero(as_tuple=True)
+    assert images.points[2, 3].max() == 0.5
+    by_elevation = images_of(_two_rings(), Imager(ImageConfig(columns=360)))
+    rows, _ = by_elevation.points.any(axis=0).nonzero()
     assert rows.tolist() == [0, 15]
 
 
 def test_rings_that_are_not_there_leave_elevations():
     scan = _two_rings()
-    images = Imager(ImageConfig(columns=360, order="ring")).images([Scan(scan.points, 0.0)])
-    (rows, _) = images.points[0].square().sum(0).nonzero(as_tuple=True)
+    images = images_of(Scan(scan.points, 0.0), Imager(ImageConfig(columns=360, order="ring")))
+    rows, _ = images.points.any(axis=0).nonzero()
     assert rows.tolist() == [0, 15]

@@ -9,7 +9,7 @@ import torch
 from lidarslam.core.geometry import log, rotation_angle
 from odometry.checkpoint import default_weights, load_checkpoint, network_of
 from odometry.correlation import CorrelationNetwork
-from odometry.hypotheses import CorrelationSearch, _peaks, _shift_scores
+from odometry.candidates import CorrelationSearch, _peaks, _shift_scores
 from odometry.torch_graphs import TorchGraphs
 
 TURN_DEG = 2.0
@@ -59,11 +59,13 @@ def test_the_shift_scores_are_those_of_training(network, rng):
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.9, -2.4])
-@pytest.mark.parametrize(("x", "y", "turn_deg"), [(3.0, -1.5, 0.0), (-6.0, 4.0, 0.0), (0.0, 0.0, 90.0), (1.0, 0.5, 20.0)])
+@pytest.mark.parametrize(
+    ("x", "y", "turn_deg"), [(3.0, -1.5, 0.0), (-6.0, 4.0, 0.0), (0.0, 0.0, 90.0), (1.0, 0.5, 20.0)]
+)
 def test_motions_of_any_size_are_found_whatever_the_heading(search, seen, heading, x, y, turn_deg):
     previous = search.describe(*seen(0.0, 0.0, 0.0), heading)
-    hypotheses, current = search.compare(previous, *seen(x, y, math.radians(turn_deg)))
-    best = hypotheses[0]
+    candidates, current = search.compare(previous, *seen(x, y, math.radians(turn_deg)))
+    best = candidates[0]
     assert math.degrees(rotation_angle(best.T_prev_curr)) == pytest.approx(turn_deg, abs=2.0 * TURN_DEG)
     np.testing.assert_allclose(best.T_prev_curr[:3, 3], [x, y, 0.0], atol=0.6)
     assert math.remainder(current.heading - heading - math.radians(turn_deg), 2.0 * math.pi) == pytest.approx(
@@ -71,12 +73,12 @@ def test_motions_of_any_size_are_found_whatever_the_heading(search, seen, headin
     )
 
 
-def test_hypotheses_are_a_distribution(search, seen):
-    hypotheses, _ = search.compare(search.describe(*seen(0.0, 0.0, 0.0)), *seen(2.0, 1.0, 0.3))
-    probabilities = np.exp([one.log_probability for one in hypotheses])
+def test_candidates_are_a_distribution(search, seen):
+    candidates, _ = search.compare(search.describe(*seen(0.0, 0.0, 0.0)), *seen(2.0, 1.0, 0.3))
+    probabilities = np.exp([one.log_probability for one in candidates])
     assert (np.diff(probabilities) <= 0.0).all()
     assert 0.0 < probabilities.sum() <= 1.0 + 1e-6
-    for one in hypotheses:
+    for one in candidates:
         assert np.isfinite(log(one.T_prev_curr)).all()
         assert (np.linalg.eigvalsh(one.covariance) > 0.0).all()
 
@@ -107,7 +109,7 @@ def test_peaks_on_the_border_of_shifts():
     assert [divmod(int(left[0].argmax()), 37) for left in _peaks(scores, 3, 4)] == [(0, 36), (30, 3)]
 
 
-def test_empty_scans_give_finite_hypotheses(search):
+def test_empty_scans_give_finite_candidates(search):
     nothing = np.zeros((3, 16, 720), dtype=np.float32)
-    hypotheses, _ = search.compare(search.describe(nothing, nothing), nothing, nothing)
-    assert all(np.isfinite(one.T_prev_curr).all() and np.isfinite(one.covariance).all() for one in hypotheses)
+    candidates, _ = search.compare(search.describe(nothing, nothing), nothing, nothing)
+    assert all(np.isfinite(one.T_prev_curr).all() and np.isfinite(one.covariance).all() for one in candidates)

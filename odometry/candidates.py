@@ -1,7 +1,7 @@
-"""What the default network holds possible of the motion between two scans: the highest peaks of its scores.
+"""Candidates of the motion between two scans: the highest peaks of the scores that the default network gives.
 
-Each peak of the scores of turns is a hypothesis of its own; the current scan, seen from above and turned by it, is
-correlated with the previous one over all shifts by the fast Fourier transform, and each peak there is one as well.
+Each peak of the scores of turns is followed; the current scan, seen from above and turned by it, is
+correlated with the previous one over all shifts by the fast Fourier transform, and each peak there is a candidate.
 """
 
 import math
@@ -27,18 +27,23 @@ _NEVER = np.float32(-1e4)
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """A motion that a network holds possible.
+class Candidate:
+    """A motion that is possible by a network's scores.
 
     Attributes:
         T_prev_curr: (4, 4).
         covariance: (6, 6) of a change of it from the left, rotation first.
-        log_probability: natural logarithm; of all hypotheses of a pair together at most 0.
+        log_probability: natural logarithm; of all candidates of a pair together at most 0.
     """
 
     T_prev_curr: FloatArray
     covariance: FloatArray
     log_probability: float
+
+    def is_motion(self) -> bool:
+        """Whether a motion follows from it; weights can be finite, and what they make of a scan is not."""
+        variances = np.diag(self.covariance)
+        return bool(np.isfinite(self.T_prev_curr).all() and np.isfinite(variances).all() and (variances > 0.0).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +63,13 @@ class Described:
 
 
 class Search(Protocol):
-    """Finds hypotheses of the motion from one scan to the next."""
+    """Finds candidates of the motion from one scan to the next."""
 
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
         """A scan (3, H, W), points and normals, by itself."""
 
-    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Hypothesis, ...], Described]:
-        """The hypotheses, the most probable first, of the motion of a scan (3, H, W), and what is kept of it."""
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
+        """The candidates, the most probable first, of the motion of a scan (3, H, W), and what is kept of it."""
 
 
 class Graphs(Protocol):
@@ -94,11 +99,11 @@ class CorrelationSearch:
         columns = self._graphs.columns(points[None], normals[None])
         return Described(columns, self._spectrum(points, normals, heading), heading)
 
-    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Hypothesis, ...], Described]:
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
         """See `Search`."""
         columns = self._graphs.columns(points[None], normals[None])
         turn_scores = self._graphs.turn_scores(previous.columns, columns)
-        found: list[tuple[float, Hypothesis, Described]] = []
+        found: list[tuple[float, Candidate, Described]] = []
         for turns in _peaks(turn_scores, _TURNS, _NEAR_COLUMNS):
             angle = float(turns[0].argmax()) * (2.0 * math.pi / turns.shape[1])
             heading = math.remainder(previous.heading + angle, 2.0 * math.pi)
@@ -107,12 +112,12 @@ class CorrelationSearch:
             for shifts in _peaks(shift_scores, _SHIFT_PEAKS, _NEAR_CELLS):
                 # Of both correlations together: a wrong turn has no high peak among the shifts.
                 score = float(turns.max() + shifts.max())
-                found.append((score, self._hypothesis(previous, turns, shifts), current))
+                found.append((score, self._candidate(previous, turns, shifts), current))
         found.sort(key=lambda one: -one[0])
         scores = np.array([score for score, _, _ in found])
         log_probabilities = scores - np.logaddexp.reduce(scores)
         kept = tuple(
-            Hypothesis(one.T_prev_curr, one.covariance, float(log_probability))
+            Candidate(one.T_prev_curr, one.covariance, float(log_probability))
             for (_, one, _), log_probability in zip(found, log_probabilities, strict=True)
             if log_probability >= log_probabilities[0] + math.log(_LEAST_PROBABILITY)
         )
@@ -122,7 +127,7 @@ class CorrelationSearch:
         features = self._graphs.bird(bird_eye(points, normals, heading)[None])[0]
         return np.asarray(fft.rfft2(features), dtype=np.complex64)
 
-    def _hypothesis(self, previous: Described, turns: Floats, shifts: Floats) -> Hypothesis:
+    def _candidate(self, previous: Described, turns: Floats, shifts: Floats) -> Candidate:
         angle, shift, log_sigma = self._graphs.peaks(turns, shifts)
         # The shift is seen in the frame of the previous grid, which is turned by its heading.
         c, s = math.cos(previous.heading), math.sin(previous.heading)
@@ -133,7 +138,7 @@ class CorrelationSearch:
         axes = np.zeros((6, 6))
         axes[:3, :3], axes[3:, 3:] = back, back
         variances = np.exp(2.0 * log_sigma.astype(np.float64))
-        return Hypothesis(T, axes @ np.diag(variances) @ axes.T, 0.0)
+        return Candidate(T, axes @ np.diag(variances) @ axes.T, 0.0)
 
 
 def _shift_scores(previous: NDArray[np.complex64], current: NDArray[np.complex64]) -> Floats:
