@@ -91,7 +91,7 @@ def column_of(azimuth: float, width: int) -> float:
 
 @compiled
 def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: Floats) -> None:
-    """Write the angles of a block of points to single precision, in separate loops, each of which takes several at once."""
+    """Write the angles of a block of points to single precision, in loops each of which takes several at once."""
     for i in range(len(x)):
         elevations[i] = _rough_arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
     for i in range(len(x)):

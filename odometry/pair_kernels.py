@@ -301,8 +301,8 @@ def _add_square(vector: FloatArray, total: FloatArray) -> None:
 def _write_row(i: int, held: Held, root: float, row: FloatArray) -> None:
     """Write a point's Jacobian (12,) and residual, times the root of its weight.
 
-    A point that is seen t seconds after the middle of its sweep, on a pixel seen t' after that of its own, moves with the
-    bend (t + t') times as it does with the motion.
+    A point that is seen t seconds after the middle of its sweep, on a pixel seen t' after that of its own, moves with
+    the bend (t + t') times as it does with the motion.
     """
     x, y, z, u, v, w = held.x[i], held.y[i], held.z[i], held.u[i], held.v[i], held.w[i]
     row[0], row[1], row[2] = root * (y * w - z * v), root * (z * u - x * w), root * (x * v - y * u)

@@ -13,7 +13,6 @@ from odometry import pair_kernels as kernels
 from odometry.alignment_config import AlignmentConfig
 from odometry.sweeps import SweepImages, SweepPair
 
-
 # Twice as many rows say hardly more if half as many points are taken of each.
 _FULL_ROWS = 32
 
