@@ -23,7 +23,7 @@ class LearnedConfig(BaseModel):
     )
     alignment: AlignmentConfig = AlignmentConfig(column_step=3)
     caution: float = Field(
-        4.0, gt=0.0, description="factor on the network's standard deviations, so that alignment leads where it can"
+        8.0, gt=0.0, description="factor on the network's standard deviations, so that alignment leads where it can"
     )
     turn_caution: float = Field(8.0, gt=0.0, description="and on those of the rotation")
     least_explained: float = Field(
