@@ -121,14 +121,16 @@ def _step(
 ) -> tuple[_State, float]:
     """One Gauss-Newton step, and by how much it moved."""
     H, g = config.information_per_m2 * H, config.information_per_m2 * g
-    expected = _expected(config) + (0.0 if guess.bend_information is None else guess.bend_information)
+    expected = _expected(config)
+    if guess.bend_information is not None:
+        expected = expected + guess.bend_information
     H[6:, 6:] += expected
     g[6:] += expected @ state.surprise
     if guess.information is not None:
         away = log(state.T_prev_curr @ inverse(guess.T_prev_curr))
         H[:6, :6] += guess.information
         g[:6] += guess.information @ away
-    H += _LEAST_INFORMATION * np.eye(12)
+    H.flat[::13] += _LEAST_INFORMATION
     delta = -np.linalg.solve(H, g)
     step, change = delta[:6], delta[6:]
     step = step * (config.largest_step / max(float(np.abs(step).max()), config.largest_step))

@@ -1,6 +1,5 @@
 """The loops over pixels and their neighbourhoods behind `odometry.normals`, compiled."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +9,21 @@ from lidarslam.core.compiled import compiled
 
 Floats = NDArray[np.float32]
 
-_TINY = 1e-30
+# All in single precision, of which a processor does twice as many at once.
+_ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0))
+_TINY = np.float32(1e-30)
 # A neighbourhood that is narrower than this share of its range is narrower than the rounding of its coordinates.
-_NARROWEST = 1e-5
+_NARROWEST = np.float32(1e-5)
 # Range noise spreads the points of a single ring over a plane that holds the rays themselves. Such a plane, 2.3
 # degrees or less from the ray, says nothing of the surface, and which of its sides faces the sensor is chance.
-_MOST_GRAZING = 0.04
+_MOST_GRAZING = np.float32(0.04)
 # Pixels that are worked on together, so that the processor takes several at once.
 BLOCK = 256
+# From one quantity of a block to the next. Were it a power of two, the processor would take a store for what the next
+# load needs, and wait.
+STRIDE = BLOCK + 16
+# Part of a row's pixels from which on all are worked on.
+MANY = 0.4
 
 
 class Neighbourhood(NamedTuple):
@@ -62,146 +68,156 @@ def planes(padded: Floats, margin: int, around: Neighbourhood, normals: Floats) 
         normals: written.
     """
     height, width = normals.shape[1:]
-    wanted, sums = np.empty(width, dtype=np.int64), np.empty((11, BLOCK), dtype=np.float32)
-    centre, neighbours = np.empty((4, BLOCK), dtype=np.float32), np.empty((4, BLOCK), dtype=np.float32)
+    wanted, neighbours = np.empty(width, dtype=np.int64), np.empty((4, BLOCK), dtype=np.float32)
+    work, found = np.empty(15 * STRIDE, dtype=np.float32), np.empty(3 * STRIDE, dtype=np.float32)
     for i in range(height):
         count, ranges = 0, padded[3, i + around.rows]
         for j in range(width):
             if ranges[margin + j] < np.inf and not (normals[0, i, j] or normals[1, i, j] or normals[2, i, j]):
                 wanted[count] = margin + j
                 count += 1
+        if count > MANY * width:  # one beside the other they are read faster than if the others were left out
+            for j in range(width):
+                wanted[j] = margin + j
+            count = width
         for begin in range(0, count, BLOCK):
             block = wanted[begin : min(begin + BLOCK, count)]
-            _scatter(padded, i, block, around, centre, neighbours, sums)
-            for k in range(len(block)):
+            size = len(block)
+            _scatter(padded, i, block, around, neighbours, work)
+            _fit(size, work, around, found)
+            for k in range(size):
                 j = block[k] - margin
-                normals[0, i, j], normals[1, i, j], normals[2, i, j] = _normal(centre[:, k], sums[:, k], around)
+                if not (normals[0, i, j] or normals[1, i, j] or normals[2, i, j]):
+                    normals[0, i, j], normals[1, i, j] = found[k], found[STRIDE + k]
+                    normals[2, i, j] = found[2 * STRIDE + k]
 
 
 @compiled
 def _scatter(
-    padded: Floats, i: int, block: NDArray[np.int64], around: Neighbourhood, centre: Floats, neighbours: Floats,
-    sums: Floats,
-) -> None:  # fmt: skip
+    padded: Floats, i: int, block: NDArray[np.int64], around: Neighbourhood, neighbours: Floats, work: Floats
+) -> None:
     """Write what the neighbours of the pixels of a block, all of row i, are like, about the pixel itself.
 
-    Coordinates of tens of metres would leave no digits to float32.
+    Coordinates of tens of metres would leave no digits to float32. Each neighbour is added for the whole block, so that
+    the processor takes several pixels at once.
 
-    Rows of `sums` (11, 256): number, squared distance of the nearest, sums of x, y, z, xx, yy, zz, xy, yz, xz. Each
-    neighbour is added for the whole block, so that the processor takes several pixels at once.
+    Args:
+        padded, around: as for `planes`.
+        i: the row.
+        block: (K,) columns of the padded image.
+        neighbours: (4, 256), room.
+        work: (15 * STRIDE,), written: x, y, z and range of the pixels; of their neighbours the number, the squared
+            distance of the nearest, and sums of x, y, z, xx, yy, zz, xy, yz, xz.
     """
     size = len(block)
+    together = block[size - 1] - block[0] == size - 1
+    work[:] = 0.0
+    work[5 * STRIDE : 6 * STRIDE] = np.inf
     for channel in range(4):
-        _gather(padded[channel, i + around.rows], block, 0, centre[channel])
-    sums[:] = 0.0
-    sums[1] = np.inf
+        row = padded[channel, i + around.rows]
+        for k in range(size):
+            work[channel * STRIDE + k] = row[block[k]]
     gate_m = np.float32(around.gate_m)
+    near_x, near_y, near_z, near_ranges = neighbours[0], neighbours[1], neighbours[2], neighbours[3]
     for down in range(2 * around.rows + 1):
+        # One by one: what is indexed by a slice in the middle is taken as not contiguous, and is not done at once.
+        x, y, z, ranges = padded[0, i + down], padded[1, i + down], padded[2, i + down], padded[3, i + down]
         for right in range(-around.columns, around.columns + 1):
-            for channel in range(4):
-                _gather(padded[channel, i + down], block, right, neighbours[channel])
-            x, y, z = neighbours[0], neighbours[1], neighbours[2]
-            _differences(size, gate_m, centre, neighbours)
-            if down != around.rows or right != 0:
-                _keep_least(size, neighbours, sums[1])
-            near = neighbours[3]
-            _add(size, near, sums[0])
-            _add(size, x, sums[2])
-            _add(size, y, sums[3])
-            _add(size, z, sums[4])
-            _add_product(size, x, x, sums[5])
-            _add_product(size, y, y, sums[6])
-            _add_product(size, z, z, sums[7])
-            _add_product(size, x, y, sums[8])
-            _add_product(size, y, z, sums[9])
-            _add_product(size, x, z, sums[10])
+            least = np.float32(np.inf if down == around.rows and right == 0 else 0.0)
+            if together:
+                begin, end = block[0] + right, block[0] + right + size
+                _add(size, gate_m, least, x[begin:end], y[begin:end], z[begin:end], ranges[begin:end], work)
+            else:
+                for k in range(size):
+                    j = block[k] + right
+                    near_x[k], near_y[k], near_z[k], near_ranges[k] = x[j], y[j], z[j], ranges[j]
+                _add(size, gate_m, least, near_x, near_y, near_z, near_ranges, work)
 
 
 @compiled
-def _gather(row: Floats, block: NDArray[np.int64], right: int, values: Floats) -> None:
-    for k in range(len(block)):
-        values[k] = row[block[k] + right]
+def _add(
+    size: int, gate_m: np.float32, least: np.float32, x: Floats, y: Floats, z: Floats, ranges: Floats, work: Floats
+) -> None:
+    """Add a neighbour of each pixel to what `_scatter` writes; `least` is added to its distance."""
+    zero, one, far = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
+    for k in range(size):
+        near = abs(ranges[k] - work[3 * STRIDE + k]) <= gate_m
+        mask = one if near else zero
+        dx, dy, dz = (x[k] - work[k]) * mask, (y[k] - work[STRIDE + k]) * mask, (z[k] - work[2 * STRIDE + k]) * mask
+        xx, yy, zz = dx * dx, dy * dy, dz * dz
+        apart = xx + yy + zz + least
+        apart = apart if near else far
+        work[4 * STRIDE + k] += mask
+        work[5 * STRIDE + k] = apart if apart < work[5 * STRIDE + k] else work[5 * STRIDE + k]
+        work[6 * STRIDE + k] += dx
+        work[7 * STRIDE + k] += dy
+        work[8 * STRIDE + k] += dz
+        work[9 * STRIDE + k] += xx
+        work[10 * STRIDE + k] += yy
+        work[11 * STRIDE + k] += zz
+        work[12 * STRIDE + k] += dx * dy
+        work[13 * STRIDE + k] += dy * dz
+        work[14 * STRIDE + k] += dx * dz
 
 
 @compiled
-def _differences(size: int, gate_m: np.float32, centre: Floats, neighbours: Floats) -> None:
-    """Make neighbours differences to the centre, zero where they are not near; their ranges become 1 where they are."""
-    x, y, z, distance = neighbours[0], neighbours[1], neighbours[2], neighbours[3]
-    cx, cy, cz, middle = centre[0], centre[1], centre[2], centre[3]
+def _fit(size: int, work: Floats, around: Neighbourhood, found: Floats) -> None:
+    """Write the normals (3 * STRIDE,) of a block of pixels that have these neighbours; zero if they lie on no plane.
+
+    Without branches, so that the processor takes several at once. The smallest eigenvalue is the root of the
+    characteristic polynomial that Newton's method finds from below; of a plane, in few steps. Where it is not small the
+    answer is too small, and still too large for a plane.
+    """
+    least_count, most_apart_m2 = np.float32(around.min_neighbours), np.float32(around.most_apart_m**2)
+    max_flatness, min_spread = np.float32(around.max_flatness), np.float32(around.min_spread)
     for k in range(size):
-        distance[k] = np.float32(1.0) if abs(distance[k] - middle[k]) <= gate_m else np.float32(0.0)
-    for k in range(size):
-        x[k] = (x[k] - cx[k]) * distance[k]
-    for k in range(size):
-        y[k] = (y[k] - cy[k]) * distance[k]
-    for k in range(size):
-        z[k] = (z[k] - cz[k]) * distance[k]
+        x, y, z, distance = work[k], work[STRIDE + k], work[2 * STRIDE + k], work[3 * STRIDE + k]
+        count, sx, sy, sz = work[4 * STRIDE + k], work[6 * STRIDE + k], work[7 * STRIDE + k], work[8 * STRIDE + k]
+        each = _ONE / (count if count > _ONE else _ONE)
+        mx, my, mz = sx * each, sy * each, sz * each
+        xx, yy, zz = work[9 * STRIDE + k] - sx * mx, work[10 * STRIDE + k] - sy * my, work[11 * STRIDE + k] - sz * mz
+        xy, yz, xz = work[12 * STRIDE + k] - sx * my, work[13 * STRIDE + k] - sy * mz, work[14 * STRIDE + k] - sx * mz
+        # Rounding may leave next to nothing, or less, of the scatter of points that are all but one.
+        size_m2 = xx + yy + zz
+        is_plane = count >= least_count and work[5 * STRIDE + k] <= most_apart_m2 and size_m2 > _TINY
+        scale = _ONE / (size_m2 if size_m2 > _TINY else _ONE)
+        xx, yy, zz, xy, yz, xz = xx * scale, yy * scale, zz * scale, xy * scale, yz * scale, xz * scale
+        # The characteristic polynomial is s^3 - s^2 + pairs s - determinant.
+        pairs = (xx * yy - xy * xy) + (yy * zz - yz * yz) + (zz * xx - xz * xz)
+        determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+        s = determinant / (pairs if pairs > _TINY else _ONE)
+        s = s - (((s - _ONE) * s + pairs) * s - determinant) / _steepness(s, pairs)
+        s = s - (((s - _ONE) * s + pairs) * s - determinant) / _steepness(s, pairs)
+        s = s - (((s - _ONE) * s + pairs) * s - determinant) / _steepness(s, pairs)
+        # The other two have the sum 1 - s and this product.
+        product, half = pairs - s * (_ONE - s), _HALF * (_ONE - s)
+        left = half * half - product
+        largest = half + np.sqrt(left if left > _ZERO else _ZERO)
+        middle = product / (largest if largest > _TINY else _ONE)
+        narrowest = _NARROWEST * distance
+        is_plane = is_plane and s <= max_flatness * middle and middle >= min_spread * largest
+        is_plane = is_plane and middle * size_m2 > count * narrowest * narrowest
+        # The rows of A - s I are at right angles to the normal: the longest of their cross products is along it.
+        a, b, c = xx - s, yy - s, zz - s
+        first, second, third = b * c - yz * yz, a * c - xz * xz, a * b - xy * xy
+        off_xy, off_yz, off_xz = xz * yz - xy * c, xy * xz - a * yz, xy * yz - xz * b
+        by_first = first >= second and first >= third
+        by_second = second >= third
+        u = first if by_first else (off_xy if by_second else off_xz)
+        v = off_xy if by_first else (second if by_second else off_yz)
+        w = off_xz if by_first else (off_yz if by_second else third)
+        length = np.sqrt(u * u + v * v + w * w)
+        each = _ONE / (length if length > _TINY else _ONE)
+        away = (u * x + v * y + w * z) * each
+        is_plane = is_plane and abs(away) >= _MOST_GRAZING * distance
+        each = -each if away > _ZERO else each
+        found[k] = u * each if is_plane else _ZERO
+        found[STRIDE + k] = v * each if is_plane else _ZERO
+        found[2 * STRIDE + k] = w * each if is_plane else _ZERO
 
 
 @compiled
-def _keep_least(size: int, neighbours: Floats, nearest: Floats) -> None:
-    x, y, z, near = neighbours[0], neighbours[1], neighbours[2], neighbours[3]
-    for k in range(size):
-        squared = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
-        squared = squared if near[k] > 0.0 else np.float32(np.inf)
-        nearest[k] = squared if squared < nearest[k] else nearest[k]
-
-
-@compiled
-def _add(size: int, values: Floats, total: Floats) -> None:
-    for k in range(size):
-        total[k] += values[k]
-
-
-@compiled
-def _add_product(size: int, values: Floats, others: Floats, total: Floats) -> None:
-    for k in range(size):
-        total[k] += values[k] * others[k]
-
-
-@compiled
-def _normal(centre: Floats, sums: Floats, around: Neighbourhood) -> tuple[float, float, float]:
-    """The normal of a pixel (4,) that has these neighbours; zero if they lie on no plane."""
-    x, y, z, distance = centre[0], centre[1], centre[2], centre[3]
-    none = 0.0, 0.0, 0.0
-    count = np.float64(sums[0])
-    if count < around.min_neighbours or sums[1] > around.most_apart_m**2:
-        return none
-    mx, my, mz = sums[2] / count, sums[3] / count, sums[4] / count
-    xx, yy, zz = sums[5] - sums[2] * mx, sums[6] - sums[3] * my, sums[7] - sums[4] * mz
-    xy, yz, xz = sums[8] - sums[2] * my, sums[9] - sums[3] * mz, sums[10] - sums[2] * mz
-    # Rounding may leave next to nothing, or less, of the scatter of points that are all but one.
-    size = xx + yy + zz
-    if not size > _TINY:
-        return none
-    xx, yy, zz, xy, yz, xz = xx / size, yy / size, zz / size, xy / size, yz / size, xz / size
-    # Smith, "Eigenvalues of a symmetric 3 x 3 matrix", 1961. Where the two larger ones are nearly equal their
-    # difference is inexact, but not the smallest.
-    a, b, c = xx - 1.0 / 3.0, yy - 1.0 / 3.0, zz - 1.0 / 3.0
-    radius = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + yz * yz + xz * xz)) / 6.0)
-    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
-    cosine = determinant / (2.0 * max(radius, 1e-9) ** 3)
-    angle = math.acos(min(max(cosine, -1.0), 1.0)) / 3.0
-    largest = 1.0 / 3.0 + 2.0 * radius * math.cos(angle)
-    smallest = 1.0 / 3.0 + 2.0 * radius * math.cos(angle + 2.0 * math.pi / 3.0)
-    middle = 1.0 - largest - smallest
-    if not (smallest <= around.max_flatness * middle and middle >= around.min_spread * largest):
-        return none
-    if not middle * size > count * (_NARROWEST * distance) ** 2:
-        return none
-    # The rows of A - smallest I are at right angles to the normal: the longest of their cross products is along it.
-    a, b, c = xx - smallest, yy - smallest, zz - smallest
-    first, second, third = b * c - yz * yz, a * c - xz * xz, a * b - xy * xy
-    off_xy, off_yz, off_xz = xz * yz - xy * c, xy * xz - a * yz, xy * yz - xz * b
-    if first >= second and first >= third:
-        u, v, w = first, off_xy, off_xz
-    elif second >= third:
-        u, v, w = off_xy, second, off_yz
-    else:
-        u, v, w = off_xz, off_yz, third
-    length = math.sqrt(u * u + v * v + w * w)
-    away = (u * x + v * y + w * z) / max(length, _TINY)
-    if not abs(away) >= _MOST_GRAZING * distance:
-        return none
-    length = max(length, _TINY) * (-1.0 if away > 0.0 else 1.0)
-    return u / length, v / length, w / length
+def _steepness(s: np.float32, pairs: np.float32) -> np.float32:
+    """The derivative of the characteristic polynomial, which is positive below the smallest eigenvalue."""
+    steepness = (_THREE * s - _TWO) * s + pairs
+    return steepness if steepness > _TINY else _ONE

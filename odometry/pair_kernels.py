@@ -87,12 +87,15 @@ class Held(NamedTuple):
 
 
 @compiled
-def sample(points: Floats, normals: Floats, offsets: Floats, step: int, chosen: Floats) -> int:
-    """Write every so-manieth pixel of each row that has a normal, (N, 7) as of `Sweep`, and tell how many they are."""
+def sample(points: Floats, normals: Floats, offsets: Floats, step: int, fewer: int, chosen: Floats) -> int:
+    """Write one of `step * fewer` pixels of each row, if it has a normal, (N, 7) as of `Sweep`, and tell how many.
+
+    So many rows in turn begin a step later.
+    """
     height, width = offsets.shape
     count = 0
     for i in range(height):
-        for j in range(0, width, step):
+        for j in range(i % fewer * step, width, step * fewer):
             u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
             if u * u + v * v + w * w > 0.5:
                 point = chosen[count]
@@ -109,16 +112,21 @@ def fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels:
     Those without a normal stand for the nearest in their row that has one, up to so many columns away.
     """
     height, width = offsets.shape
+    there = np.empty(width, dtype=np.bool_)
     for i in range(height):
         for j in range(width):
+            u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
+            there[j] = u * u + v * v + w * w > 0.5
+        for j in range(width):
             source = j
-            for step in range(2 * columns + 1):
-                distance = (step + 1) // 2 * (1 if step % 2 == 1 else -1)  # 0, 1 to the left, 1 to the right, 2 ...
-                c = (j - distance) % width
-                u, v, w = normals[0, i, c], normals[1, i, c], normals[2, i, c]
-                if u * u + v * v + w * w > 0.5:
-                    source = c
-                    break
+            if not there[j]:
+                for distance in range(1, columns + 1):
+                    left, right = j - distance, j + distance
+                    left = left + width if left < 0 else left
+                    right = right - width if right >= width else right
+                    if there[left] or there[right]:
+                        source = left if there[left] else right
+                        break
             pixel = pixels[i * width + j]
             for axis in range(3):
                 pixel[axis], pixel[3 + axis] = points[axis, i, source], normals[axis, i, source]
@@ -144,12 +152,18 @@ def _compensate(x: float, y: float, z: float, t: float, velocity: FloatArray) ->
 
 @compiled
 def _place(
-    held: Held, size: int, planes: Planes, angles: tuple[FloatArray, FloatArray], pixels: NDArray[np.int64]
+    held: Held,
+    size: int,
+    planes: Planes,
+    angles: tuple[Floats, Floats, Floats, Floats, Floats],
+    pixels: NDArray[np.int64],
 ) -> None:
-    """Write the pixels of a block of points, and whether they are inside; `angles` (256,) are room."""
-    elevations, azimuths = angles
+    """Write the pixels of a block of points, and whether they are inside; `angles` (5, 256) are room."""
+    x, y, z, elevations, azimuths = angles
     per_radian = (planes.height - 1) / (planes.high - planes.low)
-    write_angles(held.x[:size], held.y[:size], held.z[:size], elevations, azimuths)
+    for i in range(size):
+        x[i], y[i], z[i] = held.x[i], held.y[i], held.z[i]
+    write_angles(x[:size], y[:size], z[:size], elevations, azimuths)
     for i in range(size):
         row = row_of(elevations[i], planes.low, per_radian)
         held.inside[i] = row >= 0.0 and row < planes.height
@@ -169,7 +183,7 @@ def _hold(
     ground that the beams graze, pixels are metres wide; were they not, rings, which go along with the sensor, would
     hold it back.
     """
-    T, angles, pixels = motion.T, (np.empty(BLOCK), np.empty(BLOCK)), np.empty(BLOCK, dtype=np.int64)
+    T, pixels, angles = motion.T, np.empty(BLOCK, dtype=np.int64), _angles()
     for i in range(size):
         n = begin + i
         a, b, c, t = sweep.points[n, 0], sweep.points[n, 1], sweep.points[n, 2], np.float64(sweep.points[n, 6])
@@ -206,6 +220,13 @@ def _hold(
 
 
 @compiled
+def _angles() -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Room for points and their angles."""
+    x, y, z = np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
+    return x, y, z, np.empty(BLOCK, dtype=np.float32), np.empty(BLOCK, dtype=np.float32)
+
+
+@compiled
 def _room() -> Held:
     # Arrays of their own: of views of one, the compiler cannot tell that they do not overlap.
     x, y, z, residuals = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
@@ -219,14 +240,16 @@ def normal_equations(
     sweep: Sweep, planes: Planes, motion: Motion, scale_m: float, gates: Gates, H: FloatArray, g: FloatArray
 ) -> None:
     """Write H (12, 12) and g (12,) of the squares of residuals, with Geman and McClure's weights of this scale."""
-    H[:], g[:], J, held = 0.0, 0.0, np.empty(12), _room()
+    total, rows, held = np.zeros((13, 13)), np.empty((BLOCK, 13)), _room()
     for begin in range(0, len(sweep.points), BLOCK):
-        size = min(BLOCK, len(sweep.points) - begin)
+        size, count = min(BLOCK, len(sweep.points) - begin), 0
         _hold(begin, size, sweep, planes, motion, scale_m, gates, held)
         for i in range(size):
             if held.kept[i]:
-                root = 1.0 + (held.residuals[i] / scale_m) ** 2
-                _add(i, held, 1.0 / (root * root), H, g, J)
+                _write_row(i, held, 1.0 / (1.0 + (held.residuals[i] / scale_m) ** 2), rows[count])
+                count += 1
+        total += np.dot(rows[:count].T, rows[:count])
+    H[:], g[:] = total[:12, :12], total[:12, 12]
 
 
 @compiled
@@ -244,10 +267,10 @@ def judge(
     Returns:
         How many are in view, how many lie well, and the sum of the latter's squared residuals.
     """
-    H[:], in_view[:], matched[:], J, g, held = 0.0, 0.0, 0.0, np.empty(12), np.zeros(12), _room()
-    seen, count, squares, turned = 0, 0, 0.0, np.empty(3)
+    in_view[:], matched[:], total, rows, held = 0.0, 0.0, np.zeros((13, 13)), np.empty((BLOCK, 13)), _room()
+    seen, matches, turned = 0, 0, np.empty(3)
     for begin in range(0, len(sweep.points), BLOCK):
-        size = min(BLOCK, len(sweep.points) - begin)
+        size, count = min(BLOCK, len(sweep.points) - begin), 0
         _hold(begin, size, sweep, planes, motion, scale_m, gates, held)
         for i in range(size):
             if not held.inside[i]:
@@ -259,10 +282,12 @@ def judge(
             _add_square(turned, in_view)
             if held.kept[i] and abs(held.residuals[i]) < 2.0 * scale_m:
                 _add_square(turned, matched)
+                _write_row(i, held, 1.0, rows[count])
                 count += 1
-                squares += held.residuals[i] ** 2
-                _add(i, held, 1.0, H, g, J)
-    return seen, count, squares
+        matches += count
+        total += np.dot(rows[:count].T, rows[:count])
+    H[:] = total[:12, :12]
+    return seen, matches, total[12, 12]
 
 
 @compiled
@@ -273,15 +298,15 @@ def _add_square(vector: FloatArray, total: FloatArray) -> None:
 
 
 @compiled
-def _add(i: int, held: Held, weight: float, H: FloatArray, g: FloatArray, J: FloatArray) -> None:
-    """Add one point's share to H (12, 12) and g (12,); J (12,) is room."""
+def _write_row(i: int, held: Held, root: float, row: FloatArray) -> None:
+    """Write a point's Jacobian (12,) and residual, times the root of its weight.
+
+    A point that is seen t seconds after the middle of its sweep, on a pixel seen t' after that of its own, moves with
+    the bend (t + t') times as it does with the motion.
+    """
     x, y, z, u, v, w = held.x[i], held.y[i], held.z[i], held.u[i], held.v[i], held.w[i]
-    J[0], J[1], J[2] = y * w - z * v, z * u - x * w, x * v - y * u
-    J[3], J[4], J[5] = u, v, w
+    row[0], row[1], row[2] = root * (y * w - z * v), root * (z * u - x * w), root * (x * v - y * u)
+    row[3], row[4], row[5] = root * u, root * v, root * w
     for j in range(6):
-        J[6 + j] = held.offsets_s[i] * J[j]
-    for j in range(12):
-        weighted = weight * J[j]
-        g[j] += weighted * held.residuals[i]
-        for k in range(12):
-            H[j, k] += weighted * J[k]
+        row[6 + j] = held.offsets_s[i] * row[j]
+    row[12] = root * held.residuals[i]

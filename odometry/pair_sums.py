@@ -13,6 +13,9 @@ from odometry import pair_kernels as kernels
 from odometry.alignment_config import AlignmentConfig
 from odometry.sweeps import SweepImages, SweepPair
 
+# Twice as many rows say hardly more if half as many points are taken of each.
+_FULL_ROWS = 32
+
 
 @dataclass(frozen=True, eq=False)
 class Movement:
@@ -80,10 +83,11 @@ class PairSums:
 
 
 def _points(images: SweepImages, column_step: int) -> kernels.Sweep:
-    """Every so-manieth pixel of each row that has a normal."""
+    """Every so-manieth pixel of each row that has a normal; the more rows, the fewer of each."""
     height, width = images.offsets.shape
-    room = np.empty((height * (width // column_step + 1), 7), dtype=np.float32)
-    count = kernels.sample(images.points, images.normals, images.offsets, column_step, room)
+    fewer = max(1, height // _FULL_ROWS)
+    room = np.empty((height * (width // (fewer * column_step) + 1), 7), dtype=np.float32)
+    count = kernels.sample(images.points, images.normals, images.offsets, column_step, fewer, room)
     return kernels.Sweep(room[:count])
 
 

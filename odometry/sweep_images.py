@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from odometry.image_config import ImageConfig
+from odometry.normal_config import NormalConfig
 from odometry.normals import surface_normals
 from odometry.projection import ImageGrid, Points, Projection, project_sweep
 from odometry.sweeps import SweepImages
@@ -22,6 +23,9 @@ _ROWS = (64, 48, 32)
 _FILLED, _FILLED_BY_RINGS = 0.8, 0.5
 # Part of the columns in which a sensor that turns sees something. The points of one that does not lie in no rows.
 _SEEN_COLUMNS = 0.5
+# Where rows are close together a patch need not be wide; one that is wider than high takes its tilt from the noise of
+# a ring, and the ground that seems tilted holds alignment back.
+_FINE_PATCH = {"rows": 2, "columns": 1, "wide_columns": 2}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +78,13 @@ class Imager:
         times, middle = scan.time_offsets, middle_offset_s(scan)
         if self._alignment_rows == grid.rows:
             (projection,) = project_sweep(scan.points, times, middle, (grid,), rings)
-            images = self._with_normals(projection, grid)
+            images = _with_normals(projection, grid, self._config.normals)
             return ScanImages(images, images)
         fine = ImageGrid(self._alignment_rows, grid.columns, grid.elevation_low, grid.elevation_high)
         shown = project_sweep(scan.points, times, middle, (grid, fine), rings)
-        return ScanImages(*(self._with_normals(*each) for each in zip(shown, (grid, fine), strict=True)))
-
-    def _with_normals(self, projection: Projection, grid: ImageGrid) -> SweepImages:
-        normals = surface_normals(projection.image, self._config.normals)
-        return SweepImages(
-            projection.image[:3], normals, projection.offsets, grid.elevation_low, grid.elevation_high
-        )  # fmt: skip
+        normals = self._config.normals
+        fine_normals = normals.model_copy(update=_FINE_PATCH) if fine.rows > grid.rows else normals
+        return ScanImages(_with_normals(shown[0], grid, normals), _with_normals(shown[1], fine, fine_normals))
 
     def _grid_of(self, scan: Scan) -> ImageGrid:
         """The grid for a scan, which is that of an earlier one unless this one tells more."""
@@ -94,6 +94,11 @@ class Imager:
             self._grid_points = len(scan)
             self._alignment_rows = self._asked_rows or rows_of_sensor(points, scan.rings, self._grid)
         return self._grid
+
+
+def _with_normals(projection: Projection, grid: ImageGrid, config: NormalConfig) -> SweepImages:
+    normals = surface_normals(projection.image, config)
+    return SweepImages(projection.image[:3], normals, projection.offsets, grid.elevation_low, grid.elevation_high)
 
 
 def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageGrid) -> int:

@@ -196,7 +196,7 @@ def test_between_two_walls_the_covariance_along_them_is_the_networks(walls, turn
     scans = near(walls.scans(2, STILL, exp((0.0, 0.0, turned, 0.0, 0.0, 0.0))))
     unsure, sure = (sigmas(scans, Told(np.eye(4), log_sigma=math.log(sigma_m))) for sigma_m in (3.0, 0.01))
     assert unsure[along] == pytest.approx(LearnedConfig().caution * 3.0, rel=0.2)
-    assert sure[along] < 0.05
+    assert sure[along] < 0.1
     assert unsure[7 - along] < 0.05  # across
 
 
