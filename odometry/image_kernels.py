@@ -178,16 +178,16 @@ def _keep_nearest(begin: int, size: int, block: Block, rings: NDArray[np.int64],
         distance = distances[i]
         if not (distance > 0.0 and distance < np.inf):
             continue
-        row, column = np.floor(rows[i]), np.floor(columns[i])
+        row, column = int(rows[i]), int(columns[i])  # what is below 0 is cut to more, and so is not sure
         if len(rings) > 0:
-            row = float(rings[begin + i])
+            row = rings[begin + i]
         elif abs(rows[i] - row - 0.5) > _SURE:
             x, y, z = np.float64(block.x[i]), np.float64(block.y[i]), np.float64(block.z[i])
-            row = row_of(_arc_tangent(z, math.sqrt(x * x + y * y)), low, per_radian)
+            row = int(row_of(_arc_tangent(z, math.sqrt(x * x + y * y)), low, per_radian))
         if abs(columns[i] - column - 0.5) > _SURE:
-            column = column_of(_arc_tangent(np.float64(block.y[i]), np.float64(block.x[i])), width)
-        if row >= 0.0 and row < height:
-            pixel = int(row) * width + int(column)
+            column = int(column_of(_arc_tangent(np.float64(block.y[i]), np.float64(block.x[i])), width))
+        if row >= 0 and row < height:
+            pixel = row * width + column
             if distance < ranges[pixel]:
                 shown[pixel], ranges[pixel] = begin + i, distance
 
