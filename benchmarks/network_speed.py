@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from mapping_accuracy import simulate
 
-from odometry.alignment import Hypothesis, align
+from odometry.alignment import Guess, align
 from odometry.image_config import ImageConfig
 from odometry.learned_config import LearnedConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig, NetworkName
@@ -83,7 +83,7 @@ def _stages(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
     sweeps, config = SweepPair(current, previous, 0.1), LearnedConfig().alignment
     return {
         "images and normals": lambda: imager.images(scans[1]),
-        "alignment": lambda: align(Hypothesis(np.eye(4)), sweeps, config),
+        "alignment": lambda: align(Guess(np.eye(4)), sweeps, config),
     }
 
 

@@ -9,7 +9,7 @@ the change is expected to go on as between the motions before.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,18 +29,21 @@ _LEAST_INFORMATION = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class Guess:
     """A first guess about a motion.
 
     Attributes:
         T_prev_curr: (4, 4) between the middles of the sweeps.
         information: (6, 6) its inverse covariance, for a change from the left; None: it is only where to start from.
+            It counts along the directions of which the images have less.
         bend_information: (6, 6) what is known of the bend beyond that it mostly goes on as before; None: nothing.
+        odds: how much less likely it is than the first guess, as a number of standard deviations.
     """
 
     T_prev_curr: FloatArray
     information: FloatArray | None = None
     bend_information: FloatArray | None = None
+    odds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,7 @@ class Aligned:
         information: (6, 6) of the images alone, rotation first, for a change of `T_prev_curr` from the left, if
             points scattered independently by 1 m about their planes; divide by their variance. What not knowing the
             bend takes away is taken away.
+        guess_information: (6, 6) of the guess, along the directions in which it counts.
         share: of the points with a normal that lie on the other image.
         explained: of what the current scan's points in view of the other image say about the direction of
             translation that fares worst, the part said by those that lie on it. Most of a street looks the same a
@@ -66,6 +70,7 @@ class Aligned:
     T_prev_curr: FloatArray
     bend: FloatArray
     information: FloatArray
+    guess_information: FloatArray
     share: float
     explained: float
     weakest: FloatArray
@@ -81,7 +86,7 @@ class _State:
     surprise: FloatArray
 
 
-def align(guess: Hypothesis, sweeps: SweepPair, config: AlignmentConfig) -> Aligned:
+def align(guess: Guess, sweeps: SweepPair, config: AlignmentConfig) -> Aligned:
     """Refine a motion so that the current image lies on the previous one.
 
     Gauss-Newton on point-to-plane distances with Geman-McClure weights whose scale shrinks from step to step.
@@ -89,22 +94,39 @@ def align(guess: Hypothesis, sweeps: SweepPair, config: AlignmentConfig) -> Alig
     return align_each([guess], sweeps, config)[0]
 
 
-def align_each(guesses: Sequence[Hypothesis], sweeps: SweepPair, config: AlignmentConfig) -> list[Aligned]:
+def align_each(guesses: Sequence[Guess], sweeps: SweepPair, config: AlignmentConfig) -> list[Aligned]:
     """As `align`, from each of several guesses."""
     sums = PairSums(sweeps, config)
     return [_align(guess, sweeps, sums, config) for guess in guesses]
 
 
-def _align(guess: Hypothesis, sweeps: SweepPair, sums: PairSums, config: AlignmentConfig) -> Aligned:
-    state = _State(guess.T_prev_curr, np.zeros(6))
+def _align(guess: Guess, sweeps: SweepPair, sums: PairSums, config: AlignmentConfig) -> Aligned:
+    state, prior = _State(guess.T_prev_curr, np.zeros(6)), guess.information
     for done in np.linspace(0.0, 1.0, config.iterations).tolist():
         scale_m = config.coarse_m * (config.fine_m / config.coarse_m) ** min(1.0, done / config.anneal_share)
         H, g = sums.normal_equations(_movement(state, sweeps), scale_m)
-        state, moved = _step(state, H, g, guess, config)
+        if done >= config.anneal_share and guess.information is not None:
+            seen = config.information_per_m2 * _information(H, config)
+            prior = _where_unseen(guess.information, seen)
+        state, moved = _step(state, H, g, replace(guess, information=prior), config)
         if done >= config.anneal_share and moved < _ARRIVED:
             break
     movement = _movement(state, sweeps)
-    return _judge(movement, sums.tally(movement), config)
+    kept = np.zeros((6, 6)) if prior is None else prior
+    return _judge(movement, sums.tally(movement), kept, config)
+
+
+def _where_unseen(prior: FloatArray, seen: FloatArray) -> FloatArray:
+    """(6, 6) the part of a guess's information (6, 6) along directions in which the images' (6, 6) is less.
+
+    The network's errors are not independent from scan to scan: it takes small translations for smaller ones. Where the
+    images decide, even a small share of it would add up to a drift.
+    """
+    root = np.linalg.cholesky(prior)
+    half = np.linalg.solve(root, seen)
+    ratios, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
+    kept = root @ axes[:, ratios < 1.0]
+    return np.asarray(kept @ kept.T)
 
 
 def _movement(state: _State, sweeps: SweepPair) -> Movement:
@@ -116,9 +138,7 @@ def _movement(state: _State, sweeps: SweepPair) -> Movement:
     return Movement(state.T_prev_curr, velocity, bend)
 
 
-def _step(
-    state: _State, H: FloatArray, g: FloatArray, guess: Hypothesis, config: AlignmentConfig
-) -> tuple[_State, float]:
+def _step(state: _State, H: FloatArray, g: FloatArray, guess: Guess, config: AlignmentConfig) -> tuple[_State, float]:
     """One Gauss-Newton step, and by how much it moved."""
     H, g = config.information_per_m2 * H, config.information_per_m2 * g
     expected = _expected(config)
@@ -142,13 +162,14 @@ def _expected(config: AlignmentConfig) -> FloatArray:
     return np.diag([config.surprise_rad_s**-2.0] * 3 + [config.surprise_m_s**-2.0] * 3)
 
 
-def _judge(movement: Movement, tally: Tally, config: AlignmentConfig) -> Aligned:
+def _judge(movement: Movement, tally: Tally, guess_information: FloatArray, config: AlignmentConfig) -> Aligned:
     """How well the images lie on one another in the end."""
     explained, weakest = _explained(tally.in_view, tally.matched)
     return Aligned(
         T_prev_curr=movement.T_prev_curr,
         bend=movement.bend,
         information=_information(tally.H, config),
+        guess_information=guess_information,
         share=tally.share,
         # What leaves the other image's view on the way says nothing, unless it is most of the scan.
         explained=explained * min(tally.share_in_view / _MUCH_IN_VIEW, 1.0),

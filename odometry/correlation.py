@@ -21,10 +21,12 @@ from odometry.torch_images import has_normal
 INPUT_CHANNELS = 9
 SHIFTS = 2 * bird_eye.MOST_CELLS + 1
 """Shifts along x and along y, in cells, that are scored."""
-# Standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.
+# Logarithms of standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.
 _LOG_SIGMA = (-7.0, 3.0)
 # A peak is the mean over so many turns or shifts to either side of the highest.
 _PEAK = 2
+# Standard deviations of what the network does not look at: roll and pitch, radians, and the way along z, metres.
+_TILT, _CLIMB_M = 0.05, 0.2
 # What the shape of the two peaks is described by.
 _SHAPE = 8
 
@@ -165,11 +167,11 @@ def _convolved(channels_in: int, channels_out: int, stride: int = 1) -> nn.Modul
 
 
 class Peaks(nn.Module):
-    """Where the scores of turns and shifts are highest, and the standard deviations that their shape speaks for."""
+    """Where the scores of turns and shifts are highest, and standard deviations by the shape of both peaks."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.head = nn.Sequential(nn.Linear(_SHAPE, 32), nn.ReLU(), nn.Linear(32, 6))
+        self.head = nn.Sequential(nn.Linear(_SHAPE, 32), nn.ReLU(), nn.Linear(32, 3))
 
     def forward(self, turn_scores: Tensor, shift_scores: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(B, S) and (B, SHIFTS, SHIFTS) -> turn (B,), radians; shift (B, 2), metres; (B, 6) log sigma."""
@@ -178,8 +180,9 @@ class Peaks(nn.Module):
         shift, shift_shape = _shift_peak(shift_scores)
         angle = column * (2.0 * math.pi / turns)
         angle = torch.where(angle > math.pi, angle - 2.0 * math.pi, angle)
-        log_sigma: Tensor = self.head(torch.cat([turn_shape, shift_shape], dim=1)) - 3.0
-        return angle, shift, log_sigma.clamp(*_LOG_SIGMA)
+        planar = (self.head(torch.cat([turn_shape, shift_shape], dim=1)) - 3.0).clamp(*_LOG_SIGMA)
+        tilt, climb = torch.full_like(planar[:, :2], _TILT).log(), torch.full_like(planar[:, :1], _CLIMB_M).log()
+        return angle, shift, torch.cat([tilt, planar, climb], dim=1)
 
 
 def _turn_peak(scores: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, orthonormalize
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
-from odometry.alignment import Aligned, Hypothesis, align
+from odometry.alignment import Aligned, Guess, align
 from odometry.alignment_search import align_best
 from odometry.candidates import Candidate, Described, Search
 from odometry.degeneracy import Expected, gone_on, holding, joined_information, left_open
@@ -33,6 +33,8 @@ _LEAST_INFORMATION = 1e-6
 _LEAST_SIGMA = np.array([np.deg2rad(0.05)] * 3 + [0.003] * 3)
 # Rings of points on the ground go along with the sensor and hold alignment back, by a part of the way.
 _HELD_BACK = 0.02
+# How much less likely than the network's best candidate it is that the motion goes on, in standard deviations.
+_ODDS_OF_GOING_ON = 1.0
 # Part of the change of motion within a pair of sweeps that may not be even.
 _HIDDEN_SHARE = 0.05
 
@@ -153,25 +155,25 @@ class LearnedOdometry:
 
     def _align(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep, interval_s: float) -> _Laid:
         """From the network's candidates, or going on as before, or further afield."""
-        hypotheses = [Hypothesis(one.T_prev_curr, np.linalg.inv(one.covariance)) for one in candidates]
+        guesses = [
+            Guess(one.T_prev_curr, np.linalg.inv(one.covariance), odds=_odds(one, candidates[0])) for one in candidates
+        ]
         expected, leg, before = self._expected(interval_s), self._way.last, None
         if leg is not None and expected is not None:
             before = LastMotion(leg.velocity, leg.interval_s)
-            hypotheses.append(Hypothesis(expected.T_prev_curr))
+            guesses.append(Guess(expected.T_prev_curr, odds=_ODDS_OF_GOING_ON))
         sweeps = SweepPair(sweep.images.alignment, last.images.alignment, interval_s, before)
-        aligned, chosen = align_best(hypotheses, sweeps, self._config.alignment)
+        aligned = align_best(guesses, sweeps, self._config.alignment)
         degeneracy = left_open(aligned.information, aligned.matched, sweep.images.alignment)
         if len(degeneracy) and expected is not None:
             return self._go_on(aligned, degeneracy, expected, sweeps)
-        seen = self._seen(aligned)
-        told = None if chosen is None else chosen.information
-        return _Laid(aligned, seen if told is None else seen + told, degeneracy)
+        return _Laid(aligned, self._seen(aligned) + aligned.guess_information, degeneracy)
 
     def _go_on(self, aligned: Aligned, degeneracy: Degeneracy, expected: Expected, sweeps: SweepPair) -> _Laid:
         """As expected along the open directions, and as aligned across them."""
         motion = gone_on(aligned.T_prev_curr, expected.T_prev_curr, degeneracy)
         held = holding(degeneracy)
-        aligned = align(Hypothesis(motion, held, held), sweeps, self._config.alignment)
+        aligned = align(Guess(motion, held, held), sweeps, self._config.alignment)
         return _Laid(aligned, joined_information(self._seen(aligned), expected.covariance, degeneracy), degeneracy)
 
     def _seen(self, aligned: Aligned) -> FloatArray:
@@ -191,6 +193,11 @@ class LearnedOdometry:
         """The way on is not known."""
         self._way.forget()
         self._last_covariance = None
+
+
+def _odds(candidate: Candidate, best: Candidate) -> float:
+    """How much less likely a candidate is than the best one, as the number of standard deviations of a normal one."""
+    return float(np.sqrt(max(0.0, 2.0 * (best.log_probability - candidate.log_probability))))
 
 
 def _misfit(matched: int, explained: float) -> str:

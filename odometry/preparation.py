@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, exp, log
 from lidarslam.core.scan import Scan
-from odometry.alignment import Aligned, Hypothesis
+from odometry.alignment import Aligned, Guess
 from odometry.alignment_config import AlignmentConfig
 from odometry.alignment_search import align_best, try_instead
 from odometry.image_config import ImageConfig
@@ -108,7 +108,7 @@ class _Follower:
 
 def _align_one(T_last: FloatArray, sweeps: SweepPair) -> Aligned:
     """From the last motion and from rest; from many turns unless that is good, or the sensor was turning."""
-    best, _ = align_best([Hypothesis(T_last), Hypothesis(np.eye(4))], sweeps, _FINE)
+    best = align_best([Guess(T_last), Guess(np.eye(4), odds=1.0)], sweeps, _FINE)
     was_turning = float(np.linalg.norm(log(T_last)[:3])) > _TURNING
     if best.explained >= _FINE.doubtful and not was_turning:
         return best

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment import Aligned, Hypothesis, align, align_each
+from odometry.alignment import Aligned, Guess, align, align_each
 from odometry.alignment_config import AlignmentConfig
 from odometry.sweeps import LastMotion, SweepImages, SweepPair
 
@@ -41,7 +41,7 @@ def second_on_first(sweeps: list[SweepImages], last: LastMotion | None = None) -
 
 def one_on_the_other(sweeps: list[SweepImages], T: FloatArray, **options: object) -> Aligned:
     """The second of two sweeps on the first."""
-    return align(Hypothesis(T), second_on_first(sweeps), AlignmentConfig.model_validate(options))
+    return align(Guess(T), second_on_first(sweeps), AlignmentConfig.model_validate(options))
 
 
 @pytest.mark.parametrize("rolling", [False, True])
@@ -77,16 +77,14 @@ def test_turning_sweeps_are_compensated(box_room):
 def test_the_interval_tells_how_fast_the_motion_is(box_room):
     """Were the sweeps half as far apart, the body would move twice as fast in them."""
     sweeps = box_room.sweeps(2, TURNING)
-    found = align(Hypothesis(guess(TURNING)), SweepPair(sweeps[1], sweeps[0], 0.5 * INTERVAL_S), CONFIG)
+    found = align(Guess(guess(TURNING)), SweepPair(sweeps[1], sweeps[0], 0.5 * INTERVAL_S), CONFIG)
     assert errors(found.T_prev_curr, moved(TURNING))[0] > 0.1
 
 
 def test_several_guesses_are_on_their_own(box_room):
     sweeps = box_room.sweeps(2, TWIST)
     guesses = [guess(TWIST), moved(TWIST), guess(TWIST, tuple(-x for x in WRONG))]
-    for T, found in zip(
-        guesses, align_each([Hypothesis(T) for T in guesses], second_on_first(sweeps), CONFIG), strict=True
-    ):
+    for T, found in zip(guesses, align_each([Guess(T) for T in guesses], second_on_first(sweeps), CONFIG), strict=True):
         assert errors(found.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
         assert np.array_equal(found.T_prev_curr, one_on_the_other(sweeps, T).T_prev_curr)
 
@@ -95,7 +93,7 @@ def test_images_may_differ_in_rows(box_room):
     fine = replace(box_room, rows=40).sweeps(2, TWIST)
     coarse = box_room.sweeps(2, TWIST)
     for current, previous in ((fine[1], coarse[0]), (coarse[1], fine[0])):
-        found = align(Hypothesis(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), CONFIG)
+        found = align(Guess(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), CONFIG)
         assert errors(found.T_prev_curr, moved(TWIST)) < (0.02, 1e-3)
 
 
@@ -108,9 +106,9 @@ def test_without_a_step_the_guess_is_the_answer(box_room):
 def test_a_guess_is_held_as_firmly_as_its_information_says(box_room):
     sweeps = box_room.sweeps(2, TWIST)
     close = guess(TWIST, (0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
-    certain = align(Hypothesis(close, 1e9 * np.eye(6)), second_on_first(sweeps), CONFIG)
+    certain = align(Guess(close, 1e9 * np.eye(6)), second_on_first(sweeps), CONFIG)
     assert errors(certain.T_prev_curr, close) < (0.01, 5e-4)
-    uncertain = align(Hypothesis(close, 1e-3 * np.eye(6)), second_on_first(sweeps), CONFIG)
+    uncertain = align(Guess(close, 1e-3 * np.eye(6)), second_on_first(sweeps), CONFIG)
     assert errors(uncertain.T_prev_curr, moved(TWIST)) < (0.01, 5e-4)
 
 
@@ -121,7 +119,7 @@ def test_the_information_of_a_guess_is_of_changes_from_the_left(box_room):
     T = guess(twist, (0.0, 0.0, 0.0, 0.04, 0.03, 0.0))
     holds_x = np.zeros((6, 6))
     holds_x[3, 3] = 1e9
-    found = align(Hypothesis(T, holds_x), second_on_first(sweeps), CONFIG)
+    found = align(Guess(T, holds_x), second_on_first(sweeps), CONFIG)
     away = found.T_prev_curr[:3, 3] - moved(twist)[:3, 3]
     # What is held wrongly pulls a little at the rest.
     assert away[0] - T[0, 3] + moved(twist)[0, 3] == pytest.approx(0.0, abs=1e-4)
@@ -133,7 +131,7 @@ def test_in_a_corridor_the_guess_along_it_is_kept(corridor):
     twist, wrong = (0.0, 0.0, 0.0, 1.0, 0.2, 0.0), (0.01, 0.01, 0.02, 0.10, 0.06, 0.05)
     sweeps = corridor.sweeps(2, twist)
     T = guess(twist, wrong)
-    kept = align(Hypothesis(T, np.eye(6)), second_on_first(sweeps), CONFIG)
+    kept = align(Guess(T, np.eye(6)), second_on_first(sweeps), CONFIG)
     error = log(kept.T_prev_curr @ inverse(moved(twist)))
     # Turning it back about the origin moves it along x by less than a millimetre.
     assert kept.T_prev_curr[0, 3] == pytest.approx(T[0, 3], abs=1e-3)
@@ -154,7 +152,7 @@ def test_information_is_weak_along_a_corridor(corridor):
 
 def test_share_and_residual_tell_what_does_not_fit(box_room, corridor):
     room, street = box_room.sweeps(1, TWIST)[0], corridor.sweeps(1, TWIST)[0]
-    unrelated = align(Hypothesis(np.eye(4)), SweepPair(street, room, INTERVAL_S), CONFIG)
+    unrelated = align(Guess(np.eye(4)), SweepPair(street, room, INTERVAL_S), CONFIG)
     assert unrelated.share < 0.3
     beside = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST), iterations=0)
     fits = one_on_the_other(box_room.sweeps(2, TWIST), guess(TWIST))
@@ -201,7 +199,7 @@ def test_empty_images_move_nothing(box_room, empty):
     nothing = replace(full, **{name: 0.0 * getattr(full, name) for name in ("points", "normals", "offsets")})
     current = full if empty == "previous" else nothing
     previous = full if empty == "current" else nothing
-    found = align(Hypothesis(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), CONFIG)
+    found = align(Guess(guess(TWIST)), SweepPair(current, previous, INTERVAL_S), CONFIG)
     np.testing.assert_allclose(found.T_prev_curr, guess(TWIST))
     assert (found.share, found.residual_m, found.matched) == (0.0, 0.0, 0)
     assert not found.information.any()
@@ -232,7 +230,7 @@ def test_sweeps_that_a_change_of_motion_bends_are_seen_through(box_room):
     before, motion = inverse(T[0]) @ T[1], inverse(T[1]) @ T[2]
     velocity = log(before) / INTERVAL_S
     half_a_change = 0.05 * np.array(ACCELERATION)
-    off = Hypothesis(exp([0.02, 0.0, -0.02, 0.05, 0.03, 0.0]) @ motion)
+    off = Guess(exp([0.02, 0.0, -0.02, 0.05, 0.03, 0.0]) @ motion)
     for last in (None, LastMotion(velocity, INTERVAL_S)):
         found = align(off, second_on_first(sweeps, last), CONFIG)
         assert errors(found.T_prev_curr, motion) < (0.06, 0.004)
@@ -253,8 +251,8 @@ def test_a_bend_is_held_along_the_directions_that_are_asked_for(box_room):
     T = speeding_up(np.array([0.0, 0.1]))
     motion = inverse(T[0]) @ T[1]
     held = np.diag([0.0, 0.0, 1e8, 0.0, 0.0, 0.0])
-    free = align(Hypothesis(motion), second_on_first(sweeps), CONFIG)
-    found = align(Hypothesis(motion, bend_information=held), second_on_first(sweeps), CONFIG)
+    free = align(Guess(motion), second_on_first(sweeps), CONFIG)
+    found = align(Guess(motion, bend_information=held), second_on_first(sweeps), CONFIG)
     assert free.bend[2] == pytest.approx(0.4, abs=0.06)
     assert found.bend[2] == pytest.approx(0.0, abs=1e-4)
     assert abs(found.bend[3]) > 0.05
@@ -266,7 +264,7 @@ def test_the_last_motion_may_have_taken_longer(box_room):
     stiff = CONFIG.model_copy(update={"surprise_rad_s": 1e-4, "surprise_m_s": 1e-4, "iterations": 0})
     for interval_s, share in ((0.1, 0.5), (0.3, 0.25)):
         last = LastMotion(np.zeros(6), interval_s)
-        found = align(Hypothesis(moved(TWIST)), second_on_first(sweeps, last), stiff)
+        found = align(Guess(moved(TWIST)), second_on_first(sweeps, last), stiff)
         np.testing.assert_allclose(found.bend, share * np.array(TWIST), atol=1e-5)
 
 

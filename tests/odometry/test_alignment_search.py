@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment import Aligned, Hypothesis, align
+from odometry.alignment import Aligned, Guess, align
 from odometry.alignment_config import AlignmentConfig
 from odometry.alignment_search import align_best, try_guesses
 from odometry.sweeps import SweepImages, SweepPair
@@ -38,7 +38,7 @@ def one_on_the_other(
 ) -> Aligned:
     """The second of two sweeps on the first; the information is about the first guess."""
     first, *others = guesses
-    hypotheses = [Hypothesis(first, information), *(Hypothesis(guess) for guess in others)]
+    hypotheses = [Guess(first, information), *(Guess(guess) for guess in others)]
     return align_best(hypotheses, second_on_first(sweeps), AlignmentConfig(**options))[0]
 
 
@@ -47,7 +47,7 @@ def wrong_by_m(aligned: Aligned) -> float:
 
 
 def test_alignment_from_rest_stays_there_and_knows_it(street):
-    found = align(Hypothesis(REST), second_on_first(street), CONFIG)
+    found = align(Guess(REST), second_on_first(street), CONFIG)
     assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
     assert found.share > 0.3  # the ground and the walls go along
     assert found.explained < CONFIG.doubtful - 0.2
@@ -66,7 +66,7 @@ def test_no_steps_are_tried_where_there_are_none(street):
 
 def test_a_good_alignment_is_not_searched_around(street):
     found = one_on_the_other(street, moved(1.35))
-    alone = align(Hypothesis(moved(1.35)), second_on_first(street), CONFIG)
+    alone = align(Guess(moved(1.35)), second_on_first(street), CONFIG)
     assert np.array_equal(found.T_prev_curr, alone.T_prev_curr)
 
 
@@ -113,7 +113,7 @@ def test_the_best_of_many_guesses_is_found_roughly(street):
 
 def test_it_is_told_which_guess_the_alignment_began_from(street):
     """With what is known of that guess: of what a search found, nothing is."""
-    near, far = Hypothesis(moved(1.3), np.eye(6)), Hypothesis(REST, 2.0 * np.eye(6))
+    near, far = Guess(moved(1.3), np.eye(6)), Guess(REST, 2.0 * np.eye(6))
     assert align_best([near, far], second_on_first(street), CONFIG)[1] is near
     assert align_best([far, near], second_on_first(street), CONFIG)[1] is near
-    assert align_best([Hypothesis(REST)], second_on_first(street), CONFIG)[1] is None
+    assert align_best([Guess(REST)], second_on_first(street), CONFIG)[1] is None
