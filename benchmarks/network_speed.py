@@ -1,93 +1,110 @@
-"""How long the networks take for a pair of scans, beside one another in one run, and how the rest of a scan compares.
+"""How long the learned odometry takes for a scan, stage by stage, beside DeLORA's network in the same run.
 
-    python benchmarks/network_speed.py --threads 2
+    python benchmarks/network_speed.py --threads 1 --sensors vlp-16 hdl-64e
 
-Prints a table with the processor time and the wall time of each network for a pair of images of the same size, the
-median over `--repeats`. Encodings are kept from pair to pair in the program, so `correlation` is timed as it is used:
-one scan encoded, one pair compared. Then the same for the other stages of the learned odometry on a simulated scan.
+Prints a table of networks, a pair of images of 16 x 720 each, and one of the stages of a scan of each sensor: medians
+over `--repeats`, wall time and processor time. A network is timed as it is used: what is kept of the scan before is not
+computed again. Scans are simulated, a car in a street.
 """
 
 import argparse
 import time
 from collections.abc import Callable, Sequence
 from statistics import median
-from typing import Literal
 
 import numpy as np
 import torch
 from mapping_accuracy import simulate
 
+from lidarslam.core.scan import Scan
 from odometry.alignment import Guess, align
+from odometry.candidates import Described, Search
+from odometry.checkpoint import default_weights, load_checkpoint, network_of
+from odometry.config import OdometryConfig
+from odometry.exported import read_exported, shipped_folder
 from odometry.image_config import ImageConfig
 from odometry.learned_config import LearnedConfig
-from odometry.network_config import CorrelationConfig, NetworkConfig, NetworkName
+from odometry.network_config import NetworkConfig
 from odometry.networks import make_network
+from odometry.onnx_graphs import onnx_search
+from odometry.registry import make_odometry
 from odometry.sweep_images import Imager
-from odometry.sweeps import SweepPair
+from odometry.sweeps import SweepImages, SweepPair
+from odometry.torch_graphs import torch_search
 
-Change = Literal["", "channels last", "bfloat16"]
-_VARIANTS: tuple[tuple[str, NetworkName, Change], ...] = (
-    ("delora", "delora", ""),
-    ("correlation", "correlation", ""),
-    ("correlation, channels last", "correlation", "channels last"),
-    ("correlation, bfloat16", "correlation", "bfloat16"),
-)
+SCANS = 12
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=int, default=16)
-    parser.add_argument("--columns", type=int, default=720)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--sensors", nargs="+", default=["vlp-16", "hdl-64e"])
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
-    size = f"{options.rows} x {options.columns}"
-    print(f"A pair of {size} images, {options.threads} threads\n")
+    recordings = {sensor: simulate("street", "car", sensor, SCANS, 0).scans for sensor in options.sensors}
+    imager = Imager(ImageConfig())
+    pair = [imager.images(scan).network for scan in recordings[options.sensors[0]][-2:]]
+    print(f"A pair of 16 x 720 images, threads: {options.threads}\n")
     print("| network | parameters | wall, ms | CPU, ms | times faster |\n| --- | --- | --- | --- | --- |")
     slowest = None
-    for label, name, change in _VARIANTS:
-        network = make_network(NetworkConfig(name=name, correlation=CorrelationConfig(rows=options.rows)))
-        count = sum(p.numel() for p in network.parameters())
-        wall, cpu = time_pair(network, options.rows, options.columns, options.repeats, change)
+    for label, search, parameters in _networks(options.threads):
+        before = search.describe(pair[0].points, pair[0].normals)
+        wall, cpu = _timed(_comparison(search, before, pair[1]), options.repeats)
         slowest = slowest or wall
-        print(f"| {label} | {count:,} | {wall:.1f} | {cpu:.1f} | {slowest / wall:.1f} |", flush=True)
-    print(f"\nStages of the learned odometry, {options.sensor} in an office\n")
-    print("| stage | wall, ms | CPU, ms |\n| --- | --- | --- |")
-    for label, stage in _stages(options).items():
-        wall, cpu = _timed(stage, options.repeats)
-        print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
+        print(f"| {label} | {parameters:,} | {wall:.1f} | {cpu:.1f} | {slowest / wall:.1f} |", flush=True)
+    for sensor, scans in recordings.items():
+        print(f"\nA scan of {sensor}\n\n| stage | wall, ms | CPU, ms |\n| --- | --- | --- |")
+        for label, stage in _stages(scans, options.threads).items():
+            wall, cpu = _timed(stage, options.repeats)
+            print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
 
 
-def time_pair(
-    network: torch.nn.Module, rows: int, columns: int, repeats: int, change: Change = ""
-) -> tuple[float, float]:
-    """Median wall and processor milliseconds of one scan encoded and one pair compared."""
-    network = network.eval()
-    points = torch.randn(1, 3, rows, columns) * 10.0
-    normals = torch.nn.functional.normalize(torch.randn_like(points), dim=1)
-    if change == "channels last":
-        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        points, normals = (x.contiguous(memory_format=torch.channels_last) for x in (points, normals))
-    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=change == "bfloat16"):
-        earlier = network.encode(points, normals)  # type: ignore[operator]
-        return _timed(lambda: network(earlier, network.encode(points, normals)), repeats)  # type: ignore[operator]
+def _networks(threads: int) -> list[tuple[str, Search, int]]:
+    """DeLORA's with its first weights, which takes as long as with trained ones, and the shipped one in two ways."""
+    delora = make_network(NetworkConfig(name="delora")).eval()
+    shipped = network_of(load_checkpoint(default_weights()))
+    sizes = [sum(p.numel() for p in network.parameters()) for network in (delora, shipped)]
+    return [
+        ("delora, torch", torch_search(delora, threads=threads), sizes[0]),
+        ("correlation, torch", torch_search(shipped, threads=threads), sizes[1]),
+        ("correlation, ONNX Runtime", onnx_search(read_exported(shipped_folder()), threads), sizes[1]),
+    ]
 
 
-def _stages(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
-    scans = simulate("office", "handheld", options.sensor, 12, 0).scans[-2:]
-    imager = Imager(ImageConfig(rows=options.rows, columns=options.columns))
-    previous, current = (imager.images(scan).alignment for scan in scans)
-    sweeps, config = SweepPair(current, previous, 0.1), LearnedConfig().alignment
+def _comparison(search: Search, before: Described, images: SweepImages) -> Callable[[], object]:
+    return lambda: search.compare(before, images.points, images.normals)
+
+
+def _stages(scans: Sequence[Scan], threads: int) -> dict[str, Callable[[], object]]:
+    imager, search = Imager(ImageConfig()), onnx_search(read_exported(shipped_folder()), threads)
+    previous, current = (imager.images(scan) for scan in scans[-2:])
+    before = search.describe(previous.network.points, previous.network.normals)
+    candidates, _ = search.compare(before, current.network.points, current.network.normals)
+    guess = Guess(candidates[0].T_prev_curr, np.linalg.inv(candidates[0].covariance))
+    sweeps = SweepPair(current.alignment, previous.alignment, scans[-1].stamp - scans[-2].stamp)
+    config = LearnedConfig(threads=threads).alignment
     return {
-        "images and normals": lambda: imager.images(scans[1]),
-        "alignment": lambda: align(Guess(np.eye(4)), sweeps, config),
+        "images and normals": lambda: imager.images(scans[-1]),
+        "network": _comparison(search, before, current.network),
+        "alignment": lambda: align(guess, sweeps, config),
+        "all of the odometry": _whole(scans, threads),
     }
 
 
-@torch.inference_mode()
+def _whole(scans: Sequence[Scan], threads: int) -> Callable[[], object]:
+    """The next scan of the recording, over and over; the jump from its end to its beginning is not timed apart."""
+    odometry = make_odometry(OdometryConfig(method="learned", learned=LearnedConfig(threads=threads)))
+    state = {"next": 0}
+
+    def step() -> None:
+        odometry.estimate(scans[state["next"] % len(scans)])
+        state["next"] += 1
+
+    return step
+
+
 def _timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
     """Median wall and processor milliseconds, after two rounds that do not count."""
     walls, cpus = [], []

@@ -22,6 +22,8 @@ from odometry.sweeps import SweepPair
 _ARRIVED = 1e-4
 # Part of the best known direction's information that counts as none.
 _NEXT_TO_NOTHING = 0.02
+# Part of a prior's information that stands for none, along directions that it leaves open.
+_NEXT_TO_NO_PRIOR = 1e-9
 # Part of a scan that another must have in view for the two to tell.
 _MUCH_IN_VIEW = 0.5
 # Information that keeps the normal equations solvable where neither the images nor a guess say anything.
@@ -122,7 +124,7 @@ def _where_unseen(prior: FloatArray, seen: FloatArray) -> FloatArray:
     The network's errors are not independent from scan to scan: it takes small translations for smaller ones. Where the
     images decide, even a small share of it would add up to a drift.
     """
-    root = np.linalg.cholesky(prior)
+    root = np.linalg.cholesky(prior + _NEXT_TO_NO_PRIOR * np.trace(prior) * np.eye(6))
     half = np.linalg.solve(root, seen)
     ratios, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
     kept = root @ axes[:, ratios < 1.0]

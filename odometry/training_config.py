@@ -98,6 +98,4 @@ class TrainingConfig(BaseModel):
             )
         if self.network.name == "correlation" and images.columns % 4:
             raise ValueError(f"images.columns={images.columns} must be a multiple of 4 for network.name=correlation")
-        if self.network.name == "correlation" and any(width % 8 for width in network.widths):
-            raise ValueError(f"network.correlation.widths={network.widths} must be multiples of 8")
         return self

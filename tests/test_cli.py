@@ -89,7 +89,7 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
 
 
 def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Path) -> None:
-    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), pair_width=8))
+    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), bird_width=4))
     weights = tmp_path / "weights of mine: 1.safetensors"
     images = ImageConfig(columns=180)
     save_checkpoint(weights, checkpoint_of(make_network(network), network, images))

@@ -1,4 +1,4 @@
-"""`lidarslam export`: a trained network for other programs."""
+"""`lidarslam export`: a trained network as ONNX."""
 
 from pathlib import Path
 
@@ -10,11 +10,12 @@ from lidarslam.commands.terminal import say
 
 @click.command(cls=CommandWithExample, epilog="lidarslam export --weights trained/weights.safetensors --out exported")
 @click.option("--weights", type=PATH, metavar="FILE", help="Trained weights.  [default: those of the program]")
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that encoder.onnx and pair.onnx go to.")
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that the ONNX graphs go to.")
 def export(weights: Path | None, out: Path) -> None:
-    """Write a trained network as ONNX, for other programs.
+    """Write a trained network as ONNX.
 
-    encoder.onnx takes the points and normals of scans as images; pair.onnx takes what it gives for two of them.
+    `lidarslam run --weights DIR` starts faster with the folder than with the file of weights, because it does without
+    torch. Other programs can run the graphs; docs/odometry.md lists their inputs and outputs.
     """
     from odometry.checkpoint import default_weights, load_checkpoint
     from odometry.export import export_onnx

@@ -124,7 +124,7 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, small_recording: Path, name: s
 def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a network that learned nothing."""
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), pair_width=8))
+    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), bird_width=4))
     save_checkpoint(path, checkpoint_of(make_network(network), network, ImageConfig(columns=180)))
     return path
 

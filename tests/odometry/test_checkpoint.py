@@ -23,7 +23,7 @@ IMAGES = ImageConfig(rows=8, columns=96)
 
 @pytest.fixture
 def trained() -> Checkpoint:
-    config = NetworkConfig(correlation=CorrelationConfig(rows=8, widths=(8, 8, 8), pair_width=8, reach=2))
+    config = NetworkConfig(correlation=CorrelationConfig(rows=8, widths=(8, 8, 8), bird_width=4, bird_features=4))
     torch.manual_seed(3)
     return checkpoint_of(make_network(config), config, IMAGES, {"steps": 7, "sources": ["office"]})
 
@@ -43,10 +43,8 @@ def test_what_is_saved_comes_back(trained: Checkpoint, file: Path) -> None:
         for one in (trained, loaded):
             network = network_of(one)
             assert not network.training
-            features = network.encode(points, torch.zeros_like(points))
-            results.append(network(features, features.flip(0)))
-    assert torch.equal(results[0].T_prev_curr, results[1].T_prev_curr)
-    assert torch.equal(results[0].log_sigma, results[1].log_sigma)
+            results.append(network.columns(points, torch.zeros_like(points)))
+    assert torch.equal(results[0], results[1])
 
 
 def test_loading_leaves_the_random_numbers_alone(file: Path) -> None:
@@ -140,12 +138,12 @@ def test_weights_that_do_not_fit_are_told(trained: Checkpoint, file: Path) -> No
         save_checkpoint(file, replace(trained, weights=weights))
         return file
 
-    with pytest.raises(InputError, match=r"motion\.bias of network correlation is missing"):
-        load_checkpoint(saved(lambda w: w.pop("motion.bias")))
-    with pytest.raises(InputError, match=r"motion\.bias is \(5,\), network correlation has \(6,\)"):
-        load_checkpoint(saved(lambda w: w.update({"motion.bias": torch.zeros(5)})))
-    with pytest.raises(InputError, match=r"motion\.bias holds values that are not finite"):
-        load_checkpoint(saved(lambda w: w.update({"motion.bias": torch.full((6,), torch.nan)})))
+    with pytest.raises(InputError, match=r"columns\.layers\.8\.bias of network correlation is missing"):
+        load_checkpoint(saved(lambda w: w.pop("columns.layers.8.bias")))
+    with pytest.raises(InputError, match=r"columns\.layers\.8\.bias is \(5,\), network correlation has \(8,\)"):
+        load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.zeros(5)})))
+    with pytest.raises(InputError, match=r"columns\.layers\.8\.bias holds values that are not finite"):
+        load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.full((8,), torch.nan)})))
     with pytest.raises(InputError, match="has no surplus"):
         load_checkpoint(saved(lambda w: w.update({"surplus": torch.zeros(1)})))
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from odometry.correlation import PairImages
 from odometry.delora import DeloraNetwork
 from odometry.networks import DeloraPairs
 
@@ -133,6 +134,5 @@ def test_half_precision_leaves_whole_estimates() -> None:
     prev, curr = _images()
     pairs = DeloraPairs()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        features = [pairs.encode(images[:, :3], images[:, :3]) for images in (prev, curr)]
-        estimate = pairs(*features)
+        estimate = pairs(PairImages(*(torch.cat([images[:, :3]] * 2, dim=1) for images in (prev, curr))))
     assert {value.dtype for value in vars(estimate).values()} == {torch.float32}

@@ -1,4 +1,4 @@
-"""The learned odometry with a network that says what it is told, on scans whose motions are known."""
+"""The learned odometry with a network whose candidates are given, on scans whose motions are known."""
 
 import math
 from collections.abc import Callable
@@ -6,18 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
 from odometry.alignment_config import AlignmentConfig
+from odometry.candidates import Candidate, Described
 from odometry.config import OdometryConfig
 from odometry.image_config import ImageConfig
 from odometry.interface import Motion
 from odometry.learned import LearnedOdometry
 from odometry.learned_config import LearnedConfig
 from odometry.registry import make_odometry
-from odometry.runner import Floats, Guess
+
+Floats = NDArray[np.float32]
 
 IMAGES = ImageConfig(rows=16, columns=360)
 TWIST = (0.05, -0.05, 0.5, 1.0, 0.3, 0.1)  # rad/s, m/s
@@ -32,12 +35,17 @@ class Told:
     def __init__(self, *guesses: FloatArray, log_sigma: float = math.log(0.1)) -> None:
         self.guesses, self.sigma = list(guesses), math.exp(log_sigma)
 
-    def encode(self, points: Floats, normals: Floats) -> Floats:  # noqa: ARG002
-        return points
+    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:  # noqa: ARG002
+        return Described(points[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
 
-    def compare(self, previous: Floats, current: Floats) -> Guess:  # noqa: ARG002
+    def compare(
+        self,
+        previous: Described,  # noqa: ARG002
+        points: Floats,
+        normals: Floats,
+    ) -> tuple[tuple[Candidate, ...], Described]:
         guess = self.guesses.pop(0) if len(self.guesses) > 1 else self.guesses[0]
-        return Guess(guess, np.full(6, self.sigma))
+        return (Candidate(guess, np.diag(np.full(6, self.sigma**2)), 0.0),), self.describe(points, normals)
 
 
 def estimates(scans: list[Scan], network: Told, **options: object) -> list[Motion]:
@@ -195,7 +203,7 @@ def test_between_two_walls_the_covariance_along_them_is_the_networks(walls, turn
     """For a sensor turned by 90 degrees they go along y."""
     scans = near(walls.scans(2, STILL, exp((0.0, 0.0, turned, 0.0, 0.0, 0.0))))
     unsure, sure = (sigmas(scans, Told(np.eye(4), log_sigma=math.log(sigma_m))) for sigma_m in (3.0, 0.01))
-    assert unsure[along] == pytest.approx(LearnedConfig().caution * 3.0, rel=0.2)
+    assert unsure[along] == pytest.approx(3.0, rel=0.2)
     assert sure[along] < 0.1
     assert unsure[7 - along] < 0.05  # across
 
@@ -205,7 +213,7 @@ def test_the_covariance_is_of_a_change_from_the_right(walls):
     quarter = exp((0.0, 0.0, 0.5 * math.pi, 0.0, 0.0, 0.0))
     first, second = near([*walls.scans(1, STILL), *walls.scans(1, STILL, quarter)])
     found = sigmas([Scan(first.points, 0.0), Scan(second.points, 0.1)], Told(quarter, log_sigma=math.log(3.0)))
-    assert found[4] == pytest.approx(LearnedConfig().caution * 3.0, rel=0.2)
+    assert found[4] == pytest.approx(3.0, rel=0.2)
     assert found[3] < 0.05
 
 

@@ -32,7 +32,7 @@ def batch_of(targets: Tensor, believed: list[bool] | None = None) -> PairBatch:
 
 def estimate_of(T: Tensor, log_sigma: float = 0.0, scores: Tensor | None = None) -> Estimate:
     scores = torch.zeros(len(T), WIDTH) if scores is None else scores
-    return Estimate(T, torch.full((len(T), 6), log_sigma), scores)
+    return Estimate(T, torch.full((len(T), 6), log_sigma), scores, torch.zeros(len(T), 0, 0))
 
 
 def loss(estimate: Estimate, batch: PairBatch, config: TrainingConfig = ALIGNMENT_ONLY) -> Objective:
@@ -76,7 +76,7 @@ def test_the_total_is_weighted(pair):
     config = TrainingConfig(alignment_weight=2.0, geometric_weight=3.0)
     estimate = estimate_of(off(2.0, 0.1) @ pair.T_prev_curr, -1.0)
     parts = loss(estimate, pair, config)
-    alignment = parts.alignment + 0.1 * parts.confidence + 0.5 * parts.turn
+    alignment = 0.3 * parts.alignment + 0.1 * parts.confidence + parts.turn + parts.shift
     expected = 2.0 * alignment + 3.0 * (parts.point_to_plane + parts.plane_to_plane)
     torch.testing.assert_close(parts.total, expected)
     assert all(float(getattr(parts, name)) != 0.0 for name in PARTS)
@@ -130,7 +130,8 @@ def test_nothing_believed_costs_nothing_and_pulls_nowhere():
 def test_confidence_does_not_reach_the_motion():
     xi = torch.tensor([[0.01, 0.0, 0.02, 0.1, 0.0, -0.2]], requires_grad=True)
     log_sigma = torch.full((1, 6), -2.0, requires_grad=True)
-    parts = loss(Estimate(exp(xi), log_sigma, torch.zeros(1, WIDTH)), batch_of(torch.eye(4)[None]))
+    estimate = Estimate(exp(xi), log_sigma, torch.zeros(1, WIDTH), torch.zeros(1, 0, 0))
+    parts = loss(estimate, batch_of(torch.eye(4)[None]))
     reached = torch.autograd.grad(parts.confidence, [xi, log_sigma], allow_unused=True)
     assert reached[0] is None
     assert reached[1] is not None
@@ -145,7 +146,8 @@ def test_confidence_is_best_at_the_standard_deviation_of_a_laplace_distribution(
     xi = torch.zeros(len(errors), 6, dtype=torch.float64)
     xi[:, 4] = errors
     log_sigma = torch.tensor(math.log(sigma), dtype=torch.float64, requires_grad=True)
-    estimate = Estimate(exp(xi), log_sigma.expand(len(errors), 6), torch.zeros(len(errors), 0))
+    none = torch.zeros(len(errors), 0)
+    estimate = Estimate(exp(xi), log_sigma.expand(len(errors), 6), none, none[..., None])
     confidence = loss(estimate, batch_of(torch.eye(4, dtype=torch.float64).expand(len(errors), 4, 4))).confidence
     (gradient,) = torch.autograd.grad(confidence, log_sigma)
     # Five directions without an error pull by one each.
@@ -173,6 +175,42 @@ def test_the_turn_is_shared_by_the_columns_around_it(columns, shares):
     for column, share in shares.items():
         expected[column] = share
     torch.testing.assert_close(1.0 / WIDTH - gradient[0], expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "shares"),
+    [
+        (0.0, 0.0, {(18, 18): 1.0}),
+        (1.0, -0.5, {(17, 20): 1.0}),
+        (0.125, 0.25, {(18, 18): 0.375, (18, 19): 0.125, (19, 18): 0.375, (19, 19): 0.125}),
+    ],
+)
+def test_the_translation_is_shared_by_the_cells_around_it(x, y, shares):
+    scores = torch.zeros(1, 37, 37, requires_grad=True)
+    target = exp(torch.tensor([[0.0, 0.0, 0.0, x, y, 0.3]]))
+    parts = loss(replace(estimate_of(torch.eye(4)[None]), shift_scores=scores), batch_of(target))
+    assert float(parts.shift.detach()) == pytest.approx(2.0 * math.log(37), rel=1e-5)
+    (gradient,) = torch.autograd.grad(parts.shift, scores)
+    expected = torch.zeros(37, 37)
+    for cell, share in shares.items():
+        expected[cell] = share
+    torch.testing.assert_close(37.0**-2 - gradient[0], expected, rtol=0, atol=1e-5)
+
+
+def test_a_translation_out_of_reach_is_not_learnt():
+    scores = torch.randn(1, 37, 37, generator=torch.Generator().manual_seed(0))
+    far = exp(torch.tensor([[0.0, 0.0, 0.0, 9.0, 0.0, 0.0]]))
+    assert float(loss(replace(estimate_of(far), shift_scores=scores), batch_of(far)).shift) == 0.0
+
+
+def test_a_peak_that_is_not_the_right_one_is_not_drawn():
+    """Only where there are scores, which are drawn instead."""
+    far = exp(torch.tensor([[0.0, 0.0, 0.0, 3.0, 0.0, 0.0]]))
+    parts = loss(estimate_of(far), batch_of(torch.eye(4)[None]))
+    assert float(parts.alignment) == 0.0
+    assert float(parts.confidence) > 1.0
+    regressed = loss(estimate_of(far, scores=torch.zeros(1, 0)), batch_of(torch.eye(4)[None]))
+    assert float(regressed.alignment) > 1.0
 
 
 def test_the_turn_does_not_see_other_motions():
@@ -207,7 +245,7 @@ def test_geometry_compares_the_compensated_surfaces(pair):
 def test_geometry_looks_at_pairs_that_are_believed(pair):
     """Where alignment failed, the compensation that surfaces rest on is a guess."""
     T = torch.cat([off(0.0, 0.03) @ pair.T_prev_curr, off(0.0, 0.2) @ pair.T_prev_curr])
-    both = PairBatch(**{name: torch.cat([value, value]) for name, value in vars(pair).items()})
+    both = PairBatch(**{name: None if v is None else torch.cat([v, v]) for name, v in vars(pair).items()})
     both = replace(both, believed=torch.tensor([True, False]))
     config = TrainingConfig(alignment_weight=0.0, geometric_points=16 * 96)
     some, one = loss(estimate_of(T), both, config), loss(estimate_of(T[:1]), pair, config)

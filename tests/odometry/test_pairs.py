@@ -15,7 +15,7 @@ from odometry.training_config import AugmentationConfig
 TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
 NONE = AugmentationConfig(
     max_gap=1, reverse=0.0, roll=0.0, roll_deg=0.0, any_roll=0.0, mirror=0.0, scale=0.0, drop_beams=0.0,
-    drop_points=0.0, hide_sector=0.0, range_noise_m=0.0,
+    drop_points=0.0, hide_sector=0.0, range_noise_m=0.0, wet_ground=0.0, glass=0.0,
 )  # fmt: skip
 WORN = {"drop_beams": 1.0, "drop_points": 0.5, "hide_sector": 1.0, "range_noise_m": 0.05}
 
@@ -197,7 +197,7 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
             two.believed,
         ), 0)  # fmt: skip
     else:
-        several = PairBatch(*(torch.cat([v] * 3) for v in vars(as_it_is).values()))
+        several = PairBatch(*(None if v is None else torch.cat([v] * 3) for v in vars(as_it_is).values()))
         generator = torch.Generator().manual_seed(1)
         batch = augmented(several, only(**AUGMENTATIONS[name]), generator)
         expected = fit(as_it_is, 0)
@@ -265,7 +265,7 @@ def _with_holes(recording: PreparedRecording) -> PairBatch:
 @pytest.mark.parametrize("name", WORN)
 def test_worn_scans_gain_nothing_and_surfaces_are_spared(recording, name):
     whole = _with_holes(recording)
-    several = PairBatch(*(torch.cat([v] * 8) for v in vars(whole).values()))
+    several = PairBatch(*(None if v is None else torch.cat([v] * 8) for v in vars(whole).values()))
     worn = augmented(several, only(**{name: WORN[name]}), torch.Generator().manual_seed(2))
     for before, after in ((worn.previous_surfaces, worn.previous), (worn.current_surfaces, worn.current)):
         there, left = (images[:, :3].square().sum(1) > 0.0 for images in (before, after))
