@@ -82,7 +82,7 @@ def _stages(scans: Sequence[Scan], threads: int) -> dict[str, Callable[[], objec
     previous, current = (imager.images(scan) for scan in scans[-2:])
     before = search.describe(previous.network.points, previous.network.normals)
     candidates, _ = search.compare(before, current.network.points, current.network.normals)
-    guess = Guess(candidates[0].T_prev_curr, np.linalg.inv(candidates[0].covariance))
+    guess = Guess(candidates[0].T_prev_curr, np.asarray(np.linalg.inv(candidates[0].covariance), dtype=np.float64))
     sweeps = SweepPair(current.alignment, previous.alignment, scans[-1].stamp - scans[-2].stamp)
     config = LearnedConfig(threads=threads).alignment
     return {

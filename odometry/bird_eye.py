@@ -35,8 +35,8 @@ def bird_eye(points: Floats, normals: Floats, heading: float) -> Floats:
         heading: angle by which the scan is turned about z first, radians.
     """
     grid = np.zeros((CELLS, CELLS, CHANNELS), dtype=np.float32)
-    flat = (np.ascontiguousarray(part, dtype=np.float32).reshape(3, -1) for part in (points, normals))
-    _accumulate(*flat, math.cos(heading), math.sin(heading), grid)
+    flat = [np.ascontiguousarray(part, dtype=np.float32).reshape(3, -1) for part in (points, normals)]
+    _accumulate(flat[0], flat[1], math.cos(heading), math.sin(heading), grid)
     return np.ascontiguousarray(np.moveaxis(grid, -1, 0))
 
 

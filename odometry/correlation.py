@@ -21,8 +21,9 @@ from odometry.torch_images import has_normal
 INPUT_CHANNELS = 9
 SHIFTS = 2 * bird_eye.MOST_CELLS + 1
 """Shifts along x and along y, in cells, that are scored."""
-# Logarithms of standard deviations are kept within these: e^-7 is 0.05 degrees or 1 mm.
-_LOG_SIGMA = (-7.0, 3.0)
+# Standard deviations are kept within these. Peaks of columns of 2 degrees and of cells of half a metre are not known
+# better than to a part of them: while a sensor turns, both sweeps are bent, and the peak with them.
+_LEAST_TURN, _LEAST_SHIFT_M, _LARGEST_SIGMA = 0.01, 0.1, 20.0
 # A peak is the mean over so many turns or shifts to either side of the highest.
 _PEAK = 2
 # Standard deviations of what the network does not look at: roll and pitch, radians, and the way along z, metres.
@@ -180,7 +181,9 @@ class Peaks(nn.Module):
         shift, shift_shape = _shift_peak(shift_scores)
         angle = column * (2.0 * math.pi / turns)
         angle = torch.where(angle > math.pi, angle - 2.0 * math.pi, angle)
-        planar = (self.head(torch.cat([turn_shape, shift_shape], dim=1)) - 3.0).clamp(*_LOG_SIGMA)
+        planar = self.head(torch.cat([turn_shape, shift_shape], dim=1)) - 3.0
+        least = planar.new_tensor([_LEAST_TURN, _LEAST_SHIFT_M, _LEAST_SHIFT_M]).log()
+        planar = torch.maximum(planar, least).clamp(max=math.log(_LARGEST_SIGMA))
         tilt, climb = torch.full_like(planar[:, :2], _TILT).log(), torch.full_like(planar[:, :1], _CLIMB_M).log()
         return angle, shift, torch.cat([tilt, planar, climb], dim=1)
 
@@ -214,7 +217,7 @@ def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     around = torch.arange(-_PEAK, _PEAK + 1, device=scores.device)
     cells = (row[:, None, None] + around[:, None]) * count + column[:, None, None] + around  # (B, 5, 5)
     near = likelihood.gather(1, cells.flatten(1))
-    share = near.softmax(dim=1).unflatten(1, (2 * _PEAK + 1, 2 * _PEAK + 1))
+    share = near.softmax(dim=1).reshape(-1, 2 * _PEAK + 1, 2 * _PEAK + 1)
     across, along = share.sum(dim=1), share.sum(dim=2)  # over rows: along x; over columns: along y
     mean = torch.stack([(across * around).sum(dim=1), (along * around).sum(dim=1)], dim=1)
     squares = torch.stack([(across * around.square()).sum(dim=1), (along * around.square()).sum(dim=1)], dim=1)
@@ -267,6 +270,6 @@ class CorrelationNetwork(nn.Module):
         A sum over cells, not a mean: every cell adds its log-likelihood, and what shows more is more certain.
         """
         spectrum = torch.fft.rfft2(previous) * torch.fft.rfft2(current).conj()
-        scores = torch.fft.irfft2(spectrum.sum(dim=1), s=previous.shape[-2:])  # shift by s at index s
+        scores: Tensor = torch.fft.irfft2(spectrum.sum(dim=1), s=previous.shape[-2:])  # shift by s at index s
         most = bird_eye.MOST_CELLS
         return scores.roll((most, most), (1, 2))[:, :SHIFTS, :SHIFTS]

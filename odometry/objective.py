@@ -102,7 +102,8 @@ def _turn_loss(scores: Tensor, target: Tensor) -> Tensor:
 
 def _cells(T_prev_curr: Tensor) -> Tensor:
     """(B, 2) translation along x and y of motions (B, 4, 4), in cells of the bird's-eye grid."""
-    return T_prev_curr[:, :2, 3] / bird_eye.CELL_M
+    cells: Tensor = T_prev_curr[:, :2, 3] / bird_eye.CELL_M
+    return cells
 
 
 def _shift_loss(scores: Tensor, target: Tensor) -> Tensor:

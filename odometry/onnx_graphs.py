@@ -1,7 +1,6 @@
 """Exported networks in ONNX Runtime behind the interfaces of inference: no torch, and a quick start."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -92,6 +91,6 @@ def _session(path: Path, threads: int) -> onnxruntime.InferenceSession:
         raise InputError(f"{path}: cannot be used ({error}); make it again with `lidarslam export`") from error
 
 
-def _run(session: onnxruntime.InferenceSession, **inputs: Floats) -> list[Any]:
-    results: list[Any] = session.run(None, inputs)
+def _run(session: onnxruntime.InferenceSession, **inputs: Floats) -> list[Floats]:
+    results: list[Floats] = session.run(None, inputs)
     return results

@@ -28,7 +28,7 @@ from odometry.training import Validation, summarise, validate
 
 TINY = (
     "training.images={rows: 8, columns: 96}",
-    "training.network.correlation={rows: 8, widths: [8, 8, 8], pair_width: 8, reach: 2}",
+    "training.network.correlation={rows: 8, widths: [8, 8, 8], bird_width: 4}",
     "training.batch=2",
     "training.geometric_points=64",
     "training.steps=8",
@@ -153,9 +153,9 @@ def test_where_no_held_out_pair_can_be_aligned_the_last_weights_are_kept(
 def test_recordings_are_prepared_once(room_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_train_config(None, TINY)
     stretch = recorded(room_folder, config.reader)
-    first = prepared([stretch], config.training.images, tmp_path, lambda _: None)
+    first = prepared([stretch], config.training, tmp_path, lambda _: None)
     monkeypatch.setattr(training_data, "prepare", lambda *_: pytest.fail("prepared again"))
-    again = prepared([stretch], config.training.images, tmp_path, lambda _: None)
+    again = prepared([stretch], config.training, tmp_path, lambda _: None)
     for name in ("T_prev_curr", "believed", "explained", "interval_s"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name))
     for name, value in vars(first[0].images).items():

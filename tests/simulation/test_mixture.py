@@ -87,9 +87,9 @@ def test_the_draw_of_a_number_does_not_change():
     """What is added to the registries leaves prepared training data and measured figures as they are."""
     first = [tuple(vars(ingredients_of(number, SEED)).values()) for number in range(3)]
     assert first == [
-        ("street", "os1-64", "handheld", "upright"),
-        ("office", "xt32", "legged", "upside-down"),
-        ("tunnel", "vlp-16", "handheld", "upright"),
+        ("street", "os1-64", "handheld", "upright", None),
+        ("office", "xt32", "legged", "upside-down", None),
+        ("tunnel", "vlp-16", "handheld", "upright", None),
     ]
 
 
