@@ -1,0 +1,147 @@
+"""The learned odometry alone on real drives that its weights were not trained on, at several rates, beside KISS-ICP.
+
+    python benchmarks/held_out.py DRIVE=weights.safetensors ANOTHER=others.safetensors --steps 1 2 3 5
+
+Weights are named for each recording, those of a training that left it out; without any, the program's own are taken.
+The reference is the recording's truth, or with `--mapped` (as for drives whose GPS is off by decimetres) the trajectory
+that mapping at constant velocity finds at full rate. Prints a Markdown table, a row for each recording, step and
+method: the drift over segments of 20 to 60 m from every scan, the error of the rotation from scan to scan (RMS) and of
+the translation (largest), the scans that were lost, and how many errors lie within one, two and three standard
+deviations of the covariance (chi-square with six degrees of freedom: 68.3, 95.4, 99.7 % where it is right). With
+`--starts N`, 50 scans are taken from every N-th on, each time as a run of its own, and a row sums up all of them.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from mapping_accuracy import METHODS, Recorded, pipeline_results, print_row, read, true_trajectory
+from odometry_accuracy import estimated_motions, rms, shares_within_sigmas, squared_errors
+
+from evaluation.association import Association
+from evaluation.drift import segment_errors
+from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
+from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.datasets.registry import open_recording
+from lidarslam.scan_order import in_order
+from odometry.config import OdometryConfig
+from odometry.interface import Motion
+from odometry.learned_config import LearnedConfig
+
+LENGTHS_M = (20.0, 30.0, 40.0, 50.0, 60.0)
+_SCANS_OF_A_START = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Runs of one method on parts of one recording.
+
+    Attributes:
+        drift_percent: (M,) of all segments.
+        wrong: (N, 4, 4) errors of the motions from scan to scan.
+        squared: (N,) of them in standard deviations, summed over the six directions; NaN without a covariance.
+        lost: scans.
+    """
+
+    drift_percent: FloatArray
+    wrong: FloatArray
+    squared: FloatArray
+    lost: int
+
+    def cells(self) -> list[str]:
+        """Drift, rotation, translation, lost scans, shares within 1, 2, 3 sigma."""
+        drift = f"{float(np.mean(self.drift_percent)):.2f}" if len(self.drift_percent) else "too short"
+        known = self.squared[np.isfinite(self.squared)]
+        shares = ", ".join(f"{100.0 * share:.0f}" for share in shares_within_sigmas(known)) if len(known) else ""
+        rotation_deg = float(np.rad2deg(rms(rotation_angle(self.wrong))))
+        largest_m = float(np.linalg.norm(self.wrong[:, :3, 3], axis=1).max())
+        return [drift, f"{rotation_deg:.3f}", f"{largest_m:.2f}", str(self.lost), shares]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="+", metavar="RECORDING[=WEIGHTS]")
+    parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 3, 5])
+    parser.add_argument("--starts", type=int, help="also 50 scans from every so-manieth scan on, at full rate")
+    parser.add_argument("--mapped", action="store_true", help="the reference is the mapped trajectory, not the truth")
+    options = parser.parse_args(arguments)
+    columns = ("recording", "scans", "step, m", "method", "drift, %", "rotation, deg", "largest error, m", "lost")
+    print_row([*columns, "within 1, 2, 3 sigma, %"])
+    print_row(["---"] * (len(columns) + 1))
+    for source in options.sources:
+        name, _, weights = source.partition("=")
+        recorded = mapped(Path(name)) if options.mapped else with_truth(Path(name))
+        methods = {
+            "learned": OdometryConfig(learned=LearnedConfig(weights=Path(weights) if weights else None)),
+            "KISS-ICP": OdometryConfig(method="kiss-icp"),
+        }
+        for label, parts in _parts(recorded, options):
+            step_m = rms(np.concatenate([_steps_m(part) for part in parts]))
+            for method, config in methods.items():
+                outcome = joined([judged(part, estimated_motions(config, part.scans)) for part in parts])
+                print_row([recorded.name, label, f"{step_m:.2f}", method, *outcome.cells()])
+
+
+def with_truth(source: Path) -> Recorded:
+    """A recording with the truth at its scans' stamps."""
+    recorded = read(source)
+    return replace(recorded, truth=true_trajectory(recorded))
+
+
+def mapped(source: Path) -> Recorded:
+    """A recording with the trajectory that mapping finds for its truth."""
+    recording = open_recording(source)
+    scans = list(in_order(recording.scans()))
+    nothing = Trajectory(np.array([scan.stamp for scan in scans]), np.tile(np.eye(4), (len(scans), 1, 1)))
+    recorded = Recorded(recording.name, scans, nothing)
+    results = pipeline_results(recorded, METHODS["constant-velocity+map"])
+    return replace(recorded, truth=replace(nothing, T_world_lidar=np.array([one.T_world_lidar for one in results])))
+
+
+def _parts(recorded: Recorded, options: argparse.Namespace) -> Iterator[tuple[str, list[Recorded]]]:
+    """What each row is about: the recording at a rate, or many short runs."""
+    for step in options.steps:
+        label = "every" if step == 1 else f"every {step}"
+        yield label, [replace(recorded, scans=recorded.scans[::step])]
+    if options.starts:
+        count = len(recorded.scans)
+        begins = range(0, max(count - _SCANS_OF_A_START, 0) + 1, options.starts)
+        runs = [replace(recorded, scans=recorded.scans[begin : begin + _SCANS_OF_A_START]) for begin in begins]
+        yield f"{len(runs)} starts", runs
+
+
+def _steps_m(recorded: Recorded) -> FloatArray:
+    motions = true_trajectory(recorded).relative_motions()
+    return np.asarray(np.linalg.norm(motions[:, :3, 3], axis=1), dtype=np.float64)
+
+
+def judged(recorded: Recorded, motions: Sequence[Motion]) -> Outcome:
+    """The motions of one run against the reference."""
+    truth = true_trajectory(recorded)
+    estimated = np.array([motion.T_prev_curr for motion in motions[1:]])
+    wrong = inverse(estimated) @ truth.relative_motions()
+    trajectory = Trajectory(truth.stamps, chain(truth.T_world_lidar[0], estimated))
+    matched = Association(trajectory, truth, np.arange(len(truth)), len(truth), len(truth))
+    errors = segment_errors(matched, LENGTHS_M, step=1, over_travelled=True)
+    covariances = [motion.covariance for motion in motions[1:]]
+    return Outcome(
+        drift_percent=100.0 * errors.translation,
+        wrong=wrong,
+        squared=squared_errors(covariances, log(wrong)),
+        lost=sum(motion.failure is not None for motion in motions),
+    )
+
+
+def joined(outcomes: Sequence[Outcome]) -> Outcome:
+    """All runs together."""
+    drift, wrong, squared = (
+        np.concatenate([getattr(one, name) for one in outcomes]) for name in ("drift_percent", "wrong", "squared")
+    )
+    return Outcome(drift, wrong, squared, sum(one.lost for one in outcomes))
+
+
+if __name__ == "__main__":
+    main()
