@@ -69,8 +69,8 @@ def _error(candidate: Candidate, motion: FloatArray) -> tuple[float, float]:
 
 def _cells(found: Sequence[FloatArray]) -> list[str]:
     best = np.array([errors[0] for errors in found])
-    right = [(errors < (_RIGHT_DEG, _RIGHT_M)).all(axis=1) for errors in found]
-    shares = [np.mean([one[0] for one in right]), np.mean([one.any() for one in right])]
+    right = [np.all(errors < (_RIGHT_DEG, _RIGHT_M), axis=1, keepdims=True) for errors in found]
+    shares = [np.mean([one[0, 0] for one in right]), np.mean([one.any() for one in right])]
     metres = [np.median(best[:, 1]), np.percentile(best[:, 1], 95.0), best[:, 1].max()]
     return [f"{np.median(best[:, 0]):.2f}", *(f"{m:.2f}" for m in metres), *(f"{100.0 * s:.0f}" for s in shares)]
 

@@ -166,7 +166,11 @@ class TrainingLoop:
         self._clock += time.perf_counter() - began
 
     def _save_weights(self, name: str, result: Validation | None) -> None:
-        about = {**self._about, "steps": self._standing.step, "validation": None if result is None else vars(result)}
+        # Weights are passed on: the names of what they were trained on, not where it lay.
+        about = {**self._about, "sources": [Path(source).name for source in self._about.get("sources", ())]}
+        if "from" in about:
+            about["from"] = Path(about["from"]).name
+        about |= {"steps": self._standing.step, "validation": None if result is None else vars(result)}
         config = self._config
         save_checkpoint(self._out / name, checkpoint_of(self._network, config.network, config.images, about))
 

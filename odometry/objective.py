@@ -75,7 +75,9 @@ def _distance(error: Tensor) -> Tensor:
 
 def _is_near(error: Tensor) -> Tensor:
     """(B,) whether the right peak was found; drawing at a wrong one would teach nothing."""
-    return (error[:, :3].norm(dim=1) < _NEAR_ROTATION) & (error[:, 3:].norm(dim=1) < _NEAR_TRANSLATION_M)
+    rotation, translation = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
+    near: Tensor = (rotation < _NEAR_ROTATION) & (translation < _NEAR_TRANSLATION_M)
+    return near
 
 
 def _negative_log_likelihood(error: Tensor, log_sigma: Tensor) -> Tensor:
