@@ -38,7 +38,7 @@ def describe_computed(config: Config, recording: Recording, run: dict[str, Any],
     """
     tree = config.model_dump(mode="json", exclude=_WITHOUT_EFFECT)
     if config.odometry.method == "learned":
-        from odometry.checkpoint import default_weights
+        from odometry.shipped import default_weights
 
         tree["odometry"]["learned"]["weights"] = _digest(config.odometry.learned.weights or default_weights())
     given = run | {"prior": None if prior is None else _digest(prior)}
@@ -118,7 +118,11 @@ def _fingerprint(recording: Recording) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
+    """Of a file, or of the files of a folder and their names."""
     try:
+        if path.is_dir():
+            named = [(one.name, _digest(one)) for one in sorted(path.iterdir()) if one.is_file()]
+            return hashlib.sha256(json.dumps(named).encode()).hexdigest()
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:

@@ -12,7 +12,7 @@ from lidarslam.train_config import TrainConfig, load_train_config, loss_settings
 from lidarslam.train_request import DeviceName, TrainOutcome, TrainRequest
 from lidarslam.train_text import ConsoleNarrator, format_outcome
 from lidarslam.training_directory import CONFIG, SOURCES_SECTION, is_training
-from odometry.checkpoint import default_weights
+from odometry.shipped import default_weights
 
 SHIPPED = "shipped"
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,13 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import InputError
 from odometry.image_config import ImageConfig
 from odometry.network_config import NetworkConfig
 from odometry.networks import make_network
 from odometry.tensor_file import Kind, read_tensor_file, write_tensor_file
 
 WEIGHTS = Kind("weights", version=1)
-_DEFAULT = "correlation.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,21 +88,6 @@ def network_of(checkpoint: Checkpoint) -> nn.Module:
         network = make_network(checkpoint.network)
     network.load_state_dict(checkpoint.weights)
     return network.eval()
-
-
-def default_weights() -> Path:
-    """Where the weights that come with the program lie.
-
-    Raises:
-        ConfigError: it came without.
-    """
-    path = Path(str(files("odometry"))) / "weights" / _DEFAULT
-    if not path.is_file():
-        raise ConfigError(
-            f"{path}: the weights that come with the program are missing;"
-            " install it again, or name a file of weights with --weights FILE"
-        )
-    return path
 
 
 def _require_fitting(path: Path, config: NetworkConfig, weights: Mapping[str, Tensor]) -> None:

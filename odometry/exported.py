@@ -2,13 +2,12 @@
 
 import json
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import InputError
 from odometry.image_config import ImageConfig
 from odometry.network_config import NetworkConfig
 
@@ -16,7 +15,6 @@ DESCRIPTION = "network.json"
 COLUMNS, TURNS, BIRD, PEAKS, PAIR = "columns.onnx", "turns.onnx", "bird.onnx", "peaks.onnx", "pair.onnx"
 
 _KIND, _VERSION = "a network exported by lidarslam", 1
-_SHIPPED = "correlation"
 
 
 @dataclass(frozen=True)
@@ -76,18 +74,3 @@ def read_exported(folder: Path) -> Exported:
         if not (folder / name).is_file():
             raise InputError(f"{folder}: {name} is missing; make the folder again with `lidarslam export`")
     return exported
-
-
-def shipped_folder() -> Path:
-    """Where the exported network that comes with the program lies.
-
-    Raises:
-        ConfigError: it came without.
-    """
-    path = Path(str(files("odometry"))) / "weights" / _SHIPPED
-    if not path.is_dir():
-        raise ConfigError(
-            f"{path}: the network that comes with the program is missing;"
-            " install it again, or name weights with --weights"
-        )
-    return path

@@ -155,9 +155,10 @@ class LearnedOdometry:
 
     def _align(self, candidates: Sequence[Candidate], last: _Sweep, sweep: _Sweep, interval_s: float) -> _Laid:
         """From the network's candidates, or going on as before, or further afield."""
-        guesses = [
-            Guess(one.T_prev_curr, np.asarray(np.linalg.inv(one.covariance), dtype=np.float64), odds=_odds(one, candidates[0])) for one in candidates
-        ]
+        guesses = []
+        for candidate in candidates:
+            information = np.asarray(np.linalg.inv(candidate.covariance), dtype=np.float64)
+            guesses.append(Guess(candidate.T_prev_curr, information, odds=_odds(candidate, candidates[0])))
         expected, leg, before = self._expected(interval_s), self._way.last, None
         if leg is not None and expected is not None:
             before = LastMotion(leg.velocity, leg.interval_s)

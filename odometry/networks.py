@@ -30,8 +30,9 @@ class DeloraPairs(nn.Module):
     def forward(self, pairs: PairImages) -> Estimate:
         """The motions, with constant standard deviations."""
         T_prev_curr: Tensor = self.network(_with_ranges(pairs.previous), _with_ranges(pairs.current))
-        unknown = T_prev_curr.new_full((len(T_prev_curr), 6), _UNKNOWN_SIGMA).log()
-        return Estimate(T_prev_curr, unknown, unknown.new_zeros(len(unknown), 0), unknown.new_zeros(len(unknown), 0, 0))
+        size = T_prev_curr.shape[0]
+        unknown = T_prev_curr.new_full((size, 6), _UNKNOWN_SIGMA).log()
+        return Estimate(T_prev_curr, unknown, unknown.new_zeros(size, 0), unknown.new_zeros(size, 0, 0))
 
 
 def _with_ranges(images: Tensor) -> Tensor:

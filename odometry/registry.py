@@ -41,12 +41,14 @@ def _make_learned(config: LearnedConfig) -> Odometry:
     from odometry.learned import LearnedOdometry
 
     if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
-        from odometry.exported import read_exported, shipped_folder
+        from odometry.exported import read_exported
         from odometry.onnx_graphs import onnx_search
+        from odometry.shipped import shipped_folder
 
         exported = read_exported(config.weights or shipped_folder())
         return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config)
-    from odometry.checkpoint import default_weights, load_checkpoint, network_of
+    from odometry.checkpoint import load_checkpoint, network_of
+    from odometry.shipped import default_weights
     from odometry.torch_graphs import torch_search
 
     checkpoint = load_checkpoint(config.weights or default_weights())

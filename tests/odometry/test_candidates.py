@@ -9,8 +9,9 @@ import torch
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
 from odometry.candidates import CorrelationSearch, Floats, _peaks, _shift_scores
-from odometry.checkpoint import default_weights, load_checkpoint, network_of
+from odometry.checkpoint import load_checkpoint, network_of
 from odometry.correlation import CorrelationNetwork
+from odometry.shipped import default_weights
 from odometry.torch_graphs import TorchGraphs
 
 TURN_DEG = 2.0

@@ -12,10 +12,12 @@ from safetensors.torch import save_file
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from odometry import checkpoint as module
-from odometry.checkpoint import Checkpoint, checkpoint_of, default_weights, load_checkpoint, network_of, save_checkpoint
+from odometry import shipped
+from odometry.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of, save_checkpoint
 from odometry.image_config import ImageConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
+from odometry.shipped import default_weights, shipped_folder
 from odometry.tensor_file import Kind, write_tensor_file
 
 IMAGES = ImageConfig(rows=8, columns=96)
@@ -156,6 +158,7 @@ def test_a_configuration_of_a_later_program_is_told(trained: Checkpoint, tmp_pat
 
 
 def test_missing_default_weights_say_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_DEFAULT", "not_there.safetensors")
-    with pytest.raises(ConfigError, match="--weights FILE"):
-        default_weights()
+    monkeypatch.setattr(shipped, "_NAME", "not_there")
+    for place in (default_weights, shipped_folder):
+        with pytest.raises(ConfigError, match="--weights FILE"):
+            place()

@@ -10,13 +10,14 @@ import torch
 from torch.nn import functional
 
 from lidarslam.core.errors import ConfigError, InputError
-from odometry.checkpoint import Checkpoint, checkpoint_of, default_weights, load_checkpoint, network_of
+from odometry.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of
 from odometry.export import export_onnx
-from odometry.exported import DESCRIPTION, read_exported, shipped_folder
+from odometry.exported import DESCRIPTION, read_exported
 from odometry.image_config import ImageConfig
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
 from odometry.onnx_graphs import OnnxGraphs, onnx_search
+from odometry.shipped import default_weights, shipped_folder
 from odometry.torch_graphs import TorchGraphs, torch_search
 
 SHAPE = (16, 96)

@@ -1,0 +1,42 @@
+"""Where the network that comes with the program lies; without torch."""
+
+from importlib.resources import files
+from pathlib import Path
+
+from lidarslam.core.errors import ConfigError
+
+_NAME = "correlation"
+
+
+def default_weights() -> Path:
+    """The file of weights, for training and for accelerators.
+
+    Raises:
+        ConfigError: it came without.
+    """
+    path = _folder() / f"{_NAME}.safetensors"
+    if not path.is_file():
+        raise ConfigError(
+            f"{path}: the weights that come with the program are missing;"
+            " install it again, or name a file of weights with --weights FILE"
+        )
+    return path
+
+
+def shipped_folder() -> Path:
+    """The folder of the same network as ONNX, for inference.
+
+    Raises:
+        ConfigError: it came without.
+    """
+    path = _folder() / _NAME
+    if not path.is_dir():
+        raise ConfigError(
+            f"{path}: the network that comes with the program is missing;"
+            " install it again, or name weights with --weights FILE"
+        )
+    return path
+
+
+def _folder() -> Path:
+    return Path(str(files("odometry"))) / "weights"
