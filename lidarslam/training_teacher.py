@@ -30,7 +30,8 @@ class MapTeacher:
         mapped = self._mapper.process(scan, _NO_PRIOR)
         state = mapped.state
         self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * middle_offset_s(scan)))
-        self._sure.append(mapped.status is Status.OK)
+        # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.
+        self._sure.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
 
     def taught(self, recording: PreparedRecording) -> PreparedRecording:
         """The recording of the scans that were followed, with the motions between the middles of sweeps on the map.

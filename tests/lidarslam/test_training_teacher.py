@@ -1,0 +1,81 @@
+"""What teaches a network, and how often it is drawn."""
+
+import numpy as np
+import pytest
+import torch
+
+from lidarslam.core.geometry import inverse, log
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.mounts import mount_pose
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.training_data import Stretch, draw_weights
+from lidarslam.training_teacher import MapTeacher
+from odometry.image_config import ImageConfig
+from odometry.preparation import prepare
+from odometry.sweep_images import middle_offset_s
+
+SCANS = 14
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[list[Scan], Trajectory]:
+    """A car that is at speed from the first scan on, 1.5 m from scan to scan."""
+    world = build_world("street", 5)
+    motion = motion_along_route("car-fast", world, 5, speed_mps=15.0)
+    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
+    simulation = Simulation(world, find_sensor("vlp-16"), motion, T_body_lidar, SCANS, 5)
+    return list(simulation.scans()), simulation.ground_truth
+
+
+def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(drive):
+    scans, truth = drive
+    teacher = MapTeacher()
+    for scan in scans:
+        teacher.follow(scan)
+    taught = teacher.taught(prepare(iter(scans), ImageConfig()))
+    middles = np.array([scan.stamp + middle_offset_s(scan) for scan in scans[:-1]])
+    poses = truth.at(middles, 0.1)
+    expected = inverse(poses[:-1]) @ poses[1:]
+    sure = taught.believed.numpy()[: SCANS - 2]
+    assert sure.mean() > 0.7
+    errors = log(inverse(taught.T_prev_curr.double().numpy()[: SCANS - 2]) @ expected)[sure]
+    assert np.linalg.norm(errors[:, 3:], axis=1).max() < 0.05
+    assert np.rad2deg(np.linalg.norm(errors[:, :3], axis=1)).max() < 0.3
+    assert np.linalg.norm(expected[:, :3, 3], axis=1).min() > 1.0
+
+
+def test_what_is_not_sure_is_not_taught(drive):
+    scans, _ = drive
+    teacher = MapTeacher()
+    strange = [*scans[:5], Scan(scans[5].points[:40], scans[5].stamp), *scans[6:9]]
+    for scan in strange:
+        teacher.follow(scan)
+    taught = teacher.taught(prepare(iter(strange), ImageConfig()))
+    assert taught.believed.dtype == torch.bool
+    assert not taught.believed[4]
+    assert not taught.believed[5]
+
+
+def stretch(scans: int, simulated: bool) -> Stretch:
+    identity = {"simulated": 1} if simulated else {"source": "somewhere"}
+    return Stretch("some", identity, lambda: pytest.fail("opened"), 0, scans)
+
+
+def test_recordings_have_their_share_of_the_pairs_by_their_lengths():
+    given = [stretch(100, False), stretch(300, False), stretch(40, True), stretch(40, True), stretch(40, True)]
+    weights = draw_weights(given, 0.3)
+    assert weights == pytest.approx([0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3])
+
+
+def test_long_recordings_are_drawn_in_pieces():
+    weights = draw_weights([stretch(1200, False), stretch(40, True)], 0.5)
+    assert weights == pytest.approx([1 / 6, 1 / 6, 1 / 6, 0.5])
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_recordings_of_one_kind_are_drawn_equally_often(simulated):
+    assert draw_weights([stretch(10, simulated), stretch(400, simulated)], 0.3) == [1.0, 1.0]
