@@ -41,9 +41,12 @@ class Candidate:
     log_probability: float
 
     def is_motion(self) -> bool:
-        """Whether a motion follows from it; weights can be finite, and what they make of a scan is not."""
+        """Whether all of it is finite."""
         variances = np.diag(self.covariance)
         return bool(np.isfinite(self.T_prev_curr).all() and np.isfinite(variances).all() and (variances > 0.0).all())
+
+
+_NO_MOTION = Candidate(np.full((4, 4), np.nan), np.full((6, 6), np.nan), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +116,8 @@ class CorrelationSearch:
                 # Of both correlations together: a wrong turn has no high peak among the shifts.
                 score = float(turns.max() + shifts.max())
                 found.append((score, self._candidate(previous, turns, shifts), current))
+        if not found:  # weights can be finite, and what they make of a scan is not a number
+            return (_NO_MOTION,), Described(columns, previous.spectrum, previous.heading)
         found.sort(key=lambda one: -one[0])
         scores = np.array([score for score, _, _ in found])
         log_probabilities = scores - np.logaddexp.reduce(scores)

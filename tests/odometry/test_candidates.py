@@ -108,6 +108,20 @@ def test_what_was_seen_in_a_turned_grid_is_turned_back():
         assert current.heading == pytest.approx(heading + math.radians(10.0))
 
 
+class Overflowing(Known):
+    """Graphs whose features are too large for their products."""
+
+    def turn_scores(self, previous: Floats, current: Floats) -> Floats:  # noqa: ARG002
+        return np.full((1, 180), np.nan, dtype=np.float32)
+
+
+def test_scores_that_are_no_numbers_give_no_motion():
+    nothing = np.zeros((3, 16, 720), dtype=np.float32)
+    search = CorrelationSearch(Overflowing())
+    candidates, _ = search.compare(search.describe(nothing, nothing), nothing, nothing)
+    assert [candidate.is_motion() for candidate in candidates] == [False]
+
+
 def test_peaks_are_followed_down_to_the_least_probability():
     scores = np.zeros((1, 180), dtype=np.float32)
     scores[0, [10, 100, 140]] = [20.0, 19.0, 10.0]
