@@ -103,19 +103,19 @@ def align_each(guesses: Sequence[Guess], sweeps: SweepPair, config: AlignmentCon
 
 
 def _align(guess: Guess, sweeps: SweepPair, sums: PairSums, config: AlignmentConfig) -> Aligned:
-    state, prior = _State(guess.T_prev_curr, np.zeros(6)), guess.information
+    state, kept = _State(guess.T_prev_curr, np.zeros(6)), guess
     for done in np.linspace(0.0, 1.0, config.iterations).tolist():
         scale_m = config.coarse_m * (config.fine_m / config.coarse_m) ** min(1.0, done / config.anneal_share)
         H, g = sums.normal_equations(_movement(state, sweeps), scale_m)
-        if done >= config.anneal_share and guess.information is not None:
+        if done >= config.anneal_share and kept is guess and guess.information is not None:
             seen = config.information_per_m2 * _information(H, config)
-            prior = _where_unseen(guess.information, seen)
-        state, moved = _step(state, H, g, replace(guess, information=prior), config)
+            kept = replace(guess, information=_where_unseen(guess.information, seen))
+        state, moved = _step(state, H, g, kept, config)
         if done >= config.anneal_share and moved < _ARRIVED:
             break
     movement = _movement(state, sweeps)
-    kept = np.zeros((6, 6)) if prior is None else prior
-    return _judge(movement, sums.tally(movement), kept, config)
+    counted = np.zeros((6, 6)) if kept.information is None else kept.information
+    return _judge(movement, sums.tally(movement), counted, config)
 
 
 def _where_unseen(prior: FloatArray, seen: FloatArray) -> FloatArray:
