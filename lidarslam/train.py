@@ -26,7 +26,7 @@ from lidarslam.training_data import (
     prepared,
     recorded,
     simulated,
-)  # fmt: skip
+)
 from lidarslam.training_devices import Devices
 from lidarslam.training_loop import Recordings, TrainingLoop
 from lidarslam.training_state import Standing, load_state

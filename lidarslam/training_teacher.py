@@ -14,8 +14,6 @@ from mapping.prediction import Prior
 from odometry.preparation import PreparedRecording
 from odometry.sweep_images import middle_offset_s
 
-_NO_PRIOR = Prior(None, None, None)
-
 
 class MapTeacher:
     """Follows a recording by mapping at constant velocity, scan after scan."""
@@ -27,7 +25,7 @@ class MapTeacher:
 
     def follow(self, scan: Scan) -> None:
         """Register the next scan; empty ones are not taught."""
-        mapped = self._mapper.process(scan, _NO_PRIOR)
+        mapped = self._mapper.process(scan, Prior())
         state = mapped.state
         self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * middle_offset_s(scan)))
         # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.

@@ -124,9 +124,7 @@ def _where_unseen(prior: FloatArray, seen: FloatArray) -> FloatArray:
     The network's errors are not independent from scan to scan: it takes small translations for smaller ones. Where the
     images decide, even a small share of it would add up to a drift.
     """
-    root = np.linalg.cholesky(prior + _NEXT_TO_NO_PRIOR * np.trace(prior) * np.eye(6))
-    half = np.linalg.solve(root, seen)
-    ratios, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
+    root, ratios, axes = _ratios(seen, prior + _NEXT_TO_NO_PRIOR * np.trace(prior) * np.eye(6))
     kept = root @ axes[:, ratios < 1.0]
     return np.asarray(kept @ kept.T)
 
@@ -194,8 +192,18 @@ def _explained(everything: FloatArray, matched: FloatArray) -> tuple[float, Floa
     directions of which hardly any point says anything do not count as missed.
     """
     little = _NEXT_TO_NOTHING * max(float(everything.diagonal().max()), 1.0) * np.eye(3)
-    root = np.linalg.cholesky(everything + little)
-    half = np.linalg.solve(root, matched + little)
-    ratio, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+    root, ratio, vectors = _ratios(matched + little, everything + little)
     weakest = np.linalg.solve(root.T, vectors[:, 0])
     return float(ratio[0]), np.asarray(weakest / np.linalg.norm(weakest), dtype=np.float64)
+
+
+def _ratios(part: FloatArray, whole: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Generalised eigenvalues (N,), ascending, of two information matrices (N, N), the second positive definite.
+
+    Returns:
+        The Cholesky factor (N, N) of the second, the eigenvalues, and their axes (N, N) as columns, whitened by it.
+    """
+    root = np.linalg.cholesky(whole)
+    half = np.linalg.solve(root, part)
+    ratios, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
+    return np.asarray(root, dtype=np.float64), np.asarray(ratios, dtype=np.float64), np.asarray(axes, dtype=np.float64)

@@ -20,6 +20,8 @@ CHANNELS = 8
 """Values of a cell."""
 MOST_CELLS = 18
 """Largest shift that is looked for, in cells along each axis: 9 m."""
+SHIFTS = 2 * MOST_CELLS + 1
+"""Shifts along x and along y, in cells, that are scored."""
 
 # Points farther away are left out: shifted by as much as is looked for they would come round the border.
 _REACH_M = 20.0

@@ -5,7 +5,8 @@ correlated with the previous one over all shifts by the fast Fourier transform, 
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,11 +14,10 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lidarslam.core.geometry import FloatArray
-from odometry.bird_eye import MOST_CELLS, bird_eye
+from odometry.bird_eye import MOST_CELLS, SHIFTS, bird_eye
 
 Floats = NDArray[np.float32]
 
-_SHIFTS = 2 * MOST_CELLS + 1
 # Turns and shifts that are followed, and the least probability beside the best one's.
 _TURNS, _SHIFT_PEAKS = 2, 3
 _LEAST_PROBABILITY = 0.02
@@ -122,7 +122,7 @@ class CorrelationSearch:
         scores = np.array([score for score, _, _ in found])
         log_probabilities = scores - np.logaddexp.reduce(scores)
         kept = tuple(
-            Candidate(one.T_prev_curr, one.covariance, float(log_probability))
+            replace(one, log_probability=float(log_probability))
             for (_, one, _), log_probability in zip(found, log_probabilities, strict=True)
             if log_probability >= log_probabilities[0] + math.log(_LEAST_PROBABILITY)
         )
@@ -146,11 +146,33 @@ class CorrelationSearch:
         return Candidate(T, axes @ np.diag(variances) @ axes.T, 0.0)
 
 
+class WholePairs:
+    """The search with a network that sees nothing but pairs: its one motion is the only candidate; implements `Search`.
+
+    Args:
+        network: (1, 6, H, W) points and normals of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
+    """
+
+    def __init__(self, network: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> None:
+        self._network = network
+
+    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
+        """The image itself."""
+        return Described(np.concatenate([points, normals])[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
+
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
+        """See `Search`."""
+        current = self.describe(points, normals)
+        T_prev_curr, log_sigma = self._network(previous.columns, current.columns)
+        variances = np.exp(2.0 * log_sigma[0].astype(np.float64))
+        return (Candidate(T_prev_curr[0].astype(np.float64), np.diag(variances), 0.0),), current
+
+
 def _shift_scores(previous: NDArray[np.complex64], current: NDArray[np.complex64]) -> Floats:
     """(1, SHIFTS, SHIFTS) correlation of features with these spectra, with the current scan shifted along y and x."""
     product = np.einsum("fij,fij->ij", previous, current.conj())
     scores = fft.irfft2(product)
-    scores = np.roll(scores, (MOST_CELLS, MOST_CELLS), (0, 1))[:_SHIFTS, :_SHIFTS]
+    scores = np.roll(scores, (MOST_CELLS, MOST_CELLS), (0, 1))[:SHIFTS, :SHIFTS]
     return np.ascontiguousarray(scores[None], dtype=np.float32)
 
 

@@ -14,13 +14,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from odometry import bird_eye
+from odometry.bird_eye import SHIFTS
 from odometry.network_config import CorrelationConfig
 from odometry.torch_geometry import full_precision, make_transform, turn_about_z
 from odometry.torch_images import has_normal
 
 INPUT_CHANNELS = 9
-SHIFTS = 2 * bird_eye.MOST_CELLS + 1
-"""Shifts along x and along y, in cells, that are scored."""
 # Standard deviations are kept within these. Peaks of columns of 2 degrees and of cells of half a metre are not known
 # better than to a part of them: while a sensor turns, both sweeps are bent, and the peak with them.
 _LEAST_TURN, _LEAST_SHIFT_M, _LARGEST_SIGMA = 0.01, 0.1, 20.0

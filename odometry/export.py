@@ -18,8 +18,9 @@ from torch import Tensor, nn
 
 from lidarslam.core.errors import ConfigError, OutputError
 from odometry import bird_eye
+from odometry.bird_eye import SHIFTS
 from odometry.checkpoint import Checkpoint, network_of
-from odometry.correlation import SHIFTS, CorrelationNetwork, PairImages
+from odometry.correlation import CorrelationNetwork, PairImages
 from odometry.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
 
 # Not a size of anything else, so that no dimension is taken for another.

@@ -7,7 +7,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
-from odometry.candidates import Candidate, CorrelationSearch, Described, Search
+from odometry.candidates import CorrelationSearch, Search, WholePairs
 from odometry.exported import BIRD, COLUMNS, PAIR, PEAKS, TURNS, Exported
 
 Floats = NDArray[np.float32]
@@ -49,24 +49,6 @@ class OnnxGraphs:
         return float(angle[0]), shift[0], log_sigma[0]
 
 
-class OnnxPairs:
-    """A network of pairs, with its one motion as the only candidate; implements `Search`."""
-
-    def __init__(self, folder: Path, threads: int) -> None:
-        self._pairs = _session(folder / PAIR, threads)
-
-    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
-        """The image itself."""
-        return Described(np.concatenate([points, normals])[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
-
-    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
-        """See `Search`."""
-        current = self.describe(points, normals)
-        T_prev_curr, log_sigma = _run(self._pairs, previous=previous.columns, current=current.columns)
-        variances = np.exp(2.0 * log_sigma[0].astype(np.float64))
-        return (Candidate(T_prev_curr[0].astype(np.float64), np.diag(variances), 0.0),), current
-
-
 def onnx_search(exported: Exported, threads: int) -> Search:
     """The search for candidates that an exported network is made for.
 
@@ -75,7 +57,13 @@ def onnx_search(exported: Exported, threads: int) -> Search:
     """
     if exported.network.name == "correlation":
         return CorrelationSearch(OnnxGraphs(exported.folder, threads))
-    return OnnxPairs(exported.folder, threads)
+    pairs = _session(exported.folder / PAIR, threads)
+
+    def network(previous: Floats, current: Floats) -> tuple[Floats, Floats]:
+        T_prev_curr, log_sigma = _run(pairs, previous=previous, current=current)
+        return T_prev_curr, log_sigma
+
+    return WholePairs(network)
 
 
 def _session(path: Path, threads: int) -> onnxruntime.InferenceSession:

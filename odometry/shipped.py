@@ -15,12 +15,7 @@ def default_weights() -> Path:
         ConfigError: it came without.
     """
     path = _folder() / f"{_NAME}.safetensors"
-    if not path.is_file():
-        raise ConfigError(
-            f"{path}: the weights that come with the program are missing;"
-            " install it again, or name a file of weights with --weights FILE"
-        )
-    return path
+    return _required(path, path.is_file())
 
 
 def shipped_folder() -> Path:
@@ -30,13 +25,17 @@ def shipped_folder() -> Path:
         ConfigError: it came without.
     """
     path = _folder() / _NAME
-    if not path.is_dir():
-        raise ConfigError(
-            f"{path}: the network that comes with the program is missing;"
-            " install it again, or name weights with --weights FILE"
-        )
-    return path
+    return _required(path, path.is_dir())
 
 
 def _folder() -> Path:
     return Path(str(files("odometry"))) / "weights"
+
+
+def _required(path: Path, is_there: bool) -> Path:
+    if not is_there:
+        raise ConfigError(
+            f"{path}: the weights that come with the program are missing;"
+            " install it again, or name a file of weights with --weights FILE"
+        )
+    return path

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from odometry.candidates import Candidate, CorrelationSearch, Described, Search
+from odometry.candidates import CorrelationSearch, Search, WholePairs
 from odometry.correlation import CorrelationNetwork, PairImages
 
 Floats = NDArray[np.float32]
@@ -52,35 +52,19 @@ class TorchGraphs:
         return result
 
 
-class WholePairs:
-    """A network that sees nothing but pairs, with its one motion as the only candidate; implements `Search`."""
-
-    def __init__(self, network: nn.Module, device: torch.device | str = "cpu", threads: int = 1) -> None:
-        self._network = network.to(device)
-        self._device = device
-        self._threads = threads
-
-    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
-        """The image itself."""
-        return Described(np.concatenate([points, normals])[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
-
-    @torch.inference_mode()
-    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
-        """See `Search`."""
-        current = self.describe(points, normals)
-        images = (torch.from_numpy(scan.columns).to(self._device) for scan in (previous, current))
-        with using_threads(self._threads):
-            estimate = self._network(PairImages(*images))
-        T_prev_curr = estimate.T_prev_curr[0].double().numpy(force=True)
-        variances = (2.0 * estimate.log_sigma[0].double()).exp().numpy(force=True)
-        return (Candidate(T_prev_curr, np.diag(variances), 0.0),), current
-
-
 def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads: int = 1) -> Search:
     """The search for candidates that a network in evaluation mode is made for."""
     if isinstance(network, CorrelationNetwork):
         return CorrelationSearch(TorchGraphs(network, device, threads))
-    return WholePairs(network, device, threads)
+    moved = network.to(device)
+
+    @torch.inference_mode()
+    def pairs(previous: Floats, current: Floats) -> tuple[Floats, Floats]:
+        with using_threads(threads):
+            estimate = moved(PairImages(*(torch.from_numpy(images).to(device) for images in (previous, current))))
+        return _array(estimate.T_prev_curr), _array(estimate.log_sigma)
+
+    return WholePairs(pairs)
 
 
 @contextmanager

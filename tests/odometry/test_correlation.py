@@ -9,7 +9,8 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from odometry import bird_eye
-from odometry.correlation import INPUT_CHANNELS, SHIFTS, CorrelationNetwork, PairImages, column_channels
+from odometry.bird_eye import SHIFTS
+from odometry.correlation import INPUT_CHANNELS, CorrelationNetwork, PairImages, column_channels
 from odometry.network_config import CorrelationConfig, NetworkConfig
 from odometry.networks import make_network
 from odometry.objective import objective
