@@ -20,15 +20,15 @@ import numpy as np
 from mapping_accuracy import METHODS, Recorded, pipeline_results, print_row, read, true_trajectory
 from odometry_accuracy import estimated_motions, rms, shares_within_sigmas, squared_errors
 
-from evaluation.association import Association
-from evaluation.drift import segment_errors
+from evaluation.trajectory.association import Association
+from evaluation.trajectory.drift import segment_errors
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
-from lidarslam.scan_order import in_order
+from lidarslam.pipeline.scan_order import in_order
 from odometry.config import OdometryConfig
 from odometry.interface import Motion
-from odometry.learned_config import LearnedConfig
+from odometry.methods.learned_config import LearnedConfig
 
 LENGTHS_M = (20.0, 30.0, 40.0, 50.0, 60.0)
 _SCANS_OF_A_START = 50

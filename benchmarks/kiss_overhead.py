@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
@@ -70,10 +70,10 @@ def run_kiss(source: Path) -> dict[str, Any]:
 
 def run_ours(source: Path) -> dict[str, Any]:
     """Our run on the recording."""
-    from lidarslam.config import load_config
+    from lidarslam.config.settings import load_config
     from lidarslam.core.trajectory_io import read_tum
-    from lidarslam.run import execute
-    from lidarslam.run_request import RunRequest
+    from lidarslam.run.request import RunRequest
+    from lidarslam.run.run import execute
 
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()

@@ -21,21 +21,21 @@ import numpy as np
 from mapping_accuracy import print_row
 from mapping_memory import resident_mb
 
-from lidarslam.checkpoint_config import CheckpointConfig
-from lidarslam.checkpoints import Checkpoints
-from lidarslam.config import Config, load_config
+from lidarslam.config.settings import Config, load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import State
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.localisation import make_localiser
-from lidarslam.loop_closing import begin_graph
-from lidarslam.pipeline import Pipeline
-from lidarslam.prefetch import prefetch
-from lidarslam.run_directory import RunDirectory
-from lidarslam.scan_log import ScanLog
-from lidarslam.unfinished import Unfinished
-from mapping import global_map
-from odometry.external import ExternalOdometry
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.loop_closing import begin_graph
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.prefetch import prefetch
+from lidarslam.resume.checkpoints import Checkpoints
+from lidarslam.resume.config import CheckpointConfig
+from lidarslam.resume.unfinished import Unfinished
+from lidarslam.run.directory import RunDirectory
+from lidarslam.run.scan_log import ScanLog
+from mapping.global_map import global_map
+from odometry.methods.external import ExternalOdometry
 
 _POINTS = 300
 

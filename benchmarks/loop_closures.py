@@ -25,26 +25,26 @@ import numpy as np
 from mapping_accuracy import print_row
 from numpy.typing import NDArray
 
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory, chain
-from lidarslam.localisation import SweepMotion
-from lidarslam.simulation.carriers import CARRIERS
-from lidarslam.simulation.mounts import MOUNTS, mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensor_table import SENSORS
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.pipeline.localisation import SweepMotion
+from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.motion.mounts import MOUNTS, mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.world import Boxes, Route, World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from mapping.deskew import body_velocity
-from mapping.global_map import voxel_size_for
-from mapping.graph_config import SlamGraphConfig
-from mapping.graph_scan import GraphScan
-from mapping.loop_closure import LoopClosure
-from mapping.loop_config import LoopConfig
-from mapping.slam_graph import Corrected, SlamGraph
+from mapping.global_map.global_map import voxel_size_for
+from mapping.loops.detection import LoopClosure
+from mapping.loops.loop_config import LoopConfig
+from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.pose_graph.graph_scan import GraphScan
+from mapping.pose_graph.slam_graph import Corrected, SlamGraph
 
 ROOMS = "rooms"
 FALSE_M, FALSE_DEG = 0.5, 3.0

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.config import Config
+from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
-from lidarslam.run import execute
-from lidarslam.run_request import RunRequest
-from lidarslam.summary import RunSummary
+from lidarslam.run.request import RunRequest
+from lidarslam.run.run import execute
+from lidarslam.run.summary import RunSummary
 
 _STRETCH = 15
 

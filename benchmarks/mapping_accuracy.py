@@ -23,23 +23,23 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.trajectory_metrics import TrajectoryErrors, evaluate_trajectory
-from lidarslam.config import Config
+from evaluation.trajectory.metrics import TrajectoryErrors, evaluate_trajectory
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
-from lidarslam.localisation import make_localiser
-from lidarslam.pipeline import Pipeline, ScanResult
-from lidarslam.scan_order import in_order
-from lidarslam.simulation.carriers import CARRIERS
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensor_table import SENSORS
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.scan_order import in_order
+from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from mapping.config import MappingConfig
 from odometry.config import KissConfig, OdometryConfig

@@ -23,20 +23,20 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from mapping_accuracy import make_simulation, print_row, without_odometry
 
-from lidarslam.checkpoints import Checkpoints
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
-from lidarslam.localisation import ScanToMap
-from lidarslam.pipeline import Pipeline, ScanResult
-from lidarslam.prefetch import prefetch
-from lidarslam.run_directory import RunDirectory
-from lidarslam.scan_log import ScanLog
-from lidarslam.simulation.carriers import CARRIERS
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.scan_patterns import Spinning
-from lidarslam.simulation.sensor_table import SENSORS
+from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.prefetch import prefetch
+from lidarslam.resume.checkpoints import Checkpoints
+from lidarslam.resume.unfinished import Unfinished
+from lidarslam.run.directory import RunDirectory
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.scan_patterns import Spinning
+from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
-from lidarslam.unfinished import Unfinished
 from mapping.config import MappingConfig
 from mapping.mapper import Mapper
 from odometry.registry import make_odometry

@@ -41,11 +41,12 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
-from lidarslam.scan_order import in_order
-from mapping import mapper, placement, sampling
+from lidarslam.pipeline.scan_order import in_order
+from mapping import mapper, sampling
 from mapping.config import MappingConfig
 from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.tracking import attempts as placement
 
 # Stage -> what is timed for it: the object that holds the function, and its name there.
 _STAGES: dict[str, tuple[Any, str]] = {

@@ -17,10 +17,10 @@ from held_out import mapped, with_truth
 from mapping_accuracy import Recorded, print_row, true_trajectory
 
 from lidarslam.core.geometry import FloatArray, inverse, log
-from odometry.candidates import Candidate
-from odometry.checkpoint import load_checkpoint, network_of
-from odometry.sweep_images import Imager
-from odometry.torch_graphs import torch_search
+from odometry.images.sweep_images import Imager
+from odometry.network.candidates import Candidate
+from odometry.network.checkpoint import load_checkpoint, network_of
+from odometry.network.torch_graphs import torch_search
 
 _RIGHT_DEG, _RIGHT_M = 4.0, 0.8
 

@@ -17,21 +17,21 @@ import torch
 from mapping_accuracy import simulate
 
 from lidarslam.core.scan import Scan
-from odometry.alignment import Guess, align
-from odometry.candidates import Described, Search
-from odometry.checkpoint import load_checkpoint, network_of
+from odometry.alignment.alignment import Guess, align
 from odometry.config import OdometryConfig
-from odometry.exported import read_exported
-from odometry.image_config import ImageConfig
-from odometry.learned_config import LearnedConfig
-from odometry.network_config import NetworkConfig
-from odometry.networks import make_network
-from odometry.onnx_graphs import onnx_search
+from odometry.images.image_config import ImageConfig
+from odometry.images.sweep_images import Imager
+from odometry.images.sweeps import SweepImages, SweepPair
+from odometry.methods.learned_config import LearnedConfig
+from odometry.network.candidates import Described, Search
+from odometry.network.checkpoint import load_checkpoint, network_of
+from odometry.network.exported import read_exported
+from odometry.network.network_config import NetworkConfig
+from odometry.network.networks import make_network
+from odometry.network.onnx_graphs import onnx_search
+from odometry.network.shipped import default_weights, shipped_folder
+from odometry.network.torch_graphs import torch_search
 from odometry.registry import make_odometry
-from odometry.shipped import default_weights, shipped_folder
-from odometry.sweep_images import Imager
-from odometry.sweeps import SweepImages, SweepPair
-from odometry.torch_graphs import torch_search
 
 SCANS = 12
 

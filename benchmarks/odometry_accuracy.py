@@ -31,10 +31,10 @@ from scipy.stats import chi2
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
-from odometry.alignment_config import AlignmentConfig
+from odometry.alignment.alignment_config import AlignmentConfig
 from odometry.config import OdometryConfig
 from odometry.interface import Motion
-from odometry.learned_config import LearnedConfig
+from odometry.methods.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
 # Numbers of standard deviations, and the share of errors that should lie within each.

@@ -22,10 +22,10 @@ from odometry_accuracy import EXPECTED_SHARES, SIGMAS, network_alone, rms, share
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
-from lidarslam.simulation.mixture import Excerpt, mixture
-from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.recording.mixture import Excerpt, mixture
+from lidarslam.simulation.recording.recorder import Simulation
 from odometry.config import OdometryConfig
-from odometry.learned_config import LearnedConfig
+from odometry.methods.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
 # What a motion should be better than: degrees, metres, and part of the step.

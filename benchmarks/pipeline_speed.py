@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 from mapping_accuracy import make_simulation, print_row
 
-from lidarslam.config import load_config
+from lidarslam.compare.methods import parse_method
+from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
-from lidarslam.localisation import make_localiser
-from lidarslam.loop_closing import begin_graph, finish_graph
-from lidarslam.methods import parse_method
-from lidarslam.pipeline import Pipeline
-from lidarslam.scan_order import in_order
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.loop_closing import begin_graph, finish_graph
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.scan_order import in_order
 from odometry.registry import make_odometry
 
 _KISS = "KISS-ICP's own loop"

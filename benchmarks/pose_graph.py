@@ -28,14 +28,14 @@ from mapping_accuracy import print_row
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses
-from mapping.correction import corrected
-from mapping.g2o import Edge, GraphFile, format_g2o, read_g2o
-from mapping.pose_graph import Optimised, PoseGraph
-from mapping.pose_graph_config import PoseGraphConfig
+from mapping.pose_graph.correction import corrected
+from mapping.pose_graph.g2o import Edge, GraphFile, format_g2o, read_g2o
+from mapping.pose_graph.optimizer import Optimised, PoseGraph
+from mapping.pose_graph.pose_graph_config import PoseGraphConfig
 
 SCAN_S = 0.1
 # KISS-ICP's drift on KITTI 00, 0.53 % and 0.0019 degrees a metre, mostly over some 300 m, as a random walk.

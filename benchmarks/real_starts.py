@@ -33,14 +33,14 @@ from click.testing import CliRunner
 from evalio_peers import PEERS, PeerError, run_peer
 from mapping_accuracy import print_row
 
-from evaluation.association import associate
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.trajectory.association import associate
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.cli import main as lidarslam
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.scan_order import in_order
+from lidarslam.pipeline.scan_order import in_order
 
 # Methods that `lidarslam run` has, and the options that choose them.
 OPTIONS: dict[str, tuple[str, ...]] = {

@@ -10,12 +10,12 @@ import time
 from collections.abc import Iterator, Sequence
 from statistics import median
 
-from lidarslam.simulation.carriers import CARRIERS
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensor_table import SENSORS
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 

@@ -24,14 +24,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mapping_accuracy import METHODS, make_simulation, print_row
 
-from evaluation.trajectory_metrics import evaluate_trajectory
-from lidarslam.config import Config
+from evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.localisation import make_localiser
-from lidarslam.pipeline import Pipeline, ScanResult
-from lidarslam.simulation.faults import (
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.simulation.motion.given_motion import motion_along
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.recording.faults import (
     Cover,
     Faulty,
     carried_off,
@@ -41,14 +43,12 @@ from lidarslam.simulation.faults import (
     passing_by,
     standing_still,
 )
-from lidarslam.simulation.featureless import even_tunnel, open_plain, straight_drive
-from lidarslam.simulation.given_motion import motion_along
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.worlds.featureless import even_tunnel, open_plain, straight_drive
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import GlobalMapConfig
-from mapping.visibility import seen_through
+from mapping.global_map.moved_points import seen_through
 from odometry.registry import make_odometry
 
 _POLLUTED_M = 0.2

@@ -15,15 +15,15 @@ from pathlib import Path
 import torch
 from mapping_accuracy import print_row
 
-from lidarslam.simulation.mixture import Ingredients, ingredients_of
-from lidarslam.train import execute
-from lidarslam.train_config import SimulatedConfig, TrainConfig
-from lidarslam.train_request import TrainNarrator, TrainRequest
-from lidarslam.training_data import prepared, simulated
-from odometry.checkpoint import load_checkpoint, network_of
-from odometry.preparation import PreparedRecording
-from odometry.training import validate
-from odometry.training_config import TrainingConfig
+from lidarslam.simulation.recording.mixture import Ingredients, ingredients_of
+from lidarslam.train.config import SimulatedConfig, TrainConfig
+from lidarslam.train.data import prepared, simulated
+from lidarslam.train.request import TrainNarrator, TrainRequest
+from lidarslam.train.train import execute
+from odometry.network.checkpoint import load_checkpoint, network_of
+from odometry.training.preparation import PreparedRecording
+from odometry.training.training import validate
+from odometry.training.training_config import TrainingConfig
 
 _WORLDS = ("street", "office", "tunnel", "park")
 _SENSORS = ("vlp-16", "hdl-64e", "os1-128", "os1-64", "hdl-32e")

@@ -24,8 +24,8 @@ from lidarslam.commands.train import train
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.core.plain_text import printable
-from lidarslam.interruption import ended_like_interrupted
-from lidarslam.rerun_environment import keep_rerun_to_itself, leave_if_abandoned
+from lidarslam.run.interruption import ended_like_interrupted
+from lidarslam.viewer.rerun_environment import keep_rerun_to_itself, leave_if_abandoned
 
 logger = logging.getLogger(__name__)
 

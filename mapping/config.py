@@ -4,7 +4,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
-from mapping.feature_config import FeatureConfig
+from mapping.loam.config import FeatureConfig
 
 
 class GlobalMapConfig(BaseModel):
@@ -30,7 +30,7 @@ class GlobalMapConfig(BaseModel):
 
 
 class RefinementConfig(BaseModel):
-    """How a scan is laid on the map; see `mapping.refinement`."""
+    """How a scan is laid on the map; see `mapping.registration`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -44,7 +44,7 @@ class RefinementConfig(BaseModel):
 
 
 class TrackingConfig(BaseModel):
-    """When a scan laid on the map is believed; see `mapping.fit`."""
+    """When a scan laid on the map is believed; see `mapping.tracking.fit`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

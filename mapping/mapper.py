@@ -15,15 +15,23 @@ from lidarslam.core.state import State as Tree
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
-from mapping.doubt import Doubt
-from mapping.earlier_maps import EarlierMaps
-from mapping.fit import Fit
-from mapping.local_map import LocalMap
-from mapping.placement import Placed, is_rivalled, place, place_displaced, place_surprised, search, search_everywhere
 from mapping.prediction import Carrier, OdometryNoise, Prediction, Prior, State, predict
-from mapping.refinement import Refined, compensated
+from mapping.registration import Refined, compensated
 from mapping.sampling import SampledScan, Sampler
-from mapping.verdict import Circumstances, has_jumped, judge
+from mapping.surfels.surfel_map import LocalMap
+from mapping.tracking.archived_maps import EarlierMaps
+from mapping.tracking.attempts import (
+    Placed,
+    is_rivalled,
+    place,
+    place_displaced,
+    place_surprised,
+    search,
+    search_everywhere,
+)
+from mapping.tracking.fit import Fit
+from mapping.tracking.pose_status import Circumstances, has_jumped, judge
+from mapping.tracking.tracking_state import Doubt
 
 # Predictions that were off by less than this share of a cell need no coarser cells first; what they were off by is
 # forgotten by this factor a scan.

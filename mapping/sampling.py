@@ -11,9 +11,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from mapping.config import MappingConfig
-from mapping.features import extract_features
-from mapping.refinement import Sweep
-from mapping.rings import RingFinder
+from mapping.loam.features import extract_features
+from mapping.loam.rings import RingFinder
+from mapping.registration import Sweep
 
 # Spacing of the points that go into the map, and of those that are registered, in cells.
 _MAP_SPACING = 0.5

@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
-from odometry.learned_config import LearnedConfig
+from odometry.methods.learned_config import LearnedConfig
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "external"]
 
@@ -35,7 +35,7 @@ class KissConfig(BaseModel):
 
 
 class ConsistencyConfig(BaseModel):
-    """When two consecutive scans are said to fit each other; see `odometry.consistency`."""
+    """When two consecutive scans are said to fit each other; see `odometry.methods.consistency`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -4,7 +4,7 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
 from odometry.config import OdometryConfig
 from odometry.interface import Odometry
-from odometry.learned_config import LearnedConfig
+from odometry.methods.learned_config import LearnedConfig
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
@@ -22,34 +22,34 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
     if (config.method == "external") != (prior is not None):
         raise ConfigError("a prior trajectory and odometry.method=external go together; give both or neither")
     if prior is not None:
-        from odometry.external import ExternalOdometry
+        from odometry.methods.external import ExternalOdometry
 
         return ExternalOdometry(prior)
     if config.method == "learned":
         return _make_learned(config.learned)
     if config.method != "constant-velocity":
-        from odometry.kiss import KissOdometry
+        from odometry.methods.kiss import KissOdometry
 
         return KissOdometry(config.kiss_icp)
-    from odometry.constant_velocity import ConstantVelocity
+    from odometry.methods.constant_velocity import ConstantVelocity
 
     return ConstantVelocity()
 
 
 def _make_learned(config: LearnedConfig) -> Odometry:
     """By ONNX Runtime, which starts at once; by torch with a file of weights, or on an accelerator."""
-    from odometry.learned import LearnedOdometry
+    from odometry.methods.learned import LearnedOdometry
 
     if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
-        from odometry.exported import read_exported
-        from odometry.onnx_graphs import onnx_search
-        from odometry.shipped import shipped_folder
+        from odometry.network.exported import read_exported
+        from odometry.network.onnx_graphs import onnx_search
+        from odometry.network.shipped import shipped_folder
 
         exported = read_exported(config.weights or shipped_folder())
         return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config)
-    from odometry.checkpoint import load_checkpoint, network_of
-    from odometry.shipped import default_weights
-    from odometry.torch_graphs import torch_search
+    from odometry.network.checkpoint import load_checkpoint, network_of
+    from odometry.network.shipped import default_weights
+    from odometry.network.torch_graphs import torch_search
 
     checkpoint = load_checkpoint(config.weights or default_weights())
     try:

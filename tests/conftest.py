@@ -13,7 +13,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.state_file import read_state, write_state
+from lidarslam.resume.state_file import read_state, write_state
 
 # The first call of a compiled loop takes as long as compiling it.
 settings.register_profile("patient", deadline=None)

@@ -11,17 +11,17 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.config import load_config
+from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
-from lidarslam.merge import MergeOutcome
-from lidarslam.rerun_viewer import Served
-from lidarslam.summary import MergedRecording, MergeSummary, WrittenMap
-from odometry.checkpoint import checkpoint_of, save_checkpoint
-from odometry.image_config import ImageConfig
-from odometry.network_config import CorrelationConfig, NetworkConfig
-from odometry.networks import make_network
+from lidarslam.merge.merge import MergeOutcome
+from lidarslam.run.summary import MergedRecording, MergeSummary, WrittenMap
+from lidarslam.viewer.rerun_viewer import Served
+from odometry.images.image_config import ImageConfig
+from odometry.network.checkpoint import checkpoint_of, save_checkpoint
+from odometry.network.network_config import CorrelationConfig, NetworkConfig
+from odometry.network.networks import make_network
 
 
 def lidarslam(*arguments: object) -> Result:
@@ -196,7 +196,7 @@ def test_merge_exits_as_run_does(
     entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
     summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
     outcome = MergeOutcome(summary, (None, None), stopped)
-    monkeypatch.setattr("lidarslam.merge.merge", lambda *_: outcome)
+    monkeypatch.setattr("lidarslam.merge.merge.merge", lambda *_: outcome)
     assert (
         lidarslam("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder").exit_code
         == status
@@ -248,7 +248,7 @@ def test_a_file_that_may_not_be_read_gets_one_line(recording: Path, monkeypatch:
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied", str(recording / "000000.npy"))
 
-    monkeypatch.setattr("lidarslam.info.describe_source", refuse)
+    monkeypatch.setattr("lidarslam.datasets.info_text.describe_source", refuse)
     result = lidarslam("info", recording)
     assert (result.exit_code, result.stderr) == (1, f"lidarslam: {recording}/000000.npy: Permission denied\n")
 
@@ -258,7 +258,7 @@ def test_view_says_where_the_browser_is_served(
 ) -> None:
     assert lidarslam("run", recording, "--out", tmp_path / "run", "--stop", 2).exit_code == 0
     served = Served("http://127.0.0.1:9090/?url=there", None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr("lidarslam.rerun_viewer.show_runs", lambda *_: served)
+    monkeypatch.setattr("lidarslam.viewer.rerun_viewer.show_runs", lambda *_: served)
     monkeypatch.setattr("signal.pause", lambda: None)
     lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
     assert lines[0] == "http://127.0.0.1:9090/?url=there"

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.config import Config, dump_yaml, load_config, reader_settings
+from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
 from lidarslam.core.errors import ConfigError
-from lidarslam.train_config import TrainConfig, load_train_config
+from lidarslam.train.config import TrainConfig, load_train_config
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

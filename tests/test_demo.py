@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lidarslam.demo import format_demo, run_demo
+from lidarslam.compare.demo import format_demo, run_demo
 
 
 def test_the_map_survives_the_turns_that_lose_kiss_icp(tmp_path: Path) -> None:

@@ -12,20 +12,20 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from lidarslam.config import load_config
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
-from lidarslam.finished_run import load_run
-from lidarslam.pipeline import ScanResult
-from lidarslam.run import execute
-from lidarslam.run_directory import FILES
-from lidarslam.run_request import RunRequest
-from lidarslam.scan_order import in_order
-from mapping.g2o import read_g2o
+from lidarslam.pipeline.pipeline import ScanResult
+from lidarslam.pipeline.scan_order import in_order
+from lidarslam.run.directory import FILES
+from lidarslam.run.finished_run import load_run
+from lidarslam.run.request import RunRequest
+from lidarslam.run.run import execute
+from mapping.pose_graph.g2o import read_g2o
 
 KISS_ICP = [
     "odometry.method=kiss-icp",
@@ -202,7 +202,7 @@ def test_scans_that_go_back_in_time_are_left_out() -> None:
 
 
 def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lidarslam.datasets.scan_folder import ScanFolderRecording
+    from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
 
     read = ScanFolderRecording.scans
 
@@ -231,7 +231,7 @@ def test_a_damaged_scan_is_left_out_and_counted(recording: Path, tmp_path: Path)
 def test_damage_that_no_scan_can_be_left_out_for_ends_the_run_with_what_there_is(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lidarslam.datasets.scan_folder import ScanFolderRecording
+    from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
 
     read = ScanFolderRecording.scans
 
@@ -334,7 +334,7 @@ def test_kitti_raw_is_deskewed_as_by_kiss_icp(real_data: Path, tmp_path: Path) -
     from kiss_icp.config import load_config as kiss_config
     from kiss_icp.kiss_icp import KissICP
 
-    from evaluation.trajectory_metrics import evaluate_trajectory
+    from evaluation.trajectory.metrics import evaluate_trajectory
     from lidarslam.datasets.registry import open_recording
 
     drive = real_data / "kitti_raw_0005" / "2011_09_26" / "2011_09_26_drive_0005_sync"

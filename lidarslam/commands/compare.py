@@ -6,14 +6,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.options import (
-    FILE,
-    PATH,
-    CommandWithExample,
-    config_options,
-    reader_options,
-    scan_options,
-)
+from lidarslam.commands.options import FILE, PATH, CommandWithExample, config_options, reader_options, scan_options
 from lidarslam.commands.terminal import EXIT_MENDABLE, say, tell
 
 
@@ -51,7 +44,7 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
     table, and the exit status is 0 all the same; it is 1 when no method came to a result, or on Ctrl-C, which writes
     the report of what there is.
     """
-    from lidarslam.compare_command import CompareOptions, run_compare
+    from lidarslam.compare.command import CompareOptions, run_compare
 
     if (benchmark is None) == (not sources):
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")

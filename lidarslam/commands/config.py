@@ -12,6 +12,6 @@ from lidarslam.core.plain_text import printable
 @config_options
 def config(config_file: Path | None, settings: tuple[str, ...]) -> None:
     """Print the resolved configuration as YAML."""
-    from lidarslam.config import dump_yaml, load_config
+    from lidarslam.config.settings import dump_yaml, load_config
 
     click.echo(printable(dump_yaml(load_config(config_file, settings))), nl=False)

@@ -13,6 +13,6 @@ from lidarslam.commands.terminal import say, tell
 @click.option("--scans", type=click.IntRange(min=20), default=400, show_default=True, help="Length of the recording.")
 def demo(out: Path, scans: int) -> None:
     """Record an indoor run in a simulated office, map it, and compare that with KISS-ICP and the truth."""
-    from lidarslam.demo import format_demo, run_demo
+    from lidarslam.compare.demo import format_demo, run_demo
 
     say(format_demo(run_demo(out, scans, tell=tell)))

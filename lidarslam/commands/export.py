@@ -17,9 +17,9 @@ def export(weights: Path | None, out: Path) -> None:
     `lidarslam run --weights DIR` starts faster with the folder than with the file of weights, because it does without
     torch. Other programs can run the graphs; docs/odometry.md lists their inputs and outputs.
     """
-    from odometry.checkpoint import load_checkpoint
-    from odometry.export import export_onnx
-    from odometry.shipped import default_weights
+    from odometry.network.checkpoint import load_checkpoint
+    from odometry.network.export import export_onnx
+    from odometry.network.shipped import default_weights
 
     for path in export_onnx(load_checkpoint(weights or default_weights()), out):
         say(f"written to {path}")

@@ -15,7 +15,7 @@ from lidarslam.commands.terminal import say
 @config_options
 def info(source: Path, **options: Any) -> None:
     """Say what a recording holds, and what was inferred about it."""
-    from lidarslam.info import describe_source
+    from lidarslam.datasets.info_text import describe_source
 
     config = take_config(options, options.pop("settings"), source)
     say(describe_source(source, config.reader))

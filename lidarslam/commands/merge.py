@@ -33,10 +33,10 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
     common map, and for each recording a run directory with its poses in the common frame. A recording that nothing
     joins to the others is left out of the common map, and the exit status is 1.
     """
-    from lidarslam.merge import MergeRequest
-    from lidarslam.merge import merge as execute
-    from lidarslam.merge_text import format_merge
-    from lidarslam.progress import show_progress
+    from lidarslam.merge.merge import MergeRequest
+    from lidarslam.merge.merge import merge as execute
+    from lidarslam.merge.text import format_merge
+    from lidarslam.run.progress import show_progress
 
     settings = method_settings(
         options.pop("odometry"), options.pop("weights"), None, None, None, options.pop("settings")

@@ -105,12 +105,12 @@ odometry_options = _together(
 
 
 def resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
-    """The configuration (`lidarslam.config.Config`), with the options that have a name of their own applied last.
+    """The configuration (`lidarslam.config.settings.Config`), with the options applied last.
 
     Raises:
         ConfigError: a file or a setting is not what it should be.
     """
-    from lidarslam.config import load_config, reader_settings
+    from lidarslam.config.settings import load_config, reader_settings
 
     return load_config(config_file, [*settings, *reader_settings(**reader)])
 
@@ -156,7 +156,7 @@ def method_settings(
     Raises:
         UsageError: options exclude each other.
     """
-    from lidarslam.config import setting
+    from lidarslam.config.settings import setting
 
     if weights is not None:
         if odometry not in (None, "learned") or prior is not None:

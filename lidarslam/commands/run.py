@@ -58,10 +58,10 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 @click.pass_context
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
-    from lidarslam.progress import show_progress
-    from lidarslam.run import astray_when_finished, execute
-    from lidarslam.run_request import RunRequest
-    from lidarslam.summary_text import format_outcome
+    from lidarslam.run.progress import show_progress
+    from lidarslam.run.request import RunRequest
+    from lidarslam.run.run import astray_when_finished, execute
+    from lidarslam.run.summary_text import format_outcome
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume goes on with a run, --overwrite replaces it; choose one")

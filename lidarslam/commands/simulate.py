@@ -17,19 +17,19 @@ def _worlds() -> Iterable[str]:
 
 
 def _sensors() -> Iterable[str]:
-    from lidarslam.simulation.sensor_table import SENSORS
+    from lidarslam.simulation.sensors.table import SENSORS
 
     return SENSORS
 
 
 def _motions() -> Iterable[str]:
-    from lidarslam.simulation.carriers import CARRIERS
+    from lidarslam.simulation.motion.carriers import CARRIERS
 
     return CARRIERS
 
 
 def _mounts() -> Iterable[str]:
-    from lidarslam.simulation.mounts import MOUNTS
+    from lidarslam.simulation.motion.mounts import MOUNTS
 
     return MOUNTS
 
@@ -80,10 +80,10 @@ def _formats() -> Iterable[str]:
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Make a recording in a simulated world, with the exact trajectory and the exact map."""
-    from lidarslam.progress import show_count
-    from lidarslam.simulation.record import record
-    from lidarslam.simulation.recording_request import RecordRequest
-    from lidarslam.simulation.recording_text import format_summary
+    from lidarslam.run.progress import show_count
+    from lidarslam.simulation.recording.record import record
+    from lidarslam.simulation.recording.request import RecordRequest
+    from lidarslam.simulation.recording.text import format_summary
 
     motion = motion or ("handheld" if trajectory is None else "car")
     request = RecordRequest(out, motion=motion, trajectory=trajectory, **options)

@@ -30,7 +30,7 @@ def view(
     settings: tuple[str, ...],
 ) -> None:
     """Look at finished runs in Rerun: trajectories, maps, and where tracking was lost."""
-    from lidarslam.finished_run import load_run
+    from lidarslam.run.finished_run import load_run
 
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
@@ -39,7 +39,7 @@ def view(
         return
     config = resolve(config_file, settings)
     finished = [load_run(path) for path in runs]
-    from lidarslam.rerun_viewer import show_runs
+    from lidarslam.viewer.rerun_viewer import show_runs
 
     served = show_runs(finished, config.viewer, save, web)
     if save is not None:
@@ -51,8 +51,8 @@ def view(
 
 
 def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
-    from lidarslam.finished_run import load_map
-    from lidarslam.picture import draw, height_colours, save_picture
+    from lidarslam.run.finished_run import load_map
+    from lidarslam.viewer.picture import draw, height_colours, save_picture
 
     if len(runs) != 1:
         raise click.UsageError("--picture draws one map; name one run")

@@ -56,16 +56,16 @@ def _is_scan_folder(source: Path) -> bool:
 
 READERS: dict[str, Reader] = {
     "kitti-odometry": Reader(
-        "lidarslam.datasets.kitti_odometry",
+        "lidarslam.datasets.kitti.odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         _is_kitti_odometry,
     ),
     "kitti-raw": Reader(
-        "lidarslam.datasets.kitti_raw", "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder", _is_kitti_raw
+        "lidarslam.datasets.kitti.raw", "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder", _is_kitti_raw
     ),
-    "rosbag": Reader("lidarslam.datasets.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "scan-folder": Reader(
-        "lidarslam.datasets.scan_folder", "a folder of .bin, .pcd, .ply or .npy scans", _is_scan_folder
+        "lidarslam.datasets.folders.scan_folder", "a folder of .bin, .pcd, .ply or .npy scans", _is_scan_folder
     ),
 }
 

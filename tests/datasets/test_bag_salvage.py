@@ -14,12 +14,12 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2.reader import zstd
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.bag_database import DatabaseWalk
-from lidarslam.datasets.bag_file import BagFile
-from lidarslam.datasets.bag_salvage import Place, messages_from
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.ros.bag_database import DatabaseWalk
+from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_salvage import Place, messages_from
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000

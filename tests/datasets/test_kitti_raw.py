@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti_oxts import oxts_poses
-from lidarslam.datasets.kitti_raw_timing import offsets_from_azimuth
+from lidarslam.datasets.kitti.oxts import oxts_poses
+from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth
 from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.stamps import increasing_rows, mend_stamps
 

@@ -11,9 +11,9 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.lzf import decompress_lzf
-from lidarslam.datasets.pcd import read_pcd
-from lidarslam.datasets.ply import read_ply
+from lidarslam.datasets.folders.lzf import decompress_lzf
+from lidarslam.datasets.folders.pcd import read_pcd
+from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.stamps import read_stamps, stamps_from_names
 

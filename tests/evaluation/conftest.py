@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from evaluation.comparison import (
+from evaluation.comparison.comparison import (
     Comparison,
     MapErrors,
     MethodResult,
@@ -13,8 +13,8 @@ from evaluation.comparison import (
     PublishedRow,
     SequenceComparison,
 )
-from evaluation.summary_table import SummaryTable, TableCell, TableColumn, TableRow
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.comparison.summary_table import SummaryTable, TableCell, TableColumn, TableRow
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from evaluation.agreement import disagreement
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.trajectory.agreement import disagreement
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory
 

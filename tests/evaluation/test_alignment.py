@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluation.alignment import align, align_se3
+from evaluation.trajectory.alignment import align, align_se3
 from lidarslam.core.geometry import exp, inverse, is_rigid, rotation_angle
 from lidarslam.core.trajectory import Trajectory
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluation.association import associate
+from evaluation.trajectory.association import associate
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory

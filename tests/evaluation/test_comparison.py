@@ -7,11 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.comparison import Comparison, MethodResult, MethodStatus, MissingRecording, SequenceComparison
-from evaluation.mean_table import TablePlan, mean_table
-from evaluation.quantities import QUANTITIES, find_quantity
-from evaluation.summary_table import TableCell, TableRow
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.comparison.comparison import (
+    Comparison,
+    MethodResult,
+    MethodStatus,
+    MissingRecording,
+    SequenceComparison,
+)
+from evaluation.comparison.mean_table import TablePlan, mean_table
+from evaluation.comparison.quantities import QUANTITIES, find_quantity
+from evaluation.comparison.summary_table import TableCell, TableRow
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from evaluation.association import associate
-from evaluation.deviation import deviation
-from evaluation.trajectory_metrics import absolute_errors, evaluate_trajectory
+from evaluation.trajectory.association import associate
+from evaluation.trajectory.deviation import deviation
+from evaluation.trajectory.metrics import absolute_errors, evaluate_trajectory
 from lidarslam.core.geometry import exp, make_transform
 from lidarslam.core.trajectory import Trajectory
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from kiss_icp.metrics import sequence_error
 
-from evaluation.association import associate
-from evaluation.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, kitti_drift, segment_errors, short_drift
+from evaluation.trajectory.association import associate
+from evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, kitti_drift, segment_errors, short_drift
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 

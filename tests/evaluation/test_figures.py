@@ -8,14 +8,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evaluation.comparison import MapErrors
-from evaluation.figures.maps import raster
-from evaluation.figures.png import indexed_png
-from evaluation.figures.scale import Scale, round_up, tick_texts, ticks
-from evaluation.figures.thinning import thin_curve, thin_path
-from evaluation.markup import element, escape
-from evaluation.number_text import number_text
-from evaluation.table import Cell, Column, Row, Table, with_best
+from evaluation.comparison.comparison import MapErrors
+from evaluation.comparison.number_text import number_text
+from evaluation.comparison.table import Cell, Column, Row, Table, with_best
+from evaluation.report.figures.maps import raster
+from evaluation.report.figures.png import indexed_png
+from evaluation.report.figures.scale import Scale, round_up, tick_texts, ticks
+from evaluation.report.figures.thinning import thin_curve, thin_path
+from evaluation.report.markup import element, escape
 
 
 @pytest.mark.parametrize(

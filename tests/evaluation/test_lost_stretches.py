@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from evaluation.comparison import MethodResult
-from evaluation.lost_stretches import lost_stretches
+from evaluation.comparison.comparison import MethodResult
+from evaluation.trajectory.lost_stretches import lost_stretches
 from lidarslam.core.trajectory import Trajectory
 
 LOST = MethodResult(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from evaluation.map_alignment import align_map
-from evaluation.voxel_thinning import thin
+from evaluation.map.alignment import align_map
+from evaluation.map.voxel_thinning import thin
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from evaluation.error_colours import error_colours
-from evaluation.map_metrics import MapMetrics, compare_maps
-from evaluation.voxel_thinning import thin
+from evaluation.map.metrics import MapMetrics, compare_maps
+from evaluation.map.voxel_thinning import thin
+from evaluation.report.error_colours import error_colours
 from lidarslam.core.geometry import FloatArray
 
 UTM = np.array([5e5, 5e6, 300.0])

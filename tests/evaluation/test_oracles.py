@@ -5,9 +5,9 @@ import pytest
 from evo.core.metrics import APE, RPE, PoseRelation, Unit
 from evo.core.trajectory import PoseTrajectory3D
 
-from evaluation.alignment import align
-from evaluation.association import associate
-from evaluation.trajectory_metrics import absolute_errors, evaluate_trajectory, relative_errors
+from evaluation.trajectory.alignment import align
+from evaluation.trajectory.association import associate
+from evaluation.trajectory.metrics import absolute_errors, evaluate_trajectory, relative_errors
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 

@@ -7,9 +7,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from evaluation.comparison import Comparison, MethodResult, SequenceComparison
-from evaluation.figures.palette import method_styles
-from evaluation.report import render_html, render_markdown
+from evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from evaluation.report.figures.palette import method_styles
+from evaluation.report.report import render_html, render_markdown
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \ufffd"
 STROKES = {f"s{number}" for number in range(8)}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kiss_icp.metrics import absolute_trajectory_error, sequence_error
 
-from evaluation.trajectory_metrics import evaluate_trajectory
+from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses

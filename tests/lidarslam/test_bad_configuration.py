@@ -18,11 +18,11 @@ from safetensors.torch import save_file
 
 from lidarslam.cli import main
 from lidarslam.core.trajectory_io import format_kitti, read_tum
-from odometry.checkpoint import checkpoint_of, save_checkpoint
-from odometry.image_config import ImageConfig
-from odometry.network_config import CorrelationConfig, NetworkConfig
-from odometry.networks import make_network
-from odometry.shipped import default_weights
+from odometry.images.image_config import ImageConfig
+from odometry.network.checkpoint import checkpoint_of, save_checkpoint
+from odometry.network.network_config import CorrelationConfig, NetworkConfig
+from odometry.network.networks import make_network
+from odometry.network.shipped import default_weights
 
 
 def lidarslam(*arguments: object) -> Result:

@@ -17,15 +17,15 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
+from lidarslam.core.directory_lock import only_writer
 from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory_io import read_tum
-from lidarslam.datasets.ply import read_ply
-from lidarslam.directory_lock import only_writer
-from lidarslam.rerun_viewer import IncompleteRecordingError, require_complete
-from lidarslam.run_directory import FILES, RunDirectory
-from mapping.global_map import PointCloud
-from mapping.map_io import write_cloud
+from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.run.directory import FILES, RunDirectory
+from lidarslam.viewer.rerun_viewer import IncompleteRecordingError, require_complete
+from mapping.global_map.global_map import PointCloud
+from mapping.global_map.map_io import write_cloud
 
 FAST = ("--odometry", "constant-velocity")
 

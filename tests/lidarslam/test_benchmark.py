@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lidarslam.benchmark import Benchmark, load_benchmark
-from lidarslam.benchmark_request import fill_request
 from lidarslam.cli import main
-from lidarslam.compare_request import CompareRequest
+from lidarslam.compare.benchmark import Benchmark, load_benchmark
+from lidarslam.compare.benchmark_request import fill_request
+from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.request import CompareRequest
 from lidarslam.core.errors import ConfigError
-from lidarslam.methods import parse_methods
-from lidarslam.simulation.carriers import CARRIERS
-from lidarslam.simulation.sensor_table import SENSORS
+from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "benchmarks").glob("*.yaml"))

@@ -9,23 +9,23 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from lidarslam import checkpoints
-from lidarslam.checkpoint_config import CheckpointConfig
-from lidarslam.checkpoints import Checkpoints
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.localisation import OdometryAlone
-from lidarslam.pipeline import Pipeline
-from lidarslam.resuming import scans_left
-from lidarslam.run_directory import RunDirectory
-from lidarslam.state_file import read_state
-from lidarslam.unfinished import About, Unfinished, require_whole
+from lidarslam.pipeline.localisation import OdometryAlone
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.resume import checkpoints
+from lidarslam.resume.checkpoints import Checkpoints
+from lidarslam.resume.config import CheckpointConfig
+from lidarslam.resume.resuming import scans_left
+from lidarslam.resume.state_file import read_state
+from lidarslam.resume.unfinished import About, Unfinished, require_whole
+from lidarslam.run.directory import RunDirectory
 from mapping.config import GlobalMapConfig
 from odometry.config import ConsistencyConfig
-from odometry.consistency import ConsistencyCheck
-from odometry.external import ExternalOdometry
+from odometry.methods.consistency import ConsistencyCheck
+from odometry.methods.external import ExternalOdometry
 
 
 class Clock:

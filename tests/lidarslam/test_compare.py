@@ -16,15 +16,15 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.compare import CompareOutcome, Counter, Narrator, compare
-from lidarslam.compare_request import CompareRequest, RecordingEntry
-from lidarslam.compare_text import format_comparison
+from lidarslam.compare.comparison import CompareOutcome, Counter, Narrator, compare
+from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.request import CompareRequest, RecordingEntry
+from lidarslam.compare.supervised import Limits
+from lidarslam.compare.text import format_comparison
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
-from lidarslam.methods import parse_methods
-from lidarslam.supervised import Limits
 
 METRICS = {"association", "trajectory", "kitti", "segments", "map"}
 
@@ -43,7 +43,7 @@ if name == "kiss-icp@4": raise RuntimeError("no such thing")
 if name == "kiss-icp@5": raise MemoryError
 if name == "kiss-icp@6": os.kill(os.getpid(), 9)
 if name == "kiss-icp@7": print("lidarslam: the recording is damaged", file=sys.stderr); sys.exit(1)
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.method_process", sys.argv[-1]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", sys.argv[-1]])
 """
 
 

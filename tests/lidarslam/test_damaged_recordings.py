@@ -21,7 +21,7 @@ from lidarslam.cli import main
 from lidarslam.core.geometry import is_rigid
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
-from lidarslam.datasets.ply import read_ply
+from lidarslam.datasets.folders.ply import read_ply
 
 FAST = ("--odometry", "constant-velocity", "--no-pose-graph")
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")]
@@ -305,7 +305,7 @@ def test_millimetres_are_told(tmp_path, tables):
 
 
 def test_scans_that_vanish_while_it_runs_are_counted(tmp_path, tables, monkeypatch):
-    from lidarslam.datasets import scan_folder
+    from lidarslam.datasets.folders import scan_folder
 
     folder = write_folder(tmp_path / "drive", tables)
     table_reader = scan_folder.table_reader

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.config import Config, dump_yaml
+from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, write_tum
-from lidarslam.datasets.ply import read_ply
-from lidarslam.evaluate import EvaluateRequest, evaluate
-from lidarslam.evaluate_text import format_evaluation
-from lidarslam.map_evaluation import MapOptions, evaluate_map_of_run, read_transform
-from lidarslam.reference_map import find_reference_map, load_reference_map
-from mapping.global_map import PointCloud
-from mapping.map_io import write_cloud
+from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.evaluate.evaluate import EvaluateRequest, evaluate
+from lidarslam.evaluate.map_evaluation import MapOptions, evaluate_map_of_run, read_transform
+from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
+from lidarslam.evaluate.text import format_evaluation
+from mapping.global_map.global_map import PointCloud
+from mapping.global_map.map_io import write_cloud
 
 # Where the run's world lies in the recording's.
 T_TRUTH_RUN = exp([0.0, 0.0, 2.0, 5.0, -3.0, 0.5])
@@ -111,7 +111,7 @@ def test_the_figures_for_a_comparison(run: Path, recording: Path) -> None:
     reference = find_reference_map(recording)
     assert reference is not None
     evaluation = evaluate_map_of_run(run, None, reference)
-    assert evaluation.alignment.method == "trajectory"
+    assert evaluation.trajectory.alignment.method == "trajectory"
     assert len(evaluation.errors.points) == len(evaluation.errors.distances_m) > 1_000
     assert evaluation.errors.distances_m.max() < 0.2
     assert find_reference_map(run) is None

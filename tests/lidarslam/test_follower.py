@@ -5,10 +5,10 @@ import threading
 import numpy as np
 import pytest
 
-from lidarslam import follower
 from lidarslam.core.geometry import FloatArray
-from lidarslam.follower import Behind
-from mapping.graph_scan import GraphScan
+from lidarslam.pipeline import background_worker as follower
+from lidarslam.pipeline.background_worker import Behind
+from mapping.pose_graph.graph_scan import GraphScan
 
 POINTS = np.zeros((1, 3))
 

@@ -10,14 +10,14 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.localisation import Estimated, Localised, OdometryAlone, ScanToMap, SweepMotion
-from lidarslam.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.localisation import Estimated, Localised, OdometryAlone, ScanToMap, SweepMotion
+from lidarslam.pipeline.pipeline import Pipeline, ScanResult
 from mapping.config import GlobalMapConfig, MappingConfig
 from mapping.mapper import Mapper
-from odometry.consistency import ConsistencyCheck, ConsistencyConfig
-from odometry.constant_velocity import ConstantVelocity
-from odometry.external import ExternalOdometry
 from odometry.interface import Motion, Odometry
+from odometry.methods.consistency import ConsistencyCheck, ConsistencyConfig
+from odometry.methods.constant_velocity import ConstantVelocity
+from odometry.methods.external import ExternalOdometry
 
 BEFORE, AFTER = np.arange(6.0), np.arange(6.0) ** 2 - 3.0
 

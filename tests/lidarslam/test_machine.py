@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam import machine as described
-from lidarslam.machine import machine, versions
+from lidarslam.run import machine as described
+from lidarslam.run.machine import machine, versions
 
 
 def test_the_programs_that_results_depend_on_are_named() -> None:
@@ -28,7 +28,7 @@ def _git(folder: Path, *arguments: str) -> None:
 
 
 def test_a_checkout_has_a_commit_and_says_that_files_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(described, "__file__", str(tmp_path / "lidarslam" / "machine.py"))
+    monkeypatch.setattr(described, "__file__", str(tmp_path / "lidarslam" / "run" / "machine.py"))
     assert "commit" not in versions()
     _git(tmp_path, "init")
     (tmp_path / "a").write_text("1")

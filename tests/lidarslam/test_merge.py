@@ -14,25 +14,25 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidarslam.config import load_config
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
-from lidarslam.finished_run import load_map, load_run
-from lidarslam.merge import MergeOutcome, MergeRequest, merge
-from lidarslam.merge_text import format_merge
-from lidarslam.pipeline import ScanResult
-from lidarslam.run_directory import FILES
-from lidarslam.run_watch import Progress
-from lidarslam.simulation.motions import Motion
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.merge.merge import MergeOutcome, MergeRequest, merge
+from lidarslam.merge.text import format_merge
+from lidarslam.pipeline.pipeline import ScanResult
+from lidarslam.run.directory import FILES
+from lidarslam.run.finished_run import load_map, load_run
+from lidarslam.run.watch import Progress
+from lidarslam.simulation.motion.motions import Motion
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
-from mapping.g2o import read_g2o
+from mapping.pose_graph.g2o import read_g2o
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 
@@ -256,7 +256,7 @@ def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path
 
 KILLED_MERGE = """
 import os, signal, sys
-import lidarslam.merge, mapping.map_io, mapping.slam_graph, odometry.kiss
+import lidarslam.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph, odometry.methods.kiss
 from lidarslam.cli import main
 
 count = 0

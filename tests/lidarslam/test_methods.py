@@ -2,9 +2,9 @@
 
 import pytest
 
-from lidarslam.config import load_config
+from lidarslam.compare.methods import parse_method, parse_methods
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError
-from lidarslam.methods import parse_method, parse_methods
 
 
 def test_a_plain_name_sets_the_odometry_and_switches_mapping_off() -> None:

@@ -13,12 +13,12 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
-from lidarslam.localisation import OdometryAlone
-from lidarslam.pipeline import Pipeline
+from lidarslam.pipeline.localisation import OdometryAlone
+from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig
 from odometry.config import ConsistencyConfig
-from odometry.consistency import ConsistencyCheck
-from odometry.external import ExternalOdometry
+from odometry.methods.consistency import ConsistencyCheck
+from odometry.methods.external import ExternalOdometry
 
 SCANS = 60
 PASSES_UNTIL = 15

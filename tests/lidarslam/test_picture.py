@@ -7,7 +7,7 @@ import open3d as o3d
 import pytest
 
 from lidarslam.core.errors import OutputError
-from lidarslam.picture import Camera, draw, height_colours, save_picture
+from lidarslam.viewer.picture import Camera, draw, height_colours, save_picture
 
 FROM_ABOVE = Camera(azimuth_deg=-90.0, elevation_deg=90.0, width=200, height=100)
 

@@ -12,14 +12,14 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.localisation import OdometryAlone
-from lidarslam.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.localisation import OdometryAlone
+from lidarslam.pipeline.pipeline import Pipeline, ScanResult
 from mapping.config import GlobalMapConfig
-from mapping.graph_scan import GraphScan
+from mapping.pose_graph.graph_scan import GraphScan
 from odometry.config import ConsistencyConfig
-from odometry.consistency import ConsistencyCheck
-from odometry.external import ExternalOdometry
 from odometry.interface import Motion
+from odometry.methods.consistency import ConsistencyCheck
+from odometry.methods.external import ExternalOdometry
 
 
 def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lidarslam.prefetch import prefetch
+from lidarslam.pipeline.prefetch import prefetch
 
 
 def test_items_come_in_order() -> None:

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from lidarslam.progress import show_count
+from lidarslam.run.progress import show_count
 
 
 class Terminal(io.StringIO):

@@ -11,7 +11,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.reference_cloud import read_cloud
+from lidarslam.evaluate.reference_cloud import read_cloud
 
 UTM = np.array([5e5, 5e6, 300.0])
 

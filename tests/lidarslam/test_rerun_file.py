@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.rerun_file import PipedFile
+from lidarslam.viewer.rerun_file import PipedFile
 
 
 def test_what_goes_in_is_in_the_file(tmp_path: Path) -> None:
@@ -36,7 +36,7 @@ def test_a_write_that_fails_empties_the_file_and_swallows_the_rest(
         return taken
 
     written = os.write
-    monkeypatch.setattr("lidarslam.rerun_file.os.write", write)
+    monkeypatch.setattr("lidarslam.viewer.rerun_file.os.write", write)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb") as entrance:
         for _ in range(50):
@@ -76,7 +76,7 @@ def test_a_pipe_that_nobody_reads_any_more_is_closed(tmp_path: Path, monkeypatch
     def run_out(_handle: int, _piece: bytes) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("lidarslam.rerun_file._write_all", run_out)
+    monkeypatch.setattr("lidarslam.viewer.rerun_file._write_all", run_out)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb", buffering=0) as entrance:
         entrance.write(b"piece")
@@ -86,7 +86,7 @@ def test_a_pipe_that_nobody_reads_any_more_is_closed(tmp_path: Path, monkeypatch
 
 
 def test_a_writer_that_never_lets_go_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidarslam.rerun_file._LAST_PIECES_S", 0.1)
+    monkeypatch.setattr("lidarslam.viewer.rerun_file._LAST_PIECES_S", 0.1)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb"):
         assert not file.finish()

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam import rerun_program
 from lidarslam.core.errors import OutputError
-from lidarslam.rerun_program import is_taken, open_window
+from lidarslam.viewer import rerun_program
+from lidarslam.viewer.rerun_program import is_taken, open_window
 
 LISTENER = """#!/usr/bin/env python3
 import os, socket, sys, time
@@ -32,7 +32,7 @@ def port() -> int:
 def pretend(monkeypatch: pytest.MonkeyPatch, program: Path, text: str) -> None:
     program.write_text(text)
     program.chmod(0o755)
-    monkeypatch.setattr("lidarslam.rerun_program._program", lambda: str(program))
+    monkeypatch.setattr("lidarslam.viewer.rerun_program._program", lambda: str(program))
 
 
 def test_a_window_listens_on_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
@@ -56,7 +56,7 @@ def test_a_window_that_does_not_open_gets_one_line(tmp_path: Path, monkeypatch: 
 
 
 def test_a_window_that_never_listens_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
-    monkeypatch.setattr("lidarslam.rerun_program._START_S", 1.0)
+    monkeypatch.setattr("lidarslam.viewer.rerun_program._START_S", 1.0)
     pretend(monkeypatch, tmp_path / "rerun", f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 60\n")
     begun = time.monotonic()
     with pytest.raises(OutputError, match="cannot be opened"):

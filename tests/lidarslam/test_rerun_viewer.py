@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from lidarslam import rerun_environment
-from lidarslam.config import ViewerConfig
+from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.finished_run import FinishedRun
-from lidarslam.rerun_program import is_taken
-from lidarslam.rerun_viewer import IncompleteRecordingError, RerunViewer, require_complete, show_runs
+from lidarslam.run.finished_run import FinishedRun
+from lidarslam.viewer import rerun_environment
+from lidarslam.viewer.rerun_program import is_taken
+from lidarslam.viewer.rerun_viewer import IncompleteRecordingError, RerunViewer, require_complete, show_runs
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_a_port_in_use_gets_one_line(finished: FinishedRun, monkeypatch: pytest.
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        monkeypatch.setattr("lidarslam.rerun_viewer._GRPC_PORT", port)
+        monkeypatch.setattr("lidarslam.viewer.rerun_viewer._GRPC_PORT", port)
         with pytest.raises(OutputError, match=f"port {port} is in use; .* --save"):
             show_runs([finished], ViewerConfig(), None, web=True)
 
@@ -61,8 +61,8 @@ def free_port() -> int:
 def test_a_browser_is_served_to_this_machine_alone(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server on all interfaces would be there on each address of the loopback; one on 127.0.0.1 is on that alone."""
     ports = free_port(), free_port()
-    monkeypatch.setattr("lidarslam.rerun_viewer._GRPC_PORT", ports[0])
-    monkeypatch.setattr("lidarslam.rerun_viewer._WEB_PORT", ports[1])
+    monkeypatch.setattr("lidarslam.viewer.rerun_viewer._GRPC_PORT", ports[0])
+    monkeypatch.setattr("lidarslam.viewer.rerun_viewer._WEB_PORT", ports[1])
     served = show_runs([finished], ViewerConfig(), None, web=True)
     assert served is not None
     try:
@@ -111,7 +111,7 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
 
 def test_a_recording_that_cannot_be_begun_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where there is no /dev/fd."""
-    monkeypatch.setattr("lidarslam.rerun_file._ENTRANCES", tmp_path / "none")
+    monkeypatch.setattr("lidarslam.viewer.rerun_file._ENTRANCES", tmp_path / "none")
     with pytest.raises(OutputError, match=r"cannot be begun \(.*\); leave --rerun out") as caught:
         RerunViewer("run", ViewerConfig(), tmp_path / "recording.rrd")
     assert "\n" not in str(caught.value)
@@ -122,6 +122,6 @@ def test_no_display_gets_one_line(finished: FinishedRun, monkeypatch: pytest.Mon
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.setattr("lidarslam.rerun_viewer.is_taken", lambda _: False)
+    monkeypatch.setattr("lidarslam.viewer.rerun_viewer.is_taken", lambda _: False)
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
         show_runs([finished], ViewerConfig(), None, web=False)

@@ -23,7 +23,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
-from lidarslam.finished_run import load_run
+from lidarslam.run.finished_run import load_run
 
 ROOT = Path(__file__).parents[2]
 KILL = signal.SIGKILL
@@ -35,7 +35,8 @@ KILLED = -KILL
 SERVER = """
 import json, os, shutil, signal, sys, threading
 from pathlib import Path
-import lidarslam.rerun_viewer, lidarslam.run, mapping.map_io, mapping.slam_graph, odometry.learned
+import lidarslam.viewer.rerun_viewer, lidarslam.run.run, mapping.global_map.map_io, mapping.pose_graph.slam_graph
+import odometry.methods.learned
 from lidarslam.cli import main
 
 EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fsync"}

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from lidarslam.loop_closing import LoopReport
-from lidarslam.run_results import RunOutcome
-from lidarslam.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
-from lidarslam.summary_text import format_outcome
+from lidarslam.pipeline.loop_closing import LoopReport
+from lidarslam.run.results import RunOutcome
+from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
+from lidarslam.run.summary_text import format_outcome
 
 
 def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:

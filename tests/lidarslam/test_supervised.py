@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.supervised import Ending, Limits, session_rss_mb, supervise
+from lidarslam.compare.supervised import Ending, Limits, session_rss_mb, supervise
 
 Run = Callable[..., Ending]
 

@@ -11,20 +11,20 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
-from lidarslam import training_data
 from lidarslam.cli import main
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
-from lidarslam.simulation.mixture import ingredients_of
-from lidarslam.train import execute
-from lidarslam.train_config import SimulatedConfig, TrainConfig, dump_train_yaml, load_train_config, loss_settings
-from lidarslam.train_request import StepReport, TrainNarrator, TrainRequest
-from lidarslam.train_text import format_outcome, format_validation
-from lidarslam.training_data import Stretch, hold_out, prepared, recorded, simulated
-from odometry.checkpoint import load_checkpoint, network_of
-from odometry.loss_config import LossConfig
-from odometry.networks import make_network
-from odometry.training import Validation, summarise, validate
+from lidarslam.simulation.recording.mixture import ingredients_of
+from lidarslam.train import data as training_data
+from lidarslam.train.config import SimulatedConfig, TrainConfig, dump_train_yaml, load_train_config, loss_settings
+from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
+from lidarslam.train.request import StepReport, TrainNarrator, TrainRequest
+from lidarslam.train.text import format_outcome, format_validation
+from lidarslam.train.train import execute
+from odometry.network.checkpoint import load_checkpoint, network_of
+from odometry.network.networks import make_network
+from odometry.training.loss_config import LossConfig
+from odometry.training.training import Validation, summarise, validate
 
 TINY = (
     "training.images={rows: 8, columns: 96}",
@@ -138,7 +138,7 @@ def test_where_no_held_out_pair_can_be_aligned_the_last_weights_are_kept(
     room_folder: Path, tmp_path: Path, ready: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nothing = summarise(torch.zeros(0, 6), torch.zeros(0, 6))
-    monkeypatch.setattr("lidarslam.training_loop.validate", lambda *_, **__: nothing)
+    monkeypatch.setattr("lidarslam.train.loop.validate", lambda *_, **__: nothing)
     listener = Listener()
     outcome = execute(request(room_folder, tmp_path / "out", ready), listener)
     assert "nothing to compare with" in format_validation(8, listener.validations[-1][1], True)

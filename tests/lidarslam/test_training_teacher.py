@@ -7,16 +7,16 @@ import torch
 from lidarslam.core.geometry import inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
-from lidarslam.training_data import Stretch, draw_weights
-from lidarslam.training_teacher import MapTeacher
-from odometry.image_config import ImageConfig
-from odometry.preparation import prepare
-from odometry.sweep_images import middle_offset_s
+from lidarslam.train.data import Stretch, draw_weights
+from lidarslam.train.teacher import MapTeacher
+from odometry.images.image_config import ImageConfig
+from odometry.images.sweep_images import middle_offset_s
+from odometry.training.preparation import prepare
 
 SCANS = 14
 

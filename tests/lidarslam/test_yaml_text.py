@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.yaml_text import YamlError, parse_yaml, read_yaml
+from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml
 
 
 def test_plain_values() -> None:

@@ -14,7 +14,10 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, ro
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.faults import (
+from lidarslam.simulation.motion.given_motion import motion_along
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recording.faults import (
     Cover,
     Faulty,
     carried_off,
@@ -24,20 +27,17 @@ from lidarslam.simulation.faults import (
     passing_by,
     standing_still,
 )
-from lidarslam.simulation.featureless import even_tunnel, straight_drive
-from lidarslam.simulation.given_motion import motion_along
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.route_motion import motion_along_route
-from lidarslam.simulation.scan_patterns import Spinning
-from lidarslam.simulation.sensor import Sensor
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.scan_patterns import Spinning
+from lidarslam.simulation.sensors.sensor import Sensor
 from lidarslam.simulation.world import World
+from lidarslam.simulation.worlds.featureless import even_tunnel, straight_drive
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig, TrackingConfig
 from mapping.mapper import MappedScan, Mapper
 from mapping.prediction import Prior
-from mapping.refinement import compensated
+from mapping.registration import compensated
 
 AT = 70
 COUNT = 100

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from mapping.feature_config import FeatureConfig
-from mapping.features import Features, extract_features
-from mapping.rings import RingFinder
+from mapping.loam.config import FeatureConfig
+from mapping.loam.features import Features, extract_features
+from mapping.loam.rings import RingFinder
 
 Scanner = Callable[..., Scan]
 ALL_PLANES = FeatureConfig(plane_cell_m=0.0)

@@ -6,8 +6,8 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
 from mapping.config import TrackingConfig
-from mapping.fit import Fit, directional_support, measure_fit
-from mapping.local_map import LocalMap
+from mapping.surfels.surfel_map import LocalMap
+from mapping.tracking.fit import Fit, directional_support, measure_fit
 
 CONFIG = TrackingConfig()
 HALF = np.array([7.0, 5.0, 2.0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
-from mapping.floorplan import Floorplan
+from mapping.tracking.relocalisation import Floorplan
 
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 

@@ -8,7 +8,7 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse
-from mapping.g2o import Edge, GraphFile, format_g2o, read_g2o
+from mapping.pose_graph.g2o import Edge, GraphFile, format_g2o, read_g2o
 
 VERTICES = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\nVERTEX_SE3:QUAT 2 2 0 0 0 0 0 1\n"
 MOTION = "1 0 0 0 0 0 1"

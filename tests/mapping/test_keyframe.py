@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from mapping.graph_config import KeyframeConfig
-from mapping.keyframe import KeyframeSelector
+from mapping.pose_graph.graph_config import KeyframeConfig
+from mapping.pose_graph.keyframes import KeyframeSelector
 
 
 @pytest.fixture

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import mapping.loop_closure as module
+import mapping.loops.detection as module
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.core.trajectory import chain
-from mapping.loop_candidates import Keyframes
-from mapping.loop_closure import LoopClosure, LoopDetector, Submap
-from mapping.loop_config import LoopConfig
+from mapping.loops.candidates import Keyframes
+from mapping.loops.detection import LoopClosure, LoopDetector, Submap
+from mapping.loops.loop_config import LoopConfig
 
 SEEN_M = 11.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import exp, inverse, make_transform
-from mapping.loop_config import LoopConfig
-from mapping.loop_consistency import Link, Track, close_circle, correction_sigmas
+from mapping.loops.consistency import Link, Track, close_circle, correction_sigmas
+from mapping.loops.loop_config import LoopConfig
 
 CONFIG = LoopConfig()
 SIGMAS = np.array([0.003] * 3 + [0.03] * 3)

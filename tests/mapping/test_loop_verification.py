@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle, transform_points
-from mapping.loop_config import LoopConfig
-from mapping.loop_patch import Patch, make_patch
-from mapping.loop_registration import Place, Pulls
-from mapping.loop_verification import judge, verify
+from mapping.loops.loop_config import LoopConfig
+from mapping.loops.place import Patch, make_patch
+from mapping.loops.registration import Place, Pulls
+from mapping.loops.verification import judge, verify
 
 CONFIG = LoopConfig()
 # Centre and half sizes; the sensor stands inside.

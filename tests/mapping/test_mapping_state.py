@@ -10,14 +10,14 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
-from mapping import global_map
 from mapping.config import MappingConfig, TrackingConfig
-from mapping.global_map import GlobalMap
-from mapping.graph_config import KeyframeConfig
-from mapping.keyframe import KeyframeSelector
+from mapping.global_map import global_map
+from mapping.global_map.global_map import GlobalMap
+from mapping.loam.rings import RingFinder, RingSource
 from mapping.mapper import MappedScan, Mapper
+from mapping.pose_graph.graph_config import KeyframeConfig
+from mapping.pose_graph.keyframes import KeyframeSelector
 from mapping.prediction import Carrier, OdometryNoise, Prior
-from mapping.rings import RingFinder, RingSource
 
 ThroughDisk = Callable[[State], Saved]
 CONFIG = MappingConfig(keypoints=600, tracking=TrackingConfig(give_up_after=2))
@@ -63,9 +63,9 @@ def test_a_map_that_has_forgotten_goes_on(
     rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch, tidied_after: int
 ) -> None:
     """Rows of cells are in the order in which they came, also after some were dropped."""
-    from mapping.local_map import LocalMap
+    from mapping.surfels.surfel_map import LocalMap
 
-    monkeypatch.setattr("mapping.local_map._TIDIED_AFTER", tidied_after)
+    monkeypatch.setattr("mapping.surfels.surfel_map._TIDIED_AFTER", tidied_after)
 
     def add(local_map: LocalMap, step: int, seed: int) -> None:
         points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
-from mapping.loop_patch import LINE, PLANE, level_rotation, make_patch
-from mapping.place_recognition import Drawing, Expected, Places, lay_over
+from mapping.loops.descriptor import Drawing, Expected, Places, lay_over
+from mapping.loops.place import LINE, PLANE, level_rotation, make_patch
 
 RADIUS_M = 16.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])

@@ -10,12 +10,12 @@ import pytest
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, rotation_angle
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import chain
-from mapping.edge_residuals import EdgeResiduals, bounded
-from mapping.g2o import Edge, EdgeKind, read_g2o
-from mapping.graduation import decide, truncated_weights
-from mapping.pose_graph import PoseGraph
-from mapping.pose_graph_config import PoseGraphConfig
-from mapping.sessions import Sessions
+from mapping.pose_graph.components import Sessions
+from mapping.pose_graph.edge_residuals import EdgeResiduals, bounded
+from mapping.pose_graph.g2o import Edge, EdgeKind, read_g2o
+from mapping.pose_graph.graduation import decide, truncated_weights
+from mapping.pose_graph.optimizer import PoseGraph
+from mapping.pose_graph.pose_graph_config import PoseGraphConfig
 
 CONFIG = PoseGraphConfig()
 PRECISE = PoseGraphConfig(relinearise_above=1e-6, iterations_after_loop=15)

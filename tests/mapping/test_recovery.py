@@ -8,8 +8,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
 from mapping.deskew import move
-from mapping.local_map import LocalMap
-from mapping.recovery import best_starts, best_velocity, start_poses
+from mapping.surfels.surfel_map import LocalMap
+from mapping.tracking.start_poses import best_starts, best_velocity, start_poses
 
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 

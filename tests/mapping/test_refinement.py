@@ -8,9 +8,9 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from mapping.config import RefinementConfig
-from mapping.local_map import LocalMap
 from mapping.prediction import Prediction
-from mapping.refinement import Refined, Sweep, refine
+from mapping.registration import Refined, Sweep, refine
+from mapping.surfels.surfel_map import LocalMap
 
 CONFIG = RefinementConfig()
 CELL = 0.2

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse
-from mapping.loop_closure import LoopClosure
-from mapping.revisits import as_registered
+from mapping.loops.detection import LoopClosure
+from mapping.loops.revisits import as_registered
 
 SIGMA = np.array([1e-3] * 3 + [5e-3] * 3)
 REGISTERED = np.diag(SIGMA**2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.scan import Scan
-from mapping.rings import RingFinder, Rings, RingSource
+from mapping.loam.rings import RingFinder, Rings, RingSource
 
 SPINNING = ["vlp-16", "hdl-32e", "hdl-64e", "os0-64", "os1-64", "os1-128", "xt32"]
 Scanner = Callable[..., Scan]
@@ -68,7 +68,7 @@ def test_turns_give_the_rings_where_elevations_do_not(
 @pytest.mark.real_data
 def test_a_real_recording_is_stored_ring_after_ring(real_data) -> None:
     from lidarslam.datasets.config import ReaderConfig
-    from lidarslam.datasets.kitti_odometry import open_recording
+    from lidarslam.datasets.kitti.odometry import open_recording
 
     finder = RingFinder()
     for scan in open_recording(real_data / "kitti_odometry_04", ReaderConfig()).scans(0, 20, 10):

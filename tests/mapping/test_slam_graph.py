@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from lidarslam.core.state import Saved, State
-from mapping.graph_config import SlamGraphConfig
-from mapping.graph_scan import GraphScan
-from mapping.pose_graph import Optimised, PoseGraph
-from mapping.slam_graph import Corrected, SlamGraph
+from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.pose_graph.graph_scan import GraphScan
+from mapping.pose_graph.optimizer import Optimised, PoseGraph
+from mapping.pose_graph.slam_graph import Corrected, SlamGraph
 
 VOXEL_M = 0.1
 CONFIG = SlamGraphConfig(enabled=True)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from mapping.surfel_grid import SurfelGrid
-from mapping.voxel_table import ABSENT
+from mapping.surfels.grid import SurfelGrid
+from mapping.surfels.voxel_hash import ABSENT
 
 CELL = 0.5
 

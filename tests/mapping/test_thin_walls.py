@@ -7,10 +7,10 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state import Saved
-from mapping.cell_kernels import OTHER_SIDE
-from mapping.local_map import LocalMap
-from mapping.surfel_grid import SurfelGrid
-from mapping.voxel_table import VoxelTable, key_cells, point_keys
+from mapping.surfels.cell_kernels import OTHER_SIDE
+from mapping.surfels.grid import SurfelGrid
+from mapping.surfels.surfel_map import LocalMap
+from mapping.surfels.voxel_hash import VoxelTable, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
-from mapping.graph_config import TrajectoryEdgeConfig
-from mapping.graph_scan import GraphScan
-from mapping.trajectory_edges import Way, trajectory_covariance, trajectory_edges
+from mapping.pose_graph.edges import Way, trajectory_covariance, trajectory_edges
+from mapping.pose_graph.graph_config import TrajectoryEdgeConfig
+from mapping.pose_graph.graph_scan import GraphScan
 
 CONFIG = TrajectoryEdgeConfig()
 STEP = exp([0.0, 0.1, 0.5, 2.0, -1.0, 0.3])

@@ -9,9 +9,9 @@ import torch
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from odometry.preparation import PreparedRecording
-from odometry.sweeps import SweepImages
-from odometry.torch_images import RecordedImages
+from odometry.images.sweeps import SweepImages
+from odometry.training.preparation import PreparedRecording
+from odometry.training.torch_images import RecordedImages
 
 _LOW, _HIGH = np.deg2rad(-18.0), np.deg2rad(18.0)
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment import Aligned, Guess, align, align_each
-from odometry.alignment_config import AlignmentConfig
-from odometry.sweeps import LastMotion, SweepImages, SweepPair
+from odometry.alignment.alignment import Aligned, Guess, align, align_each
+from odometry.alignment.alignment_config import AlignmentConfig
+from odometry.images.sweeps import LastMotion, SweepImages, SweepPair
 
 CONFIG = AlignmentConfig()
 INTERVAL_S = 0.1

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment import Aligned, Guess, align
-from odometry.alignment_config import AlignmentConfig
-from odometry.alignment_search import align_best, try_guesses
-from odometry.sweeps import SweepImages, SweepPair
+from odometry.alignment.alignment import Aligned, Guess, align
+from odometry.alignment.alignment_config import AlignmentConfig
+from odometry.alignment.search import align_best, try_guesses
+from odometry.images.sweeps import SweepImages, SweepPair
 
 CONFIG = AlignmentConfig()
 TWIST = (0.0, 0.0, 0.0, 14.0, 0.0, 0.0)  # rad/s, m/s: 1.4 m from sweep to sweep

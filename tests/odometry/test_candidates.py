@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
-from odometry.candidates import CorrelationSearch, Floats, _peaks, _shift_scores
-from odometry.checkpoint import load_checkpoint, network_of
-from odometry.correlation import CorrelationNetwork
-from odometry.shipped import default_weights
-from odometry.torch_graphs import TorchGraphs
+from odometry.network.candidates import CorrelationSearch, Floats, _peaks, _shift_scores
+from odometry.network.checkpoint import load_checkpoint, network_of
+from odometry.network.correlation import CorrelationNetwork
+from odometry.network.shipped import default_weights
+from odometry.network.torch_graphs import TorchGraphs
 
 TURN_DEG = 2.0
 

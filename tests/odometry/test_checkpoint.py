@@ -11,14 +11,14 @@ import torch
 from safetensors.torch import save_file
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from odometry import checkpoint as module
-from odometry import shipped
-from odometry.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of, save_checkpoint
-from odometry.image_config import ImageConfig
-from odometry.network_config import CorrelationConfig, NetworkConfig
-from odometry.networks import make_network
-from odometry.shipped import default_weights, shipped_folder
-from odometry.tensor_file import Kind, write_tensor_file
+from odometry.images.image_config import ImageConfig
+from odometry.network import checkpoint as module
+from odometry.network import shipped
+from odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of, save_checkpoint
+from odometry.network.network_config import CorrelationConfig, NetworkConfig
+from odometry.network.networks import make_network
+from odometry.network.shipped import default_weights, shipped_folder
+from odometry.network.tensor_file import Kind, write_tensor_file
 
 IMAGES = ImageConfig(rows=8, columns=96)
 

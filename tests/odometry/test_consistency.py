@@ -9,7 +9,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from mapping.deskew import body_velocity, deskew
 from odometry.config import ConsistencyConfig
-from odometry.consistency import Consistency, ConsistencyCheck, plane_distances
+from odometry.methods.consistency import Consistency, ConsistencyCheck, plane_distances
 
 
 @pytest.fixture

@@ -8,17 +8,17 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from odometry import bird_eye
-from odometry.bird_eye import SHIFTS
-from odometry.correlation import INPUT_CHANNELS, CorrelationNetwork, PairImages, column_channels
-from odometry.network_config import CorrelationConfig, NetworkConfig
-from odometry.networks import make_network
-from odometry.objective import objective
-from odometry.pairs import PairBatch, birds, pair_of
-from odometry.torch_geometry import inverse, log
-from odometry.torch_images import RecordedImages, rotate_columns
-from odometry.training import loss_of
-from odometry.training_config import TrainingConfig
+from odometry.images import bird_eye
+from odometry.images.bird_eye import SHIFTS
+from odometry.network.correlation import INPUT_CHANNELS, CorrelationNetwork, PairImages, column_channels
+from odometry.network.network_config import CorrelationConfig, NetworkConfig
+from odometry.network.networks import make_network
+from odometry.training.objective import objective
+from odometry.training.pairs import PairBatch, birds, pair_of
+from odometry.training.torch_geometry import inverse, log
+from odometry.training.torch_images import RecordedImages, rotate_columns
+from odometry.training.training import loss_of
+from odometry.training.training_config import TrainingConfig
 
 COLUMNS = 96
 FEATURE_COLUMNS = COLUMNS // 4

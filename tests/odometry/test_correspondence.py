@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from odometry.correspondence import by_projection, nearest, nearest_brute_force, nearest_kd_tree
-from odometry.projection import ImageGrid, project
+from odometry.images.projection import ImageGrid, project
+from odometry.training.correspondence import by_projection, nearest, nearest_brute_force, nearest_kd_tree
 
 SEARCHES = pytest.mark.parametrize("search", [nearest, nearest_kd_tree, nearest_brute_force])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
-from odometry.degeneracy import find_degeneracy, gone_on, holding, joined_information, left_open
+from odometry.alignment.degeneracy import find_degeneracy, gone_on, holding, joined_information, left_open
 
 LEVER_M = 4.0
 

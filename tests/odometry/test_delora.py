@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.correlation import PairImages
-from odometry.delora import DeloraNetwork
-from odometry.networks import DeloraPairs
+from odometry.network.correlation import PairImages
+from odometry.network.delora import DeloraNetwork
+from odometry.network.networks import DeloraPairs
 
 
 @pytest.fixture(scope="module")

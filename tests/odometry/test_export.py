@@ -10,15 +10,15 @@ import torch
 from torch.nn import functional
 
 from lidarslam.core.errors import ConfigError, InputError
-from odometry.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of
-from odometry.export import export_onnx
-from odometry.exported import DESCRIPTION, read_exported
-from odometry.image_config import ImageConfig
-from odometry.network_config import CorrelationConfig, NetworkConfig
-from odometry.networks import make_network
-from odometry.onnx_graphs import OnnxGraphs, onnx_search
-from odometry.shipped import default_weights, shipped_folder
-from odometry.torch_graphs import TorchGraphs, torch_search
+from odometry.images.image_config import ImageConfig
+from odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of
+from odometry.network.export import export_onnx
+from odometry.network.exported import DESCRIPTION, read_exported
+from odometry.network.network_config import CorrelationConfig, NetworkConfig
+from odometry.network.networks import make_network
+from odometry.network.onnx_graphs import OnnxGraphs, onnx_search
+from odometry.network.shipped import default_weights, shipped_folder
+from odometry.network.torch_graphs import TorchGraphs, torch_search
 
 SHAPE = (16, 96)
 # Sums in another order differ in the last digits of float32.

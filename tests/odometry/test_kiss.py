@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
 from odometry.config import KissConfig
-from odometry.kiss import KissOdometry
+from odometry.methods.kiss import KissOdometry
 
 # Small enough for the room to have structure at KISS-ICP's resolution.
 INDOOR = KissConfig(voxel_size_m=0.2, max_range_m=30.0)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
-from odometry.alignment_config import AlignmentConfig
-from odometry.candidates import Candidate, Described
+from odometry.alignment.alignment_config import AlignmentConfig
 from odometry.config import OdometryConfig
-from odometry.image_config import ImageConfig
+from odometry.images.image_config import ImageConfig
 from odometry.interface import Motion
-from odometry.learned import LearnedOdometry
-from odometry.learned_config import LearnedConfig
+from odometry.methods.learned import LearnedOdometry
+from odometry.methods.learned_config import LearnedConfig
+from odometry.network.candidates import Candidate, Described
 from odometry.registry import make_odometry
 
 Floats = NDArray[np.float32]

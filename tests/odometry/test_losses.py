@@ -7,10 +7,10 @@ from pydantic import ValidationError
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from odometry.loss_config import LossConfig
-from odometry.losses import Matched, Surfaces, geometric_loss, match, plane_to_plane, point_to_plane
-from odometry.projection import ImageGrid, project
-from odometry.torch_geometry import exp, inverse, log, rotate, transform_points
+from odometry.images.projection import ImageGrid, project
+from odometry.training.loss_config import LossConfig
+from odometry.training.losses import Matched, Surfaces, geometric_loss, match, plane_to_plane, point_to_plane
+from odometry.training.torch_geometry import exp, inverse, log, rotate, transform_points
 
 EYE = torch.eye(4, dtype=torch.float64)[None]
 XI = torch.tensor([0.03, -0.04, 0.05, 0.12, -0.1, 0.08], dtype=torch.float64)

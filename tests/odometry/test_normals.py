@@ -8,8 +8,8 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from odometry.normal_config import NormalConfig
-from odometry.normals import surface_normals as normals_of
+from odometry.images.normal_config import NormalConfig
+from odometry.images.normals import surface_normals as normals_of
 
 CONFIG = NormalConfig()
 FIRST_TRY = NormalConfig(wide_gate_m=None)

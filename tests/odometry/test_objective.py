@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.correlation import Estimate
-from odometry.objective import Objective, motion_error, objective
-from odometry.pairs import PairBatch, pair_of
-from odometry.torch_geometry import exp, inverse
-from odometry.training_config import TrainingConfig
+from odometry.network.correlation import Estimate
+from odometry.training.objective import Objective, motion_error, objective
+from odometry.training.pairs import PairBatch, pair_of
+from odometry.training.torch_geometry import exp, inverse
+from odometry.training.training_config import TrainingConfig
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 WIDTH = 24

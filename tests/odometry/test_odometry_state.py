@@ -10,9 +10,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from odometry.config import ConsistencyConfig, OdometryConfig
-from odometry.consistency import ConsistencyCheck
-from odometry.external import ExternalOdometry
 from odometry.interface import Motion, Odometry
+from odometry.methods.consistency import ConsistencyCheck
+from odometry.methods.external import ExternalOdometry
 from odometry.registry import make_odometry
 
 ThroughDisk = Callable[[State], Saved]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from odometry.alignment_config import AlignmentConfig
-from odometry.pair_sums import Movement, PairSums
-from odometry.projection import ImageGrid
-from odometry.sweeps import SweepPair
+from odometry.alignment.alignment_config import AlignmentConfig
+from odometry.alignment.pair_sums import Movement, PairSums
+from odometry.images.projection import ImageGrid
+from odometry.images.sweeps import SweepPair
 
 CONFIG = AlignmentConfig()
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)

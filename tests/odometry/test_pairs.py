@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.pairs import PairBatch, Pairs, augmented, pair_of
-from odometry.preparation import PreparedRecording
-from odometry.torch_geometry import exp, inverse, log, rotate, rotation_angle, transform_points
-from odometry.training_config import AugmentationConfig
+from odometry.training.pairs import PairBatch, Pairs, augmented, pair_of
+from odometry.training.preparation import PreparedRecording
+from odometry.training.torch_geometry import exp, inverse, log, rotate, rotation_angle, transform_points
+from odometry.training.training_config import AugmentationConfig
 
 TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
 NONE = AugmentationConfig(

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lidarslam.core.scan import Scan
-from odometry.image_config import ImageConfig
-from odometry.preparation import prepare
-from odometry.torch_geometry import exp, inverse, log
+from odometry.images.image_config import ImageConfig
+from odometry.training.preparation import prepare
+from odometry.training.torch_geometry import exp, inverse, log
 
 CONFIG = ImageConfig(rows=16, columns=360)
 SLOW = (0.05, -0.05, 0.1, 1.0, 0.3, 0.1)

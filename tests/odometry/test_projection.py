@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry import projection
-from odometry.projection import ImageGrid
-from odometry.torch_images import mirror, place, rotate_columns
+from odometry.images import projection
+from odometry.images.projection import ImageGrid
+from odometry.training.torch_images import mirror, place, rotate_columns
 
 GRID = ImageGrid(16, 90, math.radians(-15.0), math.radians(15.0))
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.scan import Scan
-from odometry.image_config import ImageConfig
-from odometry.sweep_images import Imager, middle_offset_s
-from odometry.sweeps import SweepImages
+from odometry.images.image_config import ImageConfig
+from odometry.images.sweep_images import Imager, middle_offset_s
+from odometry.images.sweeps import SweepImages
 
 CONFIG = ImageConfig(rows=16, columns=360)
 TWIST = (0.0, 0.0, 0.5, 1.0, 0.0, 0.0)

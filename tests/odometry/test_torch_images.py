@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from odometry.torch_geometry import exp, transform_points
-from odometry.torch_images import RecordedImages, compensate, compensated
+from odometry.training.torch_geometry import exp, transform_points
+from odometry.training.torch_images import RecordedImages, compensate, compensated
 
 SLOW = (0.05, -0.05, 0.1, 1.0, 0.3, 0.1)
 TURNING = (0.0, 0.0, math.radians(120.0), 1.0, 0.3, 0.0)

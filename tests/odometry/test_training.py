@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from odometry.correlation import CorrelationNetwork, Estimate, PairImages
-from odometry.network_config import CorrelationConfig
-from odometry.pairs import PairBatch, birds, pair_of
-from odometry.preparation import PreparedRecording
-from odometry.torch_geometry import exp
-from odometry.training import learning_rate, loss_of, make_optimizer, summarise, validate
-from odometry.training_config import TrainingConfig
+from odometry.network.correlation import CorrelationNetwork, Estimate, PairImages
+from odometry.network.network_config import CorrelationConfig
+from odometry.training.pairs import PairBatch, birds, pair_of
+from odometry.training.preparation import PreparedRecording
+from odometry.training.torch_geometry import exp
+from odometry.training.training import learning_rate, loss_of, make_optimizer, summarise, validate
+from odometry.training.training_config import TrainingConfig
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 SCHEDULE = TrainingConfig(learning_rate=1e-3, warmup_steps=10, steps=110)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import inverse, rotation_angle
-from lidarslam.simulation.faults import carried_off, covered, dropped, index_back, passing_by, standing_still
-from lidarslam.simulation.featureless import even_tunnel, open_plain, straight_drive
-from lidarslam.simulation.motions import Motion, Sway
-from lidarslam.simulation.mounts import mount_pose
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.scan_patterns import Spinning
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.motion.motions import Motion, Sway
+from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.recording.faults import carried_off, covered, dropped, index_back, passing_by, standing_still
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.scan_patterns import Spinning
 from lidarslam.simulation.world import World
+from lidarslam.simulation.worlds.featureless import even_tunnel, open_plain, straight_drive
 
 
 @pytest.fixture

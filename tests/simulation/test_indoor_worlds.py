@@ -8,7 +8,7 @@ import open3d as o3d
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.mesh import world_mesh
+from lidarslam.simulation.casting.mesh import world_mesh
 from lidarslam.simulation.world import Boxes, World
 from lidarslam.simulation.worlds.building import UP
 from lidarslam.simulation.worlds.clearance import Clearance, sample_route

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.simulation.caster import Caster
-from lidarslam.simulation.mesh import CYLINDER_SIDES, box_mesh, cylinder_mesh, merge
-from lidarslam.simulation.route_motion import motion_along_route
+from lidarslam.simulation.casting.caster import Caster
+from lidarslam.simulation.casting.mesh import CYLINDER_SIDES, box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.clearance import sample_route
 from lidarslam.simulation.worlds.paths import loop_length

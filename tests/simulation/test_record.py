@@ -10,14 +10,14 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.geometry import make_transform, transform_points
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, read_tum, write_tum
-from lidarslam.datasets.ply import read_ply
-from lidarslam.datasets.point_table import coordinates
+from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.point_table import coordinates
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation import record as record_module
-from lidarslam.simulation.record import record
-from lidarslam.simulation.recording_motion import read_trajectory
-from lidarslam.simulation.recording_request import RecordRequest
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.recording import record as record_module
+from lidarslam.simulation.recording.motion import read_trajectory
+from lidarslam.simulation.recording.record import record
+from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.simulation.sensors.registry import find_sensor
 from lidarslam.simulation.world import Boxes, HeightField, Route, World
 from lidarslam.simulation.writers.registry import FORMATS
 
@@ -316,7 +316,7 @@ def test_help_lists_the_choices_and_an_example():
 
 
 def test_every_sensor_has_a_driver_that_can_be_written():
-    from lidarslam.simulation.sensor_table import SENSORS
+    from lidarslam.simulation.sensors.table import SENSORS
     from lidarslam.simulation.writers.driver_clouds import DRIVERS
 
     assert {find_sensor(name).driver for name in SENSORS} <= set(DRIVERS)

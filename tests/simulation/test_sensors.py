@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.simulation.mounts import MOUNTS, mount_pose
-from lidarslam.simulation.sensor_table import SENSORS
-from lidarslam.simulation.sensors import find_sensor
+from lidarslam.simulation.motion.mounts import MOUNTS, mount_pose
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import SENSORS
 
 # name: rays a sweep, lasers, lowest and highest elevation in degrees
 FACTS = {

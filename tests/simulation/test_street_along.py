@@ -6,17 +6,17 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.carriers import find_carrier
-from lidarslam.simulation.caster import Caster
-from lidarslam.simulation.given_motion import motion_along
-from lidarslam.simulation.mesh import box_mesh, cylinder_mesh, merge
-from lidarslam.simulation.motions import rotations
-from lidarslam.simulation.path_clearance import check_clearance, is_inside
-from lidarslam.simulation.recorder import Simulation
-from lidarslam.simulation.recording_motion import given_path, read_trajectory
-from lidarslam.simulation.sensors import find_sensor
-from lidarslam.simulation.worlds.street_along import build_along
-from lidarslam.simulation.worlds.street_rows import FREE_SIDE_M
+from lidarslam.simulation.casting.caster import Caster
+from lidarslam.simulation.casting.mesh import box_mesh, cylinder_mesh, merge
+from lidarslam.simulation.motion.carriers import find_carrier
+from lidarslam.simulation.motion.given_motion import motion_along
+from lidarslam.simulation.motion.motions import rotations
+from lidarslam.simulation.motion.path_clearance import check_clearance, is_inside
+from lidarslam.simulation.recording.motion import given_path, read_trajectory
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.worlds.street.along import build_along
+from lidarslam.simulation.worlds.street.rows import FREE_SIDE_M
 
 
 def figure_of_eight(size_m=70.0, rounds=1):

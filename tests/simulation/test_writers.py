@@ -11,9 +11,9 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti_calibration import read_calibration, read_tr
+from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.recording.recorder import SimulatedScan
 from lidarslam.simulation.writers.bag_messages import MessageSerializer
 from lidarslam.simulation.writers.clock import CLOCK_START_NS, clock_ns
 from lidarslam.simulation.writers.driver_clouds import DRIVERS, find_driver

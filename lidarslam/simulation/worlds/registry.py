@@ -8,14 +8,14 @@ from lidarslam.simulation.world import World
 
 # Each module has `build(seed: int) -> World`.
 WORLDS: dict[str, str] = {
-    "street": "lidarslam.simulation.worlds.street",
-    "office": "lidarslam.simulation.worlds.office",
-    "tunnel": "lidarslam.simulation.worlds.tunnel",
-    "forest": "lidarslam.simulation.worlds.forest",
-    "hall": "lidarslam.simulation.worlds.hall",
-    "park": "lidarslam.simulation.worlds.park",
-    "fields": "lidarslam.simulation.worlds.fields",
-    "terrace": "lidarslam.simulation.worlds.terrace",
+    "street": "lidarslam.simulation.worlds.street.street",
+    "office": "lidarslam.simulation.worlds.office.office",
+    "tunnel": "lidarslam.simulation.worlds.tunnel.tunnel",
+    "forest": "lidarslam.simulation.worlds.open_country.forest",
+    "hall": "lidarslam.simulation.worlds.hall.hall",
+    "park": "lidarslam.simulation.worlds.open_country.park",
+    "fields": "lidarslam.simulation.worlds.open_country.fields",
+    "terrace": "lidarslam.simulation.worlds.street.terrace",
 }
 
 

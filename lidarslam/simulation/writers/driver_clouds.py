@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
-from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.recording.recorder import SimulatedScan
 
 Records = NDArray[np.void]
 

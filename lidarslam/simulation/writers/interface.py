@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.recording.recorder import SimulatedScan
 
 
 @dataclass(frozen=True)

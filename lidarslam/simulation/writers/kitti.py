@@ -10,8 +10,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory_io import format_kitti
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti_correction import correct_elevation
-from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.datasets.kitti.correction import correct_elevation
+from lidarslam.simulation.recording.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig
 
 SEQUENCE = "00"

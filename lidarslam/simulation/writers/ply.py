@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.recording.recorder import SimulatedScan
 from lidarslam.simulation.writers.clock import clock_s
 from lidarslam.simulation.writers.interface import Rig
 

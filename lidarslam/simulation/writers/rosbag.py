@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from lidarslam.core.errors import OutputError
-from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.recording.recorder import SimulatedScan
 from lidarslam.simulation.writers.bag_messages import MessageSerializer
 from lidarslam.simulation.writers.clock import clock_ns
 from lidarslam.simulation.writers.driver_clouds import find_driver

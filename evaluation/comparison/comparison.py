@@ -1,0 +1,203 @@
+"""What a comparison of methods holds: plain values that the report draws and comparison.json keeps."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.comparison.summary_table import SummaryTable
+from evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+
+MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
+"""`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with what there was. The last four:
+nothing to show but the message; `not run`: the comparison was interrupted before it was this one's turn."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapErrors:
+    """How far a method's map lies from the reference map, point by point, thinned for drawing.
+
+    Attributes:
+        points: (K, 3) points of the method's map, in the reference map's frame.
+        distances_m: (K,) to the nearest point of the reference map.
+    """
+
+    points: FloatArray
+    distances_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """One method on one recording; what could not be had is None.
+
+    Attributes:
+        name: as the user named it, such as `kiss-icp@0.5` or `learned+map`.
+        status, message: how it ended, and why when it did not end well.
+        trajectory: its poses, in its own world.
+        lost: (N,) which of them were lost.
+        lost_reasons: why, one for each stretch of successive lost scans; empty when that is not known.
+        metrics: its errors, with the association and the alignment they are of.
+        map_metrics: the content of metrics.json's "map".
+        map_errors: for the picture.
+        ms_per_scan_median, ms_per_scan_p95: wall time from one finished scan to the next.
+        stage_ms: median wall time of each stage; stages run beside one another.
+        peak_rss_mb: of its process and its children.
+        wall_s: of the whole process, from start to end.
+        settings: the method's resolved configuration as YAML.
+        run: its run directory, relative to the report's folder; empty when there is none.
+    """
+
+    name: str
+    status: MethodStatus
+    message: str = ""
+    scans: int = 0
+    trajectory: Trajectory | None = None
+    lost: NDArray[np.bool_] | None = None
+    lost_reasons: Sequence[str] = ()
+    metrics: TrajectoryMetrics | None = None
+    map_metrics: Mapping[str, object] | None = None
+    map_errors: MapErrors | None = None
+    ms_per_scan_median: float | None = None
+    ms_per_scan_p95: float | None = None
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
+    peak_rss_mb: float | None = None
+    wall_s: float | None = None
+    settings: str = ""
+    run: str = ""
+
+    @property
+    def lost_scans(self) -> int | None:
+        """How many scans were lost; None when no trajectory came of it."""
+        return None if self.lost is None else int(self.lost.sum())
+
+    def to_json(self) -> dict[str, object]:
+        """The method's entry in comparison.json."""
+        return {
+            "status": self.status,
+            "message": self.message,
+            "metrics": self._metrics_json(),
+            "ms_per_scan_median": self.ms_per_scan_median,
+            "ms_per_scan_p95": self.ms_per_scan_p95,
+            "stage_ms": dict(self.stage_ms),
+            "scans": self.scans,
+            "lost_scans": self.lost_scans,
+            "peak_rss_mb": self.peak_rss_mb,
+            "wall_s": self.wall_s,
+            "run": self.run or None,
+        }
+
+    def _metrics_json(self) -> dict[str, object] | None:
+        """As metrics.json; None when there was nothing to compare with."""
+        if self.metrics is None and self.map_metrics is None:
+            return None
+        return metrics_json(self.metrics, self.map_metrics)
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceComparison:
+    """All methods on one recording.
+
+    Attributes:
+        sequence: the recording's name.
+        source: where it lies, as the user named it.
+        reference: what the trajectories are held against; None when there is nothing.
+        reference_name: "ground truth", or the method or file that serves as the reference.
+        methods: in the order asked for.
+        notes: what the reader should know of this recording, such as why there is no reference.
+    """
+
+    sequence: str
+    source: str
+    reference: Trajectory | None
+    reference_name: str
+    methods: Sequence[MethodResult]
+    notes: Sequence[str] = ()
+
+    def to_json(self) -> dict[str, object]:
+        """The content of comparison.json for one recording."""
+        return {
+            "sequence": self.sequence,
+            "source": self.source,
+            "reference": None if self.reference is None else self.reference_name,
+            "notes": list(self.notes),
+            "methods": {method.name: method.to_json() for method in self.methods},
+        }
+
+
+@dataclass(frozen=True)
+class MissingRecording:
+    """A recording that was asked for and is not part of the comparison.
+
+    Attributes:
+        sequence, source: as in `SequenceComparison`.
+        reason: why, in a sentence.
+    """
+
+    sequence: str
+    source: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class PublishedRow:
+    """A row of somebody's published table, quoted beside ours.
+
+    Attributes:
+        method: as published.
+        values: column -> value, for instance {"09 translation_percent": 6.05}.
+        source: where it was published.
+    """
+
+    method: str
+    values: Mapping[str, float | str]
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Everything a report is made of.
+
+    Attributes:
+        title: of the report.
+        command: that makes it again.
+        sequences: one or more recordings.
+        versions: name -> version of the programs that matter; "commit" when it is known.
+        machine: name -> text, such as processor, cores, memory, system.
+        published: rows quoted beside ours that are in none of the `tables`.
+        tables: over several recordings, published rows included; a report shows them first.
+        missing: recordings that were asked for and are not there.
+        notes: what the reader should know of the whole, such as that it was interrupted.
+    """
+
+    title: str
+    command: str
+    sequences: Sequence[SequenceComparison]
+    versions: Mapping[str, str] = field(default_factory=dict)
+    machine: Mapping[str, str] = field(default_factory=dict)
+    published: Sequence[PublishedRow] = ()
+    tables: Sequence[SummaryTable] = ()
+    missing: Sequence[MissingRecording] = ()
+    notes: Sequence[str] = ()
+
+    def to_json(self) -> dict[str, object]:
+        """The content of comparison.json: of one recording its own keys, of several a list of them."""
+        about = {
+            "title": self.title,
+            "command": self.command,
+            "versions": dict(self.versions),
+            "machine": dict(self.machine),
+            "notes": list(self.notes),
+        }
+        if len(self.sequences) == 1 and not self.tables and not self.missing:
+            (only,) = self.sequences
+            return {**about, **only.to_json(), "notes": [*self.notes, *only.notes]}
+        return {
+            **about,
+            "sequences": [sequence.to_json() for sequence in self.sequences],
+            "missing": [vars(recording) for recording in self.missing],
+            "tables": [table.to_json() for table in self.tables],
+        }

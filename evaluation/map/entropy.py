@@ -1,0 +1,123 @@
+"""How crisp a map is, without any reference."""
+
+from dataclasses import dataclass
+from itertools import chain, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from evaluation.map.voxel_thinning import thin
+from lidarslam.core.geometry import FloatArray
+
+DEFAULT_RADIUS_M = 0.3
+DEFAULT_SPACING_M = 0.05
+# Points whose neighbourhoods are looked at; the mean over as many is known to a hundredth.
+MOST_SAMPLES = 50_000
+
+# Of a sampled map: points, the edge of a block, and a hash of its coordinates (Teschner et al., VMV 2003; Knuth).
+MOST_POINTS = 500_000
+_BLOCK_M = 10.0
+_PRIMES = np.array([73_856_093, 19_349_669])
+_GOLDEN, _BITS = 2_654_435_761, 0xFFFF_FFFF
+_QUICK_SAMPLES = 10_000
+
+# Fewer neighbours say nothing about a surface.
+_FEWEST_NEIGHBOURS = 5
+# Added to the neighbourhood's spread in every direction: without it a flawless plane would have an entropy of -inf.
+_RESOLUTION_M = 1e-3
+# Neighbours held in memory at a time.
+_CHUNK = 4_000_000
+
+
+@dataclass(frozen=True)
+class MapEntropy:
+    """Mean entropy of the map's points around its points; lower is crisper.
+
+    Attributes:
+        mean: natural units; of maps of the same place, radius and spacing only.
+        radius_m: of a neighbourhood.
+        spacing_m: edge of the cells that the map was thinned to.
+        points: how many neighbourhoods the mean is of.
+    """
+
+    mean: float
+    radius_m: float
+    spacing_m: float
+    points: int
+
+    def to_json(self) -> dict[str, float | int]:
+        """The mean, and what it is of."""
+        return {
+            "mean_map_entropy": self.mean,
+            "radius_m": self.radius_m,
+            "spacing_m": self.spacing_m,
+            "points": self.points,
+        }
+
+
+def map_entropy(
+    points: FloatArray,
+    radius_m: float = DEFAULT_RADIUS_M,
+    spacing_m: float = DEFAULT_SPACING_M,
+    most_samples: int = MOST_SAMPLES,
+) -> MapEntropy | None:
+    """The mean of `ln(det(2 pi e S)) / 2` over the map's points (N, 3), S the covariance of the points around each.
+
+    Droeschel, Stückler, Behnke, "Local multi-resolution representation for 6D motion estimation and mapping with a
+    continuously rotating 3D laser scanner", ICRA 2014, with a spread of 1 mm added in every direction. The map is
+    thinned first; of a large map an even sample of the points is taken, each with all its neighbours. None when no
+    point has enough neighbours.
+    """
+    thinned = thin(points, spacing_m)
+    if len(thinned) < _FEWEST_NEIGHBOURS:
+        return None
+    thinned = thinned - thinned.mean(axis=0)
+    tree = cKDTree(thinned, balanced_tree=False, compact_nodes=False)
+    sample = thinned[:: max(1, -(-len(thinned) // most_samples))]
+    counts = np.asarray(tree.query_ball_point(sample, radius_m, return_length=True, workers=-1), dtype=np.int64)
+    sample, counts = sample[counts >= _FEWEST_NEIGHBOURS], counts[counts >= _FEWEST_NEIGHBOURS]
+    if not len(sample):
+        return None
+    entropies = np.empty(len(sample))
+    for chunk in _chunks(counts):
+        found = tree.query_ball_point(sample[chunk], radius_m, workers=-1)
+        neighbours = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(counts[chunk].sum()))
+        entropies[chunk] = _entropies(sample[chunk], thinned[neighbours], counts[chunk])
+    return MapEntropy(float(entropies.mean()), radius_m, spacing_m, len(sample))
+
+
+def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:
+    """`map_entropy` of whole blocks of a map, in a second or two however large it is.
+
+    Blocks of 10 m on the ground are drawn by a hash of their position: of two maps of one place the same ones.
+    """
+    share = most_points / max(1, len(points))
+    if share < 1.0:
+        cells = np.floor(points[:, :2] / _BLOCK_M).astype(np.int64)
+        drawn = (cells @ _PRIMES) * _GOLDEN & _BITS
+        points = points[drawn < share * _BITS]
+    return map_entropy(points, most_samples=_QUICK_SAMPLES)
+
+
+def _chunks(counts: NDArray[np.int64]) -> list[slice]:
+    """Stretches of points with no more neighbours together than fit into memory."""
+    number = np.cumsum(counts) // _CHUNK
+    borders = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(counts)]
+    return [slice(first, end) for first, end in pairwise(borders)]
+
+
+def _entropies(centres: FloatArray, neighbours: FloatArray, counts: NDArray[np.int64]) -> FloatArray:
+    """The entropy (N,) around each centre (N, 3) from the neighbours of all, one after the other, and their counts."""
+    offsets = neighbours - np.repeat(centres, counts, axis=0)  # small, so that squares keep their digits
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    share = 1.0 / counts[:, None]
+    mean = np.add.reduceat(offsets, starts) * share
+    upper = [(i, j) for i in range(3) for j in range(i, 3)]
+    covariance = np.empty((len(centres), 3, 3))
+    for i, j in upper:
+        product = np.add.reduceat(offsets[:, i] * offsets[:, j], starts) * share[:, 0] - mean[:, i] * mean[:, j]
+        covariance[:, i, j] = covariance[:, j, i] = product
+    covariance += _RESOLUTION_M**2 * np.eye(3)
+    _, log_determinant = np.linalg.slogdet(2.0 * np.pi * np.e * covariance)
+    return np.asarray(0.5 * log_determinant, dtype=np.float64)

@@ -1,0 +1,184 @@
+"""How far a map is from a reference map, and how much of the reference it holds.
+
+Both clouds are thinned to one point a cell of the same size first, so that nobody gains by many points in one place.
+Distances are from point to nearest point; for a flawless map they are therefore not 0 but about half of the spacing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from evaluation.map.voxel_thinning import thin
+from lidarslam.core.geometry import FloatArray
+
+F_SCORE_THRESHOLDS_M = (0.1, 0.2, 0.5)
+SUBT_TOLERANCES_M = (1.0,)
+DEFAULT_SPACING_M = 0.05
+# Accuracy looks at the map in the reference's bounding box, grown by this much on every side.
+BOX_MARGIN_M = 1.0
+
+_GAP_SAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class MapMetrics:
+    """Errors of a map; None where one cannot be computed.
+
+    Attributes:
+        accuracy_mean_m: mean distance of the map's points to the reference.
+        completeness_mean_m: mean distance of the reference's points to the map.
+        chamfer_m: the mean of the two.
+        f_score_percent: threshold in metres -> harmonic mean of the share of the map's points that are that close to
+            the reference, and of the reference's points that close to the map. Knapitsch et al., "Tanks and Temples",
+            TOG 2017.
+        coverage_percent: tolerance in metres -> share of the reference's points that close to the map.
+        deviation_percent: tolerance in metres -> share of the map's points farther from the reference.
+    """
+
+    accuracy_mean_m: float | None
+    completeness_mean_m: float | None
+    chamfer_m: float | None
+    f_score_percent: Mapping[float, float | None]
+    coverage_percent: Mapping[float, float | None]
+    deviation_percent: Mapping[float, float | None]
+
+    def to_json(self) -> dict[str, object]:
+        """The errors, as metrics.json names them."""
+        return {
+            "accuracy_mean_m": self.accuracy_mean_m,
+            "completeness_mean_m": self.completeness_mean_m,
+            "chamfer_m": self.chamfer_m,
+            "f_score_percent": {str(float(m)): share for m, share in self.f_score_percent.items()},
+            "coverage_percent": {str(float(m)): share for m, share in self.coverage_percent.items()},
+            "deviation_percent": {str(float(m)): share for m, share in self.deviation_percent.items()},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class CloudErrors:
+    """Points of one cloud and how far each is from the other cloud.
+
+    Attributes:
+        points: (N, 3) the thinned cloud, in the reference's frame.
+        distances_m: (N,) to the nearest point of the other.
+        considered: (N,) whether the point is where both clouds could have one.
+    """
+
+    points: FloatArray
+    distances_m: FloatArray
+    considered: NDArray[np.bool_]
+
+    def share_within(self, threshold_m: float, considered_only: bool) -> float | None:
+        """Which share of the points, 0 to 1, is at most that far; None without points."""
+        distances = self.distances_m[self.considered] if considered_only else self.distances_m
+        return float(np.mean(distances <= threshold_m)) if len(distances) else None
+
+    @property
+    def mean_m(self) -> float | None:
+        """Mean distance of the points that are considered."""
+        distances = self.distances_m[self.considered]
+        return float(distances.mean()) if len(distances) else None
+
+
+@dataclass(frozen=True, eq=False)
+class MapComparison:
+    """A map beside its reference.
+
+    Attributes:
+        metrics: the errors in one number each.
+        map_errors: the map's points and their distances to the reference.
+        reference_errors: the reference's points and their distances to the map.
+        spacing_m: edge of the cells that both were thinned to.
+        map_gap_m: median distance between neighbouring points of the thinned map; None for fewer than two points.
+    """
+
+    metrics: MapMetrics
+    map_errors: CloudErrors
+    reference_errors: CloudErrors
+    spacing_m: float
+    map_gap_m: float | None
+
+
+def compare_maps(
+    map_points: FloatArray,
+    reference_points: FloatArray,
+    positions: FloatArray | None = None,
+    max_range_m: float = np.inf,
+    spacing_m: float = DEFAULT_SPACING_M,
+) -> MapComparison:
+    """Compare a map (N, 3) with a reference (M, 3) that it has been brought to the frame of.
+
+    Accuracy and the map's part of the F-score are of its points inside the reference's bounding box grown by a metre;
+    completeness and the reference's part of the F-score are of its points within the sensor's range of the path.
+    Coverage and deviation are of all points, as the map analysis of the DARPA SubT Challenge has them, so that a map
+    that left the box shows.
+
+    Args:
+        map_points: in the reference's frame.
+        reference_points: what is true.
+        positions: (K, 3) where the sensor was, in the reference's frame; None when that is unknown.
+        max_range_m: how far the sensor sees.
+        spacing_m: edge of the cells that both are thinned to.
+    """
+    origin = reference_points.mean(axis=0) if len(reference_points) else np.zeros(3)
+    mapped, reference = thin(map_points - origin, spacing_m), thin(reference_points - origin, spacing_m)
+    in_range = np.ones(len(reference), dtype=np.bool_)
+    if positions is not None and np.isfinite(max_range_m):
+        in_range = np.isfinite(_distances(reference, positions - origin, max_range_m))
+    map_errors = CloudErrors(mapped + origin, _distances(mapped, reference), _in_box(mapped, reference))
+    reference_errors = CloudErrors(reference + origin, _distances(reference, mapped), in_range)
+    metrics = _metrics(map_errors, reference_errors)
+    return MapComparison(metrics, map_errors, reference_errors, spacing_m, _median_gap(mapped))
+
+
+def _metrics(mapped: CloudErrors, reference: CloudErrors) -> MapMetrics:
+    # A side without points leaves the other side's distances infinite: nothing can be computed then.
+    empty = not len(mapped.points) or not len(reference.points)
+    accuracy, completeness = (None, None) if empty else (mapped.mean_m, reference.mean_m)
+    chamfer = None if accuracy is None or completeness is None else 0.5 * (accuracy + completeness)
+    return MapMetrics(
+        accuracy_mean_m=accuracy,
+        completeness_mean_m=completeness,
+        chamfer_m=chamfer,
+        f_score_percent={m: None if chamfer is None else _f_score(mapped, reference, m) for m in F_SCORE_THRESHOLDS_M},
+        coverage_percent={m: None if empty else _percent(reference, m) for m in SUBT_TOLERANCES_M},
+        deviation_percent={m: None if empty else 100.0 - _percent(mapped, m) for m in SUBT_TOLERANCES_M},
+    )
+
+
+def _f_score(mapped: CloudErrors, reference: CloudErrors, threshold_m: float) -> float:
+    precision = mapped.share_within(threshold_m, considered_only=True) or 0.0
+    recall = reference.share_within(threshold_m, considered_only=True) or 0.0
+    return 200.0 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def _percent(errors: CloudErrors, tolerance_m: float) -> float:
+    return 100.0 * (errors.share_within(tolerance_m, considered_only=False) or 0.0)
+
+
+def _distances(points: FloatArray, others: FloatArray, bound_m: float = np.inf) -> FloatArray:
+    """Distance (N,) of each point to the nearest of the others; inf beyond the bound, and when there are none."""
+    if not len(points) or not len(others):
+        return np.full(len(points), np.inf)
+    # Without balancing and shrinking a tree is built several times faster, and thinned points need neither.
+    tree = cKDTree(others, balanced_tree=False, compact_nodes=False)
+    distances, _ = tree.query(points, distance_upper_bound=bound_m, workers=-1)
+    return np.asarray(distances, dtype=np.float64)
+
+
+def _median_gap(points: FloatArray) -> float | None:
+    if len(points) < 2:
+        return None
+    sample = points[:: max(1, len(points) // _GAP_SAMPLES)]
+    distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2, workers=-1)
+    return float(np.median(np.asarray(distances)[:, 1]))
+
+
+def _in_box(points: FloatArray, reference: FloatArray) -> NDArray[np.bool_]:
+    if not len(reference):
+        return np.zeros(len(points), dtype=np.bool_)
+    low, high = reference.min(axis=0) - BOX_MARGIN_M, reference.max(axis=0) + BOX_MARGIN_M
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1), dtype=np.bool_)

@@ -1,0 +1,159 @@
+"""How far a trajectory is from a reference."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from evaluation.trajectory.alignment import AlignmentMethod, align
+from evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
+from evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Errors in one number each; None where one cannot be computed.
+
+    Attributes:
+        length_m: path length of the reference over the matched poses.
+        ate_rmse_m: absolute trajectory error, the positions' root mean square distance after SE(3) alignment.
+        ate_rotation_rmse_deg: root mean square angle between the orientations after the same alignment.
+        rpe_translation_rmse_m: relative pose error from one scan to the next; None when no two successive scans
+            have a reference pose.
+        rpe_rotation_rmse_deg: likewise for the rotation.
+        end_error_m: distance between the last positions after the first poses are made to coincide: how far off the
+            end is for one who trusts the start. No smaller for a closed loop.
+    """
+
+    length_m: float
+    ate_rmse_m: float
+    ate_rotation_rmse_deg: float
+    rpe_translation_rmse_m: float | None
+    rpe_rotation_rmse_deg: float | None
+    end_error_m: float
+
+    def to_json(self) -> dict[str, float | None]:
+        """The errors, as metrics.json names them."""
+        return {
+            "length_m": self.length_m,
+            "ate_rmse_m": self.ate_rmse_m,
+            "ate_rotation_rmse_deg": self.ate_rotation_rmse_deg,
+            "rpe_translation_rmse_m": self.rpe_translation_rmse_m,
+            "rpe_rotation_rmse_deg": self.rpe_rotation_rmse_deg,
+            "end_error_m": self.end_error_m,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryMetrics:
+    """Everything that is said about a trajectory beside a reference.
+
+    Attributes:
+        association: the pairs of poses the figures are of.
+        T_reference_estimate: (4, 4) the alignment the ATE was computed with.
+        errors: absolute and relative errors.
+        kitti: KITTI's drift; None under 100 m.
+        segments: metres -> drift over short segments; None where the reference is too short.
+        alignment: how the alignment was found.
+    """
+
+    association: Association
+    T_reference_estimate: FloatArray
+    errors: TrajectoryErrors
+    kitti: KittiDrift | None
+    segments: Mapping[int, Drift | None]
+    alignment: AlignmentMethod = "se3"
+
+    def to_json(self) -> dict[str, object]:
+        """The content of metrics.json, with no map compared."""
+        return {
+            "association": self.association.to_json(),
+            "trajectory": self.errors.to_json(),
+            "kitti": self.kitti and self.kitti.to_json(),
+            "segments": {str(m): drift and drift.to_json(10) for m, drift in self.segments.items()},
+            "map": None,
+        }
+
+
+def evaluate_trajectory(
+    estimate: Trajectory,
+    reference: Trajectory,
+    tolerance_s: float = DEFAULT_TOLERANCE_S,
+    max_gap_s: float = DEFAULT_MAX_GAP_S,
+    alignment: AlignmentMethod = "se3",
+) -> TrajectoryMetrics:
+    """Compare an estimate with a reference, both poses of the LiDAR; the worlds may differ, the scale may not.
+
+    The two are matched in time by `associate`, which explains `tolerance_s` and `max_gap_s`. The `alignment`, which
+    `align` explains, concerns the absolute errors only.
+
+    Raises:
+        InputError: fewer than three poses are of the same instant.
+    """
+    association = associate(estimate, reference, tolerance_s, max_gap_s)
+    T_reference_estimate = align(association.estimate, association.reference, alignment)
+    return TrajectoryMetrics(
+        association=association,
+        T_reference_estimate=T_reference_estimate,
+        errors=trajectory_errors(association, T_reference_estimate),
+        kitti=kitti_drift(association),
+        segments=short_drift(association),
+        alignment=alignment,
+    )
+
+
+def metrics_json(
+    trajectory: TrajectoryMetrics | None, map_metrics: Mapping[str, object] | None = None
+) -> dict[str, object]:
+    """The content of metrics.json: a trajectory's errors and a map's, None where there is no reference for it."""
+    parts = dict.fromkeys(("association", "trajectory", "kitti", "segments"))
+    return {
+        **(parts if trajectory is None else trajectory.to_json()),
+        "map": None if map_metrics is None else dict(map_metrics),
+    }
+
+
+def trajectory_errors(association: Association, T_reference_estimate: FloatArray) -> TrajectoryErrors:
+    """The absolute errors after the given alignment (4, 4), and the relative ones, which need none."""
+    distances_m, angles_rad = absolute_errors(association, T_reference_estimate)
+    step_distances_m, step_angles_rad = relative_errors(association)
+    at_start = align(association.estimate, association.reference, "first_pose")
+    end = at_start @ association.estimate.T_world_lidar[-1]
+    return TrajectoryErrors(
+        length_m=association.reference.length_m,
+        ate_rmse_m=_rms(distances_m),
+        ate_rotation_rmse_deg=float(np.rad2deg(_rms(angles_rad))),
+        rpe_translation_rmse_m=_rms(step_distances_m) if len(step_distances_m) else None,
+        rpe_rotation_rmse_deg=float(np.rad2deg(_rms(step_angles_rad))) if len(step_angles_rad) else None,
+        end_error_m=float(np.linalg.norm(end[:3, 3] - association.reference.positions[-1])),
+    )
+
+
+def absolute_errors(association: Association, T_reference_estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distance (M,) in metres and angle (M,) in radians between each aligned pose and its reference.
+
+    Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
+    """
+    aligned = T_reference_estimate @ association.estimate.T_world_lidar
+    return _differences(aligned, association.reference.T_world_lidar)
+
+
+def relative_errors(association: Association) -> tuple[FloatArray, FloatArray]:
+    """Distance in metres and angle in radians between the motions `T_prev_curr` of both, for successive scans.
+
+    A pair is left out when a scan between the two has no reference. Sturm et al., IROS 2012.
+    """
+    successive = np.diff(association.rows) == 1
+    estimate = association.estimate.relative_motions()[successive]
+    return _differences(estimate, association.reference.relative_motions()[successive])
+
+
+def _differences(T_a: FloatArray, T_b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    distance = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
+    return np.asarray(distance, dtype=np.float64), rotation_angle(inverse(T_a) @ T_b)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,84 @@
+"""What the end of a method's process means: its status in the comparison, and why."""
+
+import json
+import signal
+from pathlib import Path
+from typing import Any, cast
+
+from evaluation.comparison.comparison import MethodStatus
+from lidarslam.compare.method_process import LOST
+from lidarslam.compare.supervised import Ending, Limits
+from lidarslam.run.directory import SUMMARY
+
+# The run came to its end; how much of it was lost is another matter.
+WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
+
+_SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
+_MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
+_LONGEST_MESSAGE = 300
+
+Judgement = tuple[MethodStatus, str]
+
+
+def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> Judgement:
+    """The status and, when it did not end well, the reason.
+
+    Args:
+        ending: of the process.
+        folder: its run directory, which held no run before.
+        log: its standard error.
+        limits: that it had.
+    """
+    has_result = (folder / SUMMARY).is_file()
+    if ending.cause != "itself":
+        return _cut_short(ending, has_result, limits)
+    if ending.status == LOST and has_result:
+        return "lost", _where_lost(folder)
+    if ending.status == 0 and has_result:
+        return "ok", ""
+    said = _last_words(log)
+    if any(words in said for words in _MEMORY_ERRORS):
+        return "out of memory", said
+    if ending.status < 0:
+        return _killed(-ending.status, said)
+    return ("stopped" if has_result else "failed"), said or f"ended with status {ending.status} and said nothing"
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of a run's summary.json.
+
+    Raises:
+        OSError, ValueError: it is not there, or damaged.
+    """
+    return cast(dict[str, Any], json.loads((folder / SUMMARY).read_text(encoding="utf-8")))
+
+
+def _cut_short(ending: Ending, has_result: bool, limits: Limits) -> Judgement:
+    if ending.cause == "memory":
+        return "out of memory", f"took more than {limits.memory_mb:,.0f} MB"
+    if ending.cause == "time":
+        return "timed out", f"took more than {limits.timeout_s:g} s"
+    return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
+
+
+def _killed(number: int, said: str) -> Judgement:
+    if number == signal.SIGKILL:
+        return "out of memory", "killed by the system (signal 9), as it does when memory runs out"
+    reason = f"{_SIGNALS.get(number, 'ended by the system')} (signal {number})"
+    return "failed", f"{reason}: {said}" if said else reason
+
+
+def _where_lost(folder: Path) -> str:
+    summary = read_summary(folder)
+    if not summary["lost"]:
+        slid = summary["map_contradictions"][0]
+        return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"
+    first = summary["lost"][0]
+    return f"first lost on scan {first['first']}: {first['reason']}"
+
+
+def _last_words(log: Path) -> str:
+    """The last line a process wrote to standard error, without the program's name before it."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    return last.removeprefix("lidarslam: ")[:_LONGEST_MESSAGE]

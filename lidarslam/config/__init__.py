@@ -1,0 +1,1 @@
+"""The configuration: its settings, YAML in and out."""

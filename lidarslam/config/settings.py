@@ -1,0 +1,184 @@
+"""The whole configuration, composed of the libraries' own; YAML in and out.
+
+Defaults live in the code, beside what consumes them; a file or `--set` holds only what differs.
+"""
+
+import difflib
+import reprlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from lidarslam.config.yaml_text import YamlError, parse_yaml
+from lidarslam.config.yaml_text import read_yaml as read_yaml_file
+from lidarslam.core.errors import ConfigError
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.resume.config import CheckpointConfig
+from lidarslam.run.directory import RUN_SECTION
+from lidarslam.train.directory import SOURCES_SECTION
+from mapping.config import GlobalMapConfig, MappingConfig
+from mapping.pose_graph.graph_config import SlamGraphConfig
+from odometry.config import OdometryConfig
+
+# The sections of a run's or a training's config.yaml that are no configuration.
+_DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
+
+_MOST_FAULTS = 5
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 80
+_SHORT.maxlong = 40
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class ViewerConfig(BaseModel):
+    """What the Rerun recording holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    scan_points: int = Field(20_000, ge=1, description="points of each scan that are shown")
+    map_points: int = Field(200_000, ge=1, description="points of the map around the sensor that are shown")
+    map_radius_m: float = Field(60.0, gt=0.0, description="how far around the sensor the map is shown")
+    map_every: int = Field(20, ge=1, description="the map is shown anew every so many scans")
+
+
+class Config(BaseModel):
+    """Everything that decides what a run computes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    reader: ReaderConfig = ReaderConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    mapping: MappingConfig = MappingConfig()
+    pose_graph: SlamGraphConfig = SlamGraphConfig()
+    global_map: GlobalMapConfig = GlobalMapConfig()
+    viewer: ViewerConfig = ViewerConfig()
+    checkpoints: CheckpointConfig = CheckpointConfig()
+
+
+def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """The defaults, changed by a YAML file and then by settings such as `odometry.kiss_icp.voxel_size_m=0.5`.
+
+    Raises:
+        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    """
+    return load_model(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
+
+
+def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
+    """Any configuration: its defaults, changed by a YAML file and then by settings; the example shows what those are.
+
+    A section of the file that says what was computed, rather than how, is passed over.
+
+    Raises:
+        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    """
+    tree = {} if path is None else read_yaml(path)
+    for section in _DESCRIPTIONS:
+        tree.pop(section, None)
+    for setting in settings:
+        _apply(tree, setting, example)
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, model, _origin(path, settings))) from None
+
+
+def reader_settings(**options: str | None) -> list[str]:
+    """The reader's options that were given, as settings; quoted as YAML text, so that sequence 04 stays 04."""
+    return [setting(f"reader.{key}", value) for key, value in options.items() if value is not None]
+
+
+def setting(key: str, text: str) -> str:
+    """A setting whose value is a text, whatever it looks like to YAML."""
+    quoted = text.replace("'", "''")
+    return f"{key}='{quoted}'"
+
+
+def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:
+    """The resolved configuration as YAML; `run` becomes the section that says what was run."""
+    tree: dict[str, Any] = {} if run is None else {RUN_SECTION: run}
+    return str(yaml.safe_dump(tree | config.model_dump(mode="json"), sort_keys=False, allow_unicode=True))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The tree in a file.
+
+    Raises:
+        ConfigError: it is not readable YAML, or no keys and values.
+    """
+    try:
+        tree = read_yaml_file(path)
+    except YamlError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: expected keys and values, got a {type(tree).__name__}")
+    return tree
+
+
+def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
+    """Set one `key.path=value` in the tree; the value is read as YAML."""
+    dotted, separator, text = setting.partition("=")
+    keys = dotted.strip().split(".")
+    if not separator or not all(keys):
+        raise ConfigError(f"--set {_short(setting)}: expected key.path=value, such as {example}")
+    try:
+        value = parse_yaml(text)
+    except YamlError as error:
+        if not error.is_syntax:
+            raise ConfigError(f"--set {_short(setting)}: {error}") from error
+        value = text
+    for key in keys[:-1]:
+        branch = tree.setdefault(key, {})
+        if not isinstance(branch, dict):
+            raise ConfigError(f"--set {_short(setting)}: {key} is a value, not a section")
+        tree = branch
+    tree[keys[-1]] = value
+
+
+def _origin(path: Path | None, settings: Sequence[str]) -> str:
+    """Where a fault can have come from: the file, the settings, or either."""
+    return " or ".join(([str(path)] if path else []) + (["--set"] if settings else []))
+
+
+def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
+    """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
+    faults = error.errors(include_url=False)
+    told = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
+    told += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    return f"configuration ({origin}): {'; '.join(told)}"
+
+
+def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
+    location = [str(part) for part in fault["loc"]]
+    key = ".".join(location)
+    if fault["type"] == "extra_forbidden":
+        return f"there is no {key}{_suggest(location, model)}"
+    if fault["type"] == "model_type":
+        return f"{key}={_short(fault['input'])}: expected a section"
+    if fault["type"] == "value_error":
+        # Keys that contradict each other: the input would be their whole section, the validator names the two.
+        return f"{key}: {fault['ctx']['error']}"
+    return f"{key}={_short(fault['input'])}: {fault['msg'].lower()}"
+
+
+def _short(value: object) -> str:
+    """A value as one would write it, its beginning if it is long: aliases of YAML can make it endless."""
+    return _SHORT.repr(value)
+
+
+def _suggest(location: Sequence[str], model: type[BaseModel]) -> str:
+    section: Any = model
+    for key in location[:-1]:
+        annotation = section.model_fields[key].annotation
+        # A section that may be null is a union of itself and None.
+        section = next((part for part in get_args(annotation) if part is not type(None)), annotation)
+    known = list(section.model_fields)
+    close = difflib.get_close_matches(location[-1], known, n=1)
+    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(known)}"

@@ -1,0 +1,107 @@
+"""What lies in a folder of scans: which files are scans, when they were taken, where the truth is."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.folders.scan_files import natural_key
+from lidarslam.datasets.registry import SCAN_SUFFIXES
+from lidarslam.datasets.stamps import mend_stamps, read_stamps, stamps_from_names
+from lidarslam.datasets.truth_files import find_truth_file
+
+_STAMP_FILES = ("timestamps.txt", "times.txt")
+
+
+@dataclass(frozen=True, eq=False)
+class FolderLayout:
+    """The scans of a folder.
+
+    Attributes:
+        files: N files in the order of time, all with one suffix.
+        stamps: (N,) seconds, strictly increasing.
+        from_clock: whether the stamps were found; else they are made from the rate.
+        truth: a TUM file, or None.
+        notes: what the user should know.
+        warnings: what was mended.
+    """
+
+    files: tuple[Path, ...]
+    stamps: FloatArray
+    from_clock: bool
+    truth: Path | None
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
+    """Look at a folder's names and its stamp file; no scan is opened.
+
+    Raises:
+        InputError: there is no scan, or the stamp file does not go with the scans.
+    """
+    files, notes, warnings = _find_scans(folder)
+    truth = find_truth_file((folder, folder.resolve().parent))
+    stamp_file = _find_stamp_file(folder)
+    if stamp_file is not None:
+        stamps, replaced = _read_stamp_file(stamp_file, files)
+        if replaced:
+            warnings.append(
+                f"{replaced} stamps of {stamp_file.name} repeat, run backwards or far ahead and were interpolated."
+            )
+        return FolderLayout(tuple(files), stamps, True, truth, tuple(notes), tuple(warnings))
+    named = stamps_from_names([path.stem for path in files])
+    if named is not None:
+        # The order of names is not that of time: 5.36 comes before 5.4.
+        order = np.argsort(named, kind="stable")
+        if (np.diff(named[order]) > 0.0).all():
+            notes.append("The stamps are the file names.")
+            in_time = tuple(files[i] for i in order)
+            return FolderLayout(in_time, named[order], True, truth, tuple(notes), tuple(warnings))
+        warnings.append("The file names look like stamps, but some are equal.")
+    notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
+    assumed = np.arange(len(files)) / rate_hz
+    return FolderLayout(tuple(files), assumed, False, truth, tuple(notes), tuple(warnings))
+
+
+def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
+    """The scan files in natural order, the most common suffix and numbered names where there are such; and words."""
+    named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
+    candidates = [path for path in named if path.is_file()]
+    if not candidates:
+        raise InputError(f"{folder}: expected scan files ({', '.join(SCAN_SUFFIXES)}), found none")
+    counts = Counter(path.suffix.lower() for path in candidates)
+    suffix = max(SCAN_SUFFIXES, key=lambda s: counts[s])  # of equals the first, so that a map beside a scan loses
+    same = [path for path in candidates if path.suffix.lower() == suffix]
+    numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
+    files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
+    skipped = sorted(path.name for path in set(candidates) - set(files))
+    notes = []
+    if skipped:
+        shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
+        notes.append(f"{len(skipped)} other files were not taken for scans: {shown}.")
+    gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
+    return files, notes, [f"{len(gone)} scans are no files that can be opened, such as {gone[0]}."] if gone else []
+
+
+def _find_stamp_file(folder: Path) -> Path | None:
+    places = (folder, folder.resolve().parent)
+    return next((place / name for place in places for name in _STAMP_FILES if (place / name).is_file()), None)
+
+
+def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int]:
+    stamps = read_stamps(path)
+    stamps = stamps[np.isfinite(stamps)]
+    if len(stamps) != len(files):
+        raise InputError(
+            f"{path}: expected a stamp for each of the {len(files)} {files[0].suffix} scans in {files[0].parent},"
+            f" got {len(stamps)}; complete it, or move it away to use the file names or the rate"
+        )
+    try:
+        return mend_stamps(stamps, np.arange(len(stamps), dtype=np.float64))
+    except ValueError:
+        raise InputError(f"{path}: expected stamps that increase from line to line, no two of them do") from None

@@ -1,0 +1,1 @@
+"""KITTI odometry and raw data."""

@@ -1,0 +1,195 @@
+"""The KITTI odometry benchmark: `sequences/NN/{velodyne/*.bin, times.txt, calib.txt}` and `poses/NN.txt`.
+
+The scans are motion compensated by the publishers. The poses are those of the left camera, `cam`; they come to the
+LiDAR's frame here, once, and nowhere else.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_kitti_poses
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
+from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, numbered_scans, read_bin, scan_indices
+from lidarslam.datasets.kitti.calibration import read_tr
+from lidarslam.datasets.kitti.correction import correct_elevation
+from lidarslam.datasets.recording import PointField, Recording, RecordingInfo
+from lidarslam.datasets.stamps import increasing_rows, read_stamps, scan_rate
+
+
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open a sequence of the benchmark: its root, with `config.sequence`, or one `sequences/NN` folder.
+
+    Raises:
+        InputError: no such sequence, no scan, or a damaged stamp or calibration file.
+    """
+    return KittiOdometryRecording(_find_sequence(source, config.sequence), config)
+
+
+def _find_sequence(source: Path, wanted: str | None) -> Path:
+    if (source / "velodyne").is_dir():
+        name = source.resolve().name
+        if wanted is not None and wanted.zfill(2) != name.zfill(2):
+            raise InputError(f"{source}: is the sequence {name}, not {wanted}; leave --sequence out or give the root")
+        return source
+    folders = sorted(f.parent for f in (source / "sequences").glob("*/velodyne") if f.is_dir())
+    available = ", ".join(f.name for f in folders)
+    if not folders:
+        raise InputError(f"{source}: expected sequences/NN/velodyne or velodyne below it, found neither")
+    if wanted is None:
+        if len(folders) > 1:
+            raise InputError(f"{source}: holds several sequences; choose one with --sequence: {available}")
+        return folders[0]
+    for folder in folders:
+        if folder.name in (wanted, wanted.zfill(2)):
+            return folder
+    raise InputError(f"{source}: has no sequence {wanted!r} with scans; there are: {available}")
+
+
+class KittiOdometryRecording:
+    """One sequence; implements `Recording`."""
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        self._folder = folder
+        self._config = config
+        self._files, self._numbers = numbered_scans(folder / "velodyne")
+        self._times = self._read_times()
+        last = int(self._numbers[-1])
+        if self._times is not None and last >= len(self._times):
+            raise InputError(
+                f"{folder / 'times.txt'}: expected a stamp for every scan up to {self._files[-1].name},"
+                f" {last + 1} lines, got {len(self._times)}; complete it, or remove it to use the rate"
+            )
+        self._stamps = self._stamps_of(self._numbers)
+
+    def _read_times(self) -> FloatArray | None:
+        path = self._folder / "times.txt"
+        if not path.is_file():
+            return None
+        times = read_stamps(path)
+        increasing = increasing_rows(times)
+        if not increasing.all():
+            raise InputError(
+                f"{path}: expected stamps that increase from line to line, those at line"
+                f" {int(np.argmin(increasing)) + 1} and perhaps others do not; mend it, or remove it to use the rate"
+            )
+        return times
+
+    def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
+        return numbers / self._config.rate_hz if self._times is None else self._times[numbers]
+
+    @property
+    def name(self) -> str:
+        """Such as kitti_04."""
+        return f"kitti_{self._folder.resolve().name}"
+
+    @cached_property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """The extrinsic calibration `Tr`, (4, 4); None without calib.txt."""
+        path = self._folder / "calib.txt"
+        return read_tr(path) if path.is_file() else None
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar of every pose that has a stamp, those of absent scans included.
+
+        Raises:
+            InputError: the pose file is damaged.
+        """
+        path, T_cam_lidar = self._pose_file, self.T_cam_lidar
+        if path is None or T_cam_lidar is None:
+            return None
+        T_cam0_cam = read_kitti_poses(path)
+        if self._times is not None:
+            T_cam0_cam = T_cam0_cam[: len(self._times)]
+        # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
+        T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
+        return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
+
+    @property
+    def _has_calibration(self) -> bool:
+        return (self._folder / "calib.txt").is_file()
+
+    @property
+    def _pose_file(self) -> Path | None:
+        folder = self._folder.resolve()
+        candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
+        return next((path for path in candidates if path.is_file()), None)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`, without times: they are motion compensated.
+
+        Raises:
+            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
+        """
+        return readable_scans(scan_indices(len(self), start, stop, step), self._read, faults)
+
+    def _read(self, index: int) -> Scan:
+        points = read_bin(self._files[index])[:, :3]
+        angle_deg = self._config.kitti_elevation_correction_deg
+        return Scan.from_raw(correct_elevation(points, angle_deg) if angle_deg else points, self._stamps[index])
+
+    def describe(self) -> RecordingInfo:
+        """What `lidarslam info` prints.
+
+        Raises:
+            InputError: no scan can be read.
+        """
+        _, first, unreadable = first_readable(self._folder, range(len(self)), self._read)
+        return RecordingInfo(
+            reader="kitti-odometry",
+            scans=len(self),
+            first_stamp=float(self._stamps[0]),
+            duration_s=float(self._stamps[-1] - self._stamps[0]),
+            rate_hz=scan_rate(self._stamps),
+            points_per_scan=len(first),
+            dropped_points=first.dropped,
+            has_rings=False,
+            ground_truth=self._pose_file if self._has_calibration else None,
+            point_time=None,
+            fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
+            notes=(*self._notes(), *self.warnings, *unreadable.warnings()),
+        )
+
+    def _notes(self) -> Iterator[str]:
+        yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
+        if angle_deg := self._config.kitti_elevation_correction_deg:
+            yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is missing, or more than it should be."""
+        return tuple(self._warnings())
+
+    def _warnings(self) -> Iterator[str]:
+        last = int(self._numbers[-1])
+        if self._times is None:
+            yield f"There is no times.txt; the stamps assume {self._config.rate_hz:g} scans a second."
+        elif last + 1 < len(self._times):
+            yield f"times.txt has {len(self._times)} lines for the scans up to number {last}."
+        if len(self) <= last - self._numbers[0]:
+            yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
+        if self._pose_file is not None and not self._has_calibration:
+            yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
+        elif self._pose_file is not None and (poses := self._count_poses(self._pose_file)) not in (0, last + 1):
+            yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
+
+    def _count_poses(self, path: Path) -> int:
+        """Zero where the file is damaged, which the truth tells when it is asked for."""
+        try:
+            return len(read_kitti_poses(path))
+        except InputError:
+            return 0

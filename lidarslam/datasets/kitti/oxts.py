@@ -1,0 +1,65 @@
+"""The GPS/IMU unit of a KITTI raw drive: one text file of 30 numbers for each camera image."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.trajectory_io import parse_numbers
+from lidarslam.datasets.folders.scan_files import numbered_scans
+
+_POLE_DEG = 90.0
+_EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
+_COLUMNS = 30
+_POSITION_ACCURACY_COLUMN = 23
+
+
+@dataclass(frozen=True, eq=False)
+class OxtsPoses:
+    """The unit's poses.
+
+    Attributes:
+        numbers: (N,) the row of the stamp file each pose belongs to.
+        T_enu_imu: (N, 4, 4) in an east-north-up frame; imu is x forward, y left, z up.
+        accuracy_m: (N,) standard deviation of the position as the unit itself states it.
+    """
+
+    numbers: NDArray[np.intp]
+    T_enu_imu: FloatArray
+    accuracy_m: FloatArray
+
+
+def read_oxts(folder: Path) -> OxtsPoses:
+    """Read `oxts/data` of a drive.
+
+    Raises:
+        InputError: there is no file, or one does not hold 30 numbers that begin with a latitude.
+    """
+    files, numbers = numbered_scans(folder, ".txt")
+    tables = [parse_numbers(path, _COLUMNS) for path in files]
+    for path, table in zip(files, tables, strict=True):
+        if len(table) != 1 or not np.isfinite(table[0, :6]).all():
+            raise InputError(f"{path}: expected one line of {_COLUMNS} numbers, got {len(table)}; copy the file again")
+        if not abs(table[0, 0]) < _POLE_DEG:
+            raise InputError(f"{path}: begins with {table[0, 0]:g}, which is no latitude; copy the file again")
+    rows = np.concatenate(tables)
+    return OxtsPoses(numbers, oxts_poses(rows), rows[:, _POSITION_ACCURACY_COLUMN])
+
+
+def oxts_poses(rows: FloatArray) -> FloatArray:
+    """T_enu_imu (N, 4, 4) of rows (N, >=6): latitude, longitude (degrees), altitude (m), roll, pitch, yaw (radians).
+
+    The position is the Mercator projection scaled by the cosine of the first latitude, so that metres are metres
+    there; the rotation is Rz(yaw) Ry(pitch) Rx(roll), yaw counted from east (Geiger et al., IJRR 2013, and the
+    raw development kit).
+    """
+    latitude, longitude = np.deg2rad(rows[:, 0]), np.deg2rad(rows[:, 1])
+    scaled_radius = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    east = scaled_radius * longitude
+    north = scaled_radius * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+    R = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]]).as_matrix()
+    return make_transform(R, np.column_stack([east, north, rows[:, 2]]))

@@ -1,0 +1,1 @@
+"""Rosbags and ROS messages."""

@@ -1,0 +1,52 @@
+"""Which topic of a bag is the recording."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.recording import SeveralTopicsError, Topic
+from lidarslam.datasets.ros.bag_file import CLOUD_TYPES
+
+_PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
+_TOPICS_LISTED = 20
+
+
+def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
+    """The wanted point cloud topic, or the only one with messages.
+
+    Raises:
+        SeveralTopicsError: there is more than one to choose from.
+        InputError: there is no such topic, or none to choose from; the message lists them.
+    """
+    clouds = [topic for topic in topics if topic.message_type in CLOUD_TYPES and topic.messages]
+    if wanted is not None:
+        named = [topic for topic in topics if topic.name.lstrip("/") == wanted.lstrip("/")]
+        if chosen := next((topic for topic in named if topic in clouds), None):
+            return chosen
+        found = f"holds {_listing(named)}, which is no point cloud" if named else f"has no topic {wanted!r}"
+        raise InputError(f"{source}: {found}; its point cloud topics: {_listing(clouds)}")
+    if len(clouds) == 1:
+        return clouds[0]
+    if clouds:
+        message = f"{source}: several point cloud topics, choose one with --topic: {_listing(clouds)}"
+        raise SeveralTopicsError(message, clouds, topics)
+    if not any(topic.messages for topic in topics):
+        raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
+    raise InputError(
+        f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages."
+        f"{_packets_hint(topics)} Its topics: {_listing(topics)}"
+    )
+
+
+def _listing(topics: Sequence[Topic]) -> str:
+    words = [f"{topic.name} ({topic.message_type}, {topic.messages} messages)" for topic in topics[:_TOPICS_LISTED]]
+    if len(topics) > _TOPICS_LISTED:
+        words.append(f"and {len(topics) - _TOPICS_LISTED} more")
+    return ", ".join(words) or "none"
+
+
+def _packets_hint(topics: Sequence[Topic]) -> str:
+    packets = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
+    if not packets:
+        return ""
+    return f" {packets[0].name} holds raw packets: play it through the sensor's driver and record the point clouds."

@@ -1,0 +1,81 @@
+"""Livox's own point cloud message, CustomMsg of livox_ros_driver, livox_ros_driver2 and livox_interfaces.
+
+Its points are records of fixed size, so they are read where they lie: unpacking 20 000 of them one by one would take
+longer than the odometry.
+"""
+
+import struct
+from typing import Literal
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.config import TimeUnit
+from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, coordinates
+
+CUSTOM_MESSAGE_TYPES = (
+    "livox_ros_driver/msg/CustomMsg",
+    "livox_ros_driver2/msg/CustomMsg",
+    "livox_interfaces/msg/CustomMsg",
+)
+TIME_FIELD = "offset_time"
+TIME_UNIT: TimeUnit = "ns"
+
+# livox_ros_driver2/msg/CustomPoint.msg, in its order; 19 bytes.
+_POINT = (
+    ("offset_time", "uint32"),
+    ("x", "float32"),
+    ("y", "float32"),
+    ("z", "float32"),
+    ("reflectivity", "uint8"),
+    ("tag", "uint8"),
+    ("line", "uint8"),
+)
+_FIELDS = tuple(PointField(name, type_name) for name, type_name in _POINT)
+_CDR_ALIGNED_POINT = 20
+ByteOrder = Literal["<", ">"]
+
+
+def decode_custom_message(raw: bytes, ros2: bool) -> DecodedCloud:
+    """Decode a serialised CustomMsg; the times are nanoseconds of a clock, `timebase + offset_time`, as uint64.
+
+    Args:
+        raw: the message as it stands in the bag.
+        ros2: serialised by ROS 2 (CDR: aligned, of either byte order) rather than by ROS 1 (packed).
+
+    Raises:
+        InputError: the bytes are not such a message.
+    """
+    try:
+        return _decode_cdr(raw) if ros2 else _decode_ros1(raw)
+    except struct.error as error:
+        raise InputError(f"a Livox CustomMsg of {len(raw)} bytes ends too early ({error})") from error
+
+
+def _decode_ros1(raw: bytes) -> DecodedCloud:
+    # header: seq, stamp, length of frame_id and its characters; then timebase, point_num, lidar_id, rsvd[3], points.
+    (characters,) = struct.unpack_from("<I", raw, 12)
+    timebase, count = struct.unpack_from("<Q8xI", raw, 16 + characters)
+    return _points(raw, 36 + characters, count, timebase, "<", packed=True)
+
+
+def _decode_cdr(raw: bytes) -> DecodedCloud:
+    # The same without seq; everything is aligned to its own size, counted from behind the four bytes of encapsulation.
+    order: ByteOrder = "<" if raw[1:2] == b"\x01" else ">"
+    (characters,) = struct.unpack_from(order + "I", raw, 12)
+    start = 4 + -(-(12 + characters) // 8) * 8
+    timebase, count = struct.unpack_from(order + "Q8xI", raw, start)
+    return _points(raw, start + 20, count, timebase, order, packed=False)
+
+
+def _points(raw: bytes, start: int, count: int, timebase: int, order: ByteOrder, packed: bool) -> DecodedCloud:
+    record = np.dtype([(name, np.dtype(type_name).newbyteorder(order)) for name, type_name in _POINT])
+    step = record.itemsize if packed else _CDR_ALIGNED_POINT
+    # The last point of an aligned message may or may not be followed by its byte of padding.
+    needed = (count - 1) * step + record.itemsize if count else 0
+    if len(raw) - start < needed:
+        raise InputError(f"a Livox CustomMsg of {count} points needs {start + needed} bytes, it has {len(raw)}")
+    cloud = np.ndarray((count,), record, raw, offset=start, strides=(step,))
+    times = cloud[TIME_FIELD].astype(np.uint64) + np.uint64(timebase)
+    return DecodedCloud(coordinates(cloud), TIME_FIELD, times, cloud["line"].copy(), _FIELDS)

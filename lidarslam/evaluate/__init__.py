@@ -1,0 +1,1 @@
+"""Evaluating runs and trajectory files on disk."""

@@ -1,0 +1,194 @@
+"""How good a trajectory and its map are: from a run directory or a trajectory file to metrics.json."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from evaluation.map.entropy import MapEntropy, map_entropy
+from evaluation.report.error_colours import DEFAULT_CLIP_M
+from evaluation.trajectory.agreement import disagreement
+from evaluation.trajectory.alignment import AlignmentMethod
+from evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S
+from evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory, metrics_json
+from lidarslam.core.errors import InputError
+from lidarslam.evaluate.error_cloud import check_error_files, write_errors
+from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
+from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map, read_map
+from lidarslam.evaluate.reference_map import ReferenceMap, find_reference_map, load_reference_map
+from lidarslam.run import directory as files
+from lidarslam.run.directory import RunDirectory
+
+
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """What is evaluated, against what, and where the figures go.
+
+    Attributes:
+        run: a run directory, or a trajectory in TUM or KITTI text.
+        reference: a trajectory file, a run directory or a recording; None: the truth that came with the run's source.
+        reference_map: a cloud; None: the exact map of a simulated source, else none.
+        map_file: the map of a bare trajectory, or another one than the run's.
+        alignment: of the trajectory, for the ATE.
+        tolerance_s, max_gap_s: how poses are matched in time.
+        map_options: how maps are compared.
+        errors: files for the map coloured by its errors.
+        errors_clip_m: distance of the brightest colour.
+        out: file for the figures; None: metrics.json of the run, and nothing of a bare trajectory.
+        needs_reference: whether it is an error that there is nothing to compare with.
+    """
+
+    run: Path
+    reference: Path | None = None
+    reference_map: Path | None = None
+    map_file: Path | None = None
+    alignment: AlignmentMethod = "se3"
+    tolerance_s: float = DEFAULT_TOLERANCE_S
+    max_gap_s: float = DEFAULT_MAX_GAP_S
+    map_options: MapOptions = field(default_factory=MapOptions)
+    errors: Sequence[Path] = ()
+    errors_clip_m: float = DEFAULT_CLIP_M
+    out: Path | None = None
+    needs_reference: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What came of it.
+
+    Attributes:
+        estimate: what was evaluated.
+        reference: what its trajectory was held against, in words; None when there was nothing.
+        metrics: errors of the trajectory.
+        map: errors of the map; None without a map or a reference for it.
+        entropy: crispness of the map; None without a map.
+        notes: what the reader should know.
+        written: the files.
+    """
+
+    estimate: Estimate
+    reference: str | None
+    metrics: TrajectoryMetrics | None
+    map: MapEvaluation | None
+    entropy: MapEntropy | None
+    notes: Sequence[str]
+    written: Sequence[Path]
+
+    def to_json(self) -> dict[str, object]:
+        """The content of metrics.json."""
+        return {
+            **metrics_json(self.metrics, None if self.map is None else self.map.json),
+            "map_alignment": self.map and self.map.alignment.to_json(),
+            "map_entropy": self.entropy and self.entropy.to_json(),
+            "notes": list(self.notes),
+        }
+
+
+def evaluate(request: EvaluateRequest) -> Evaluation:
+    """Compare, and write the figures.
+
+    Raises:
+        InputError: something to read is missing or damaged, or there is nothing to compare with.
+        OutputError: something cannot be written.
+    """
+    check_error_files(request.errors)
+    estimate = read_estimate(request.run, request.map_file)
+    notes: list[str] = []
+    reference = _reference(request, estimate, notes)
+    metrics = None
+    if reference is not None:
+        pair_of_both = pair(estimate, reference)
+        metrics = evaluate_trajectory(*pair_of_both, request.tolerance_s, request.max_gap_s, request.alignment)
+        unrelated = disagreement(metrics)
+        notes += [] if unrelated is None else [unrelated]
+    compared = _evaluate_map(request, estimate, metrics, reference, notes)
+    if request.errors and compared is None:
+        raise InputError("--errors colours a map by its distance to a reference; name one with --reference-map MAP")
+    evaluation = Evaluation(
+        estimate=estimate,
+        reference=None if reference is None else reference.what,
+        metrics=metrics,
+        map=compared,
+        entropy=_entropy(estimate, compared),
+        notes=[*notes, *(compared.warnings() if compared is not None else ())],
+        written=_outputs(request, estimate),
+    )
+    _write(request, evaluation)
+    return evaluation
+
+
+def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -> Poses | None:
+    """What the trajectory is held against; with a map to compare, doing without is only noted."""
+    if request.reference is not None:
+        return read_reference(request.reference, estimate.config.reader)
+    if not request.needs_reference:
+        return None
+    try:
+        return _own_truth(estimate)
+    except InputError as error:
+        if request.reference_map is None:
+            raise
+        notes.append(f"the trajectory is not evaluated: {error}")
+        return None
+
+
+def _own_truth(estimate: Estimate) -> Poses:
+    source = estimate.source
+    if source is None:
+        raise InputError(
+            f"{estimate.poses.what}: nothing says what is true here; name a trajectory with --reference or a map with"
+            " --reference-map"
+        )
+    if not source.exists():
+        raise InputError(
+            f"{source}: the recording that the run was made of is not there any more; name it, or its true"
+            " trajectory, with --reference"
+        )
+    return recording_truth(source, estimate.config.reader)
+
+
+def _evaluate_map(
+    request: EvaluateRequest,
+    estimate: Estimate,
+    metrics: TrajectoryMetrics | None,
+    reference: Poses | None,
+    notes: list[str],
+) -> MapEvaluation | None:
+    reference_map = _reference_map(request, estimate)
+    if reference_map is None:
+        return None
+    if estimate.map_file is None and request.reference_map is None:
+        if estimate.run is not None:
+            notes.append("the run has no map to compare with that of the simulation")
+        return None
+    # Poses of KITTI's camera say nothing about where the LiDAR's world lies.
+    in_camera = estimate.run is not None and reference is not None and reference.stamps is None
+    own_metrics = None if in_camera else metrics
+    return evaluate_map(estimate, read_map(estimate), own_metrics, reference_map, request.map_options)
+
+
+def _reference_map(request: EvaluateRequest, estimate: Estimate) -> ReferenceMap | None:
+    if request.reference_map is not None:
+        return load_reference_map(request.reference_map)
+    if not request.needs_reference:
+        return None
+    sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
+    return next((found for found in map(find_reference_map, sources) if found is not None), None)
+
+
+def _entropy(estimate: Estimate, compared: MapEvaluation | None) -> MapEntropy | None:
+    if compared is not None:
+        return compared.entropy
+    return None if estimate.map_file is None else map_entropy(read_map(estimate))
+
+
+def _outputs(request: EvaluateRequest, estimate: Estimate) -> list[Path]:
+    figures = request.out or (None if estimate.run is None else estimate.run / files.METRICS)
+    return [*([] if figures is None else [figures]), *request.errors]
+
+
+def _write(request: EvaluateRequest, evaluation: Evaluation) -> None:
+    for path in evaluation.written:
+        if path not in request.errors:
+            RunDirectory(path.parent).write_json(path.name, evaluation.to_json())
+        elif evaluation.map is not None:
+            write_errors(path, evaluation.map.comparison, evaluation.map.positions, request.errors_clip_m)

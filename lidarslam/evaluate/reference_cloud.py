@@ -1,0 +1,95 @@
+"""Point clouds on disk, as scanners, surveyors and mapping programs leave them; the only file that imports laspy and
+pye57."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.folders.pcd import read_pcd
+from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.point_table import coordinates
+
+# Surveys end well within this; squares of much more overflow.
+_FARTHEST_M = 1e9
+
+
+def read_cloud(path: Path) -> FloatArray:
+    """The finite points (N, 3), metres, of a .pcd, .ply, .las, .laz or .e57 file, in the file's own frame.
+
+    Coordinates stay in double precision, because surveys count metres from far away. The scans of an E57 file are
+    put together by their poses.
+
+    Raises:
+        InputError: the file is missing, damaged, of another kind, or holds no point; or its reader is not installed.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}; name a point cloud")
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(f"{path}: not a point cloud that can be read; it must end in {', '.join(_READERS)}")
+    points = read(path)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        raise InputError(f"{path}: holds no point; choose another file")
+    farthest = float(np.abs(points).max())
+    if farthest > _FARTHEST_M:
+        raise InputError(f"{path}: a point lies {farthest:.3g} m from the origin; expected metres on this planet")
+    return points
+
+
+def _read_table(path: Path) -> FloatArray:
+    table = read_ply(path) if path.suffix.lower() == ".ply" else read_pcd(path)
+    try:
+        return coordinates(table)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _read_las(path: Path) -> FloatArray:
+    try:
+        import laspy
+    except ImportError as error:
+        raise InputError(f"{path}: LAS and LAZ files need laspy; type: pip install 'laspy[lazrs]'") from error
+    try:
+        with laspy.open(path) as file:
+            cloud = file.read()
+            if len(cloud) != file.header.point_count:
+                raise ValueError(f"{len(cloud):,} of {file.header.point_count:,} points")
+            return np.asarray(cloud.xyz, dtype=np.float64)
+    except Exception as error:  # whatever a damaged file makes of laspy and of its decompressors
+        raise _damaged(path, error) from error
+
+
+def _read_e57(path: Path) -> FloatArray:
+    try:
+        import pye57
+    except ImportError as error:
+        raise InputError(f"{path}: E57 files need pye57; type: pip install pye57") from error
+    try:
+        file = pye57.E57(str(path))
+        try:
+            scans = [file.read_scan(number, ignore_missing_fields=True) for number in range(file.scan_count)]
+        finally:
+            file.close()
+        columns = [np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1) for scan in scans]
+        return np.concatenate([np.empty((0, 3)), *columns])
+    except Exception as error:  # pye57 passes on libE57Format's own exceptions
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    kind = path.suffix[1:].upper()
+    reason = " ".join(str(error).split())[:160] or type(error).__name__
+    return InputError(f"{path}: not a readable {kind} file ({reason}); copy it again or remove it")
+
+
+_READERS: dict[str, Callable[[Path], FloatArray]] = {
+    ".ply": _read_table,
+    ".pcd": _read_table,
+    ".las": _read_las,
+    ".laz": _read_las,
+    ".e57": _read_e57,
+}

@@ -1,0 +1,59 @@
+"""Maps that are true: a file, or what lies beside a simulated recording."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.evaluate.reference_cloud import read_cloud
+from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceMap:
+    """A map to compare with.
+
+    Attributes:
+        path: where it was read.
+        points: (N, 3) in its own frame.
+        truth: the true trajectory in that same frame; None when no trajectory is known to be in it.
+    """
+
+    path: Path
+    points: FloatArray
+    truth: Trajectory | None = None
+
+    @property
+    def what(self) -> str:
+        """It is, in words."""
+        return f"{self.path}{'' if self.truth is None else ', the exact map of the simulation'}"
+
+
+def load_reference_map(path: Path) -> ReferenceMap:
+    """A map from a file; that of a simulated recording brings its trajectory with it.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    truth = path.parent / GROUND_TRUTH
+    is_simulated = path.name == REFERENCE_MAP and _is_simulated(path.parent) and truth.is_file()
+    return ReferenceMap(path, read_cloud(path), read_tum(truth) if is_simulated else None)
+
+
+def find_reference_map(source: Path) -> ReferenceMap | None:
+    """The exact map of a simulated recording, which lies in its folder; None of any other.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    # Of a recording in KITTI's layout, the source may be sequences/NN.
+    for folder in [source, *source.resolve().parents[:2]]:
+        if (folder / REFERENCE_MAP).is_file() and _is_simulated(folder):
+            return load_reference_map(folder / REFERENCE_MAP)
+    return None
+
+
+def _is_simulated(folder: Path) -> bool:
+    readme = folder / README
+    return readme.is_file() and MADE_BY in readme.read_text(encoding="utf-8", errors="replace")

@@ -1,0 +1,1 @@
+"""Merging several recordings of one place."""

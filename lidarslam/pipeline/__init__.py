@@ -1,0 +1,1 @@
+"""The pipeline: scan, odometry, mapping, pose graph."""

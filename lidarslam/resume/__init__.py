@@ -1,0 +1,1 @@
+"""Checkpoints: saving the state of a run, and going on from it."""

@@ -1,0 +1,1 @@
+"""One run on disk: its request, files, log and summary."""

@@ -1,0 +1,128 @@
+"""What goes wrong with a sensor in the field: it is covered, carried off, hemmed in by traffic; scans are dropped.
+
+Each fault takes a simulation and gives the scans with the truth about them, so that what becomes of them can be told
+exactly.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.motion.motions import CHANNELS, Motion, Sway
+from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.world import Boxes, Mover
+
+Cover = Literal["empty", "near", "stray"]
+
+_NEAR_M = 0.3
+_STRAY_POINTS = 25
+_STRAY_M = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Faulty:
+    """A recording with a fault in it.
+
+    Attributes:
+        scans: N of them, stamps increasing.
+        truth: T_world_lidar at their stamps.
+        concerned: (N,) the scans that the fault shows in; none where it lies between two scans.
+        after: the first scan for which all is well again.
+    """
+
+    scans: tuple[Scan, ...]
+    truth: Trajectory
+    concerned: NDArray[np.bool_]
+    after: int
+
+
+def covered(simulation: Simulation, start: int, stop: int, cover: Cover, seed: int = 0) -> Faulty:
+    """Something lies over the sensor during scans `start` to `stop` - 1.
+
+    It returns nothing, echoes from within 0.3 m all around, or a few stray points.
+    """
+    rng = np.random.default_rng(seed)
+    scans = list(simulation.scans())
+    for index in range(start, stop):
+        scans[index] = _cover(scans[index], cover, rng)
+    concerned = np.zeros(len(scans), dtype=np.bool_)
+    concerned[start:stop] = True
+    return Faulty(tuple(scans), simulation.ground_truth, concerned, stop)
+
+
+def _cover(scan: Scan, cover: Cover, rng: np.random.Generator) -> Scan:
+    if cover == "empty":
+        return scan.select(np.empty(0, dtype=np.intp))
+    if cover == "near":
+        ranges = np.linalg.norm(scan.points, axis=1, keepdims=True)
+        return replace(scan, points=scan.points / ranges * rng.uniform(0.6 * _NEAR_M, _NEAR_M, (len(scan), 1)))
+    few = scan.select(np.sort(rng.choice(len(scan), _STRAY_POINTS, replace=False)))
+    return replace(few, points=rng.uniform(-_STRAY_M, _STRAY_M, (_STRAY_POINTS, 3)))
+
+
+def carried_off(simulation: Simulation, at: int, goes_on_at: int, turned_deg: float = 0.0) -> Faulty:
+    """Lifted after scan `at` - 1, and set down where the simulation is at scan `goes_on_at`, turned about its z axis.
+
+    The recording jumps from one scan to the next, and goes on from there with noise of its own.
+    """
+    T_lidar_turned = exp(np.array([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0]))
+    later = replace(simulation, T_body_lidar=simulation.T_body_lidar @ T_lidar_turned, seed=simulation.seed + 1)
+    count = min(len(simulation) - at, len(simulation) - goes_on_at)
+    stamps = simulation.stamps[: at + count]
+    there = [replace(later.scan(goes_on_at + k).scan, stamp=float(stamps[at + k])) for k in range(count)]
+    poses = [simulation.ground_truth.T_world_lidar[:at], later.ground_truth.T_world_lidar[goes_on_at:][:count]]
+    scans = (*simulation.scans(0, at), *there)
+    concerned = np.zeros(len(scans), dtype=np.bool_)
+    concerned[at] = True
+    return Faulty(scans, Trajectory(stamps, np.concatenate(poses)), concerned, at)
+
+
+def index_back(simulation: Simulation, index: int, distance_m: float) -> int:
+    """The scan, of those before `index`, whose place is nearest to so far from that of the scan before `index`."""
+    positions = simulation.ground_truth.positions
+    away = np.linalg.norm(positions[:index] - positions[index - 1], axis=1)
+    return int(np.abs(away - distance_m).argmin())
+
+
+def dropped(simulation: Simulation, missing: Collection[int]) -> Faulty:
+    """Some scans never came."""
+    kept = [index for index in range(len(simulation)) if index not in missing]
+    scans = tuple(simulation.scan(index).scan for index in kept)
+    after = sum(index < min(missing) for index in kept)
+    truth = Trajectory(simulation.stamps[kept], simulation.ground_truth.T_world_lidar[kept])
+    return Faulty(scans, truth, np.zeros(len(kept), dtype=np.bool_), after)
+
+
+def standing_still(position: FloatArray, yaw: float, sensor_height_m: float) -> Motion:
+    """A body that stays at a place (3,) on the ground."""
+    base = np.zeros((3, len(CHANNELS)))
+    base[:, :3], base[:, 5] = position, yaw
+    return Motion("still", np.array([0.0, 1.0, 2.0]), base, Sway(), sensor_height_m, repeats=False)
+
+
+def passing_by(
+    place: FloatArray, yaw: float, size: FloatArray, beside_m: FloatArray, speed_mps: float, reach_m: float
+) -> tuple[Mover, ...]:
+    """Boxes that go up and down beside a place (3,) on the ground, along a heading.
+
+    Args:
+        place, yaw: where, and which way they go.
+        size: (3,) length, width and height of each.
+        beside_m: (K,) how far to the left of the place each goes.
+        speed_mps: of each, some faster and some slower by up to a fifth.
+        reach_m: how far ahead and behind they turn back.
+    """
+    body = Boxes(np.array([[0.0, 0.0, 0.5 * size[2] + 0.1]]), 0.5 * size[None], np.eye(3)[None])
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    movers = []
+    for number, beside in enumerate(beside_m):
+        ends = place + beside * left + np.array([[-reach_m], [reach_m]]) * ahead
+        speed = speed_mps * (0.8 + 0.4 * ((0.618 * number) % 1.0))
+        movers.append(Mover(body, ends, speed, 4.0 * reach_m * ((0.382 * number) % 1.0)))
+    return tuple(movers)

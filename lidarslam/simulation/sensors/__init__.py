@@ -1,0 +1,1 @@
+"""LiDAR models: scan patterns and noise."""

@@ -1,0 +1,148 @@
+"""The sensors there are, after their manuals and data sheets; ring 0 is where the driver has it.
+
+Rates are 10 Hz throughout. Noise close by is the precision (one sigma) where it is published and half the stated
+accuracy where it is not; its growth with range is what the published figures for near and far suggest. Ouster's rays
+start at the sensor's origin, as everybody's here, not on the real circle of 16 to 28 mm around it.
+"""
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.sensors.scan_patterns import Rosette, Spinning
+from lidarslam.simulation.sensors.sensor import RangeModel, Sensor
+
+# Altitude angles of one OS0-64 and one OS1-128, from their own metadata as published with the Ouster SDK.
+_OS0_64_DEG = np.array([
+    45.85, 44.07, 42.82, 41.05, 39.80, 38.06, 36.81, 35.09, 33.81, 32.14, 30.85, 29.20, 27.92, 26.28, 24.97, 23.38,
+    22.07, 20.49, 19.17, 17.62, 16.28, 14.77, 13.41, 11.92, 10.55, 9.10, 7.70, 6.28, 4.85, 3.47, 2.02, 0.66,
+    -0.81, -2.15, -3.64, -4.96, -6.47, -7.78, -9.30, -10.61, -12.15, -13.42, -15.00, -16.26, -17.86, -19.11, -20.73,
+    -21.97, -23.61, -24.85, -26.51, -27.73, -29.41, -30.63, -32.33, -33.54, -35.27, -36.47, -38.25, -39.43, -41.23,
+    -42.43, -44.28, -45.46,
+])  # fmt: skip
+_OS1_128_DEG = np.array([
+    20.95, 20.67, 20.36, 20.03, 19.73, 19.41, 19.11, 18.76, 18.47, 18.14, 17.82, 17.50, 17.19, 16.86, 16.53, 16.20,
+    15.89, 15.56, 15.23, 14.90, 14.57, 14.23, 13.90, 13.57, 13.25, 12.91, 12.57, 12.22, 11.90, 11.55, 11.20, 10.87,
+    10.54, 10.18, 9.84, 9.51, 9.15, 8.81, 8.47, 8.11, 7.78, 7.43, 7.08, 6.74, 6.39, 6.04, 5.70, 5.34,
+    4.98, 4.64, 4.29, 3.93, 3.58, 3.24, 2.88, 2.53, 2.17, 1.82, 1.47, 1.12, 0.78, 0.41, 0.07, -0.28,
+    -0.64, -0.99, -1.35, -1.70, -2.07, -2.40, -2.75, -3.11, -3.46, -3.81, -4.15, -4.50, -4.86, -5.22, -5.57, -5.90,
+    -6.27, -6.61, -6.97, -7.30, -7.67, -8.01, -8.35, -8.69, -9.05, -9.38, -9.71, -10.07, -10.42, -10.76, -11.09,
+    -11.43, -11.78, -12.12, -12.46, -12.78, -13.15, -13.46, -13.80, -14.12, -14.48, -14.79, -15.11, -15.46, -15.79,
+    -16.12, -16.45, -16.76, -17.11, -17.44, -17.74, -18.06, -18.39, -18.72, -19.02, -19.32, -19.67, -19.99, -20.27,
+    -20.57, -20.92, -21.22, -21.54, -21.82,
+])  # fmt: skip
+
+
+def _one_column(elevations_deg: FloatArray, columns: int, start_azimuth_deg: float, slot: float) -> Spinning:
+    """Lasers straight above one another, one pair after the other firing: the lower half's and the upper half's.
+
+    That is Velodyne's order: -15, 1, -13, 3, ... degrees for the VLP-16. `slot` is the part of a column's time that
+    the firing takes, the rest is for recharging.
+    """
+    half = len(elevations_deg) // 2
+    rank = np.concatenate([2 * np.arange(half), 2 * np.arange(half) + 1])
+    firing = np.asarray(slot * rank / len(elevations_deg), dtype=np.float64)
+    return Spinning(elevations_deg, np.zeros(2 * half), firing, columns, start_azimuth_deg)
+
+
+def _velodyne_64(columns: int, elevation_offsets_deg: FloatArray | float = 0.0) -> Spinning:
+    """HDL-64E S2: an upper block with a third and a lower one with half a degree between the lasers.
+
+    The lasers stand side by side in groups, about 3.2 degrees apart, as the calibration files that come with the
+    devices show; both blocks fire at the same time.
+
+    Args:
+        columns: number of columns in a turn.
+        elevation_offsets_deg: (64,) calibrated minus nominal elevation of each laser, from the highest down.
+    """
+    upper = np.linspace(2.0, -8.33, 32)
+    lower = np.linspace(-8.83, -24.33, 32)
+    elevations = np.concatenate([upper, lower]) + elevation_offsets_deg
+    side_by_side = np.array([7.9, 4.7, 1.5, -1.9, -5.1, -8.4, 9.1, 5.8, 2.6, -0.7, -3.9, -7.2])
+    offsets = np.concatenate([side_by_side[(np.arange(32) + 8) % 12], side_by_side[np.arange(32) % 12]])
+    firing = np.tile(np.linspace(0.0, 31.0 / 32.0, 32), 2)
+    return Spinning(elevations[::-1], offsets[::-1], firing[::-1], columns)
+
+
+def _calibration_offsets_deg(lasers: int, sigma_deg: float, largest_deg: float, seed: int) -> FloatArray:
+    """Made-up offsets (lasers,) of a device's elevations from the nominal ones: normal, clipped, the same every time.
+
+    Calibration files of real HDL-64E have offsets of this size; these are not those of any device.
+    """
+    drawn = sigma_deg * np.random.default_rng(seed).standard_normal(lasers)
+    return np.asarray(np.clip(drawn, -largest_deg, largest_deg))
+
+
+def _ouster(altitudes_deg: FloatArray, azimuths_deg: list[float], columns: int) -> Spinning:
+    """Ouster: all lasers of a column fire together; azimuth angles repeat and count clockwise, as in its metadata."""
+    offsets = -np.resize(azimuths_deg, len(altitudes_deg))
+    return Spinning(altitudes_deg, offsets, np.zeros(len(altitudes_deg)), columns)
+
+
+def _hesai_32(columns: int) -> Spinning:
+    """XT32: 15 to -16 degrees in steps of one, 1.512 us from laser to laser, 50 us from column to column."""
+    firing = np.asarray(1.512 * np.arange(32) / 50.0, dtype=np.float64)
+    return Spinning(np.arange(15.0, -17.0, -1.0), np.zeros(32), firing, columns, start_azimuth_deg=90.0)
+
+
+# Range limits: VLP-16 100 m, HDL-32E 80 to 100 m, HDL-64E 120 m, OS0 50 m and OS1 120 m at 80 % reflectivity,
+# XT32 120 m, Mid-360 70 m at 80 %. Velodyne's packets count 2 mm, Hesai's 4 mm, Ouster's and Livox's 1 mm.
+_TABLE = (
+    Sensor(  # 55.296 us a column of 16 lasers 2.304 us apart (User Manual 63-9243), rounded to 0.2 degrees
+        "vlp-16",
+        "velodyne",
+        10.0,
+        _one_column(np.arange(-15.0, 16.0, 2.0), 1800, 0.0, 16 * 2.304 / 55.296),
+        RangeModel(0.4, 100.0, 0.010, 0.00020, 0.0030, 0.002),
+    ),
+    Sensor(  # 46.08 us a column of 32 lasers 1.152 us apart
+        "hdl-32e",
+        "velodyne",
+        10.0,
+        _one_column(np.linspace(-30.67, 10.67, 32), 2170, 0.0, 32 * 1.152 / 46.08),
+        RangeModel(0.5, 100.0, 0.010, 0.00020, 0.0030, 0.002),
+    ),
+    Sensor(  # 48 us a column; KITTI's starts each turn at the rear
+        "hdl-64e",
+        "velodyne",
+        10.0,
+        _velodyne_64(2083),
+        RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002),
+    ),
+    Sensor(  # the same with uneven rings, as every real one has
+        "hdl-64e-calibrated",
+        "velodyne",
+        10.0,
+        _velodyne_64(2083, _calibration_offsets_deg(64, sigma_deg=0.06, largest_deg=0.12, seed=64)),
+        RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002),
+    ),
+    Sensor(
+        "os0-64",
+        "ouster",
+        10.0,
+        _ouster(_OS0_64_DEG, [9.2, -3.0], 1024),
+        RangeModel(0.3, 50.0, 0.010, 0.00050, 0.0061, 0.001),
+    ),
+    Sensor(  # the first generation's design values: 33.2 degrees
+        "os1-64",
+        "ouster",
+        10.0,
+        _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024),
+        RangeModel(0.5, 120.0, 0.010, 0.00025, 0.0031, 0.001),
+    ),
+    Sensor(
+        "os1-128",
+        "ouster",
+        10.0,
+        _ouster(_OS1_128_DEG, [4.21, 1.41, -1.40, -4.21], 1024),
+        RangeModel(0.3, 120.0, 0.008, 0.00025, 0.0031, 0.001),
+    ),
+    Sensor("xt32", "hesai", 10.0, _hesai_32(2000), RangeModel(0.1, 120.0, 0.005, 0.00010, 0.0017, 0.004)),
+    Sensor(  # after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
+        "livox",
+        "livox",
+        10.0,
+        Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5),
+        RangeModel(0.1, 70.0, 0.010, 0.00025, 0.0030, 0.001),
+    ),
+)
+SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in _TABLE}

@@ -1,0 +1,1 @@
+"""Worlds in the open: park, forest, fields."""

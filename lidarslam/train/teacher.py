@@ -1,0 +1,42 @@
+"""Self-training: the trajectory that scan-to-map registration finds without any network teaches the network."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidarslam.core.geometry import FloatArray, exp, inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from mapping.config import MappingConfig
+from mapping.mapper import Mapper
+from mapping.prediction import Prior
+from odometry.images.sweep_images import middle_offset_s
+from odometry.training.preparation import PreparedRecording
+
+
+class MapTeacher:
+    """Follows a recording by mapping at constant velocity, scan after scan."""
+
+    def __init__(self) -> None:
+        self._mapper = Mapper(MappingConfig())
+        self._T_world_middle: list[FloatArray] = []
+        self._sure: list[bool] = []
+
+    def follow(self, scan: Scan) -> None:
+        """Register the next scan; empty ones are not taught."""
+        mapped = self._mapper.process(scan, Prior())
+        state = mapped.state
+        self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * middle_offset_s(scan)))
+        # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.
+        self._sure.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
+
+    def taught(self, recording: PreparedRecording) -> PreparedRecording:
+        """The recording of the scans that were followed, with the motions between the middles of sweeps on the map.
+
+        A motion is taught where both poses have the status ok.
+        """
+        T = np.stack(self._T_world_middle)
+        T_prev_curr = inverse(T[:-1]) @ T[1:]
+        sure = torch.tensor(self._sure)
+        return replace(recording, T_prev_curr=torch.from_numpy(T_prev_curr).float(), believed=sure[:-1] & sure[1:])

@@ -1,0 +1,1 @@
+"""Rerun and pictures."""

@@ -1,0 +1,86 @@
+"""The loops over points and voxels behind `GlobalMap`, compiled.
+
+A row of sums is (7,) float32: position within the voxel, direction it was seen from, number of points. Keys are those
+of `mapping.surfels.cell_kernels`.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+from mapping.surfels.cell_kernels import cell_of, key_of
+
+Keys = NDArray[np.int64]
+Sums = NDArray[np.float32]
+
+
+@compiled
+def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Sums) -> None:
+    """Write keys (N,) and rows (N, 7) of the points (N, 3) of a scan, in the LiDAR frame."""
+    T, sensor = T_world_lidar, T_world_lidar[:3, 3]
+    for n in range(len(points)):
+        a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        u, v, w = sensor[0] - x, sensor[1] - y, sensor[2] - z
+        distance = math.sqrt(u * u + v * v + w * w)
+        i, j, k = cell_of(x / voxel_size_m), cell_of(y / voxel_size_m), cell_of(z / voxel_size_m)
+        keys[n] = key_of(i, j, k)
+        # Within the voxel float32 is exact enough.
+        sums[n, 0], sums[n, 1], sums[n, 2] = x - i * voxel_size_m, y - j * voxel_size_m, z - k * voxel_size_m
+        sums[n, 3], sums[n, 4], sums[n, 5], sums[n, 6] = u / distance, v / distance, w / distance, 1.0
+
+
+@compiled
+def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, unique: Keys, totals: Sums) -> int:
+    """Write the keys (M,) and the sums (M, 7) of the rows of equal keys (N,), given an order that sorts these.
+
+    Returns:
+        M.
+    """
+    count = 0
+    for n in range(len(order)):
+        row = order[n]
+        if count == 0 or keys[row] != unique[count - 1]:
+            unique[count] = keys[row]
+            totals[count] = sums[row]
+            count += 1
+        else:
+            _add(sums, row, totals, count - 1)
+    return count
+
+
+@compiled
+def merge(keys: Keys, sums: Sums, other_keys: Keys, other_sums: Sums, unique: Keys, totals: Sums) -> int:
+    """Write the keys (M,) and the sums (M, 7) of two tables, each sorted by keys that occur once.
+
+    Returns:
+        M.
+    """
+    count, i, j = 0, 0, 0
+    while i < len(keys) or j < len(other_keys):
+        here = i < len(keys) and (j == len(other_keys) or keys[i] <= other_keys[j])
+        there = j < len(other_keys) and (i == len(keys) or other_keys[j] <= keys[i])
+        if here:
+            unique[count] = keys[i]
+            totals[count] = sums[i]
+            i += 1
+        if there:
+            if here:
+                _add(other_sums, j, totals, count)
+            else:
+                unique[count] = other_keys[j]
+                totals[count] = other_sums[j]
+            j += 1
+        count += 1
+    return count
+
+
+@compiled
+def _add(sums: Sums, row: int, totals: Sums, total: int) -> None:
+    for column in range(7):
+        totals[total, column] += sums[row, column]

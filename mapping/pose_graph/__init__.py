@@ -1,0 +1,1 @@
+"""The pose graph: keyframes, edges, optimisation."""

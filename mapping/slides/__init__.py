@@ -1,0 +1,1 @@
+"""Detecting maps that contradict themselves."""

@@ -1,0 +1,1 @@
+"""The surfel map and its compiled loops."""

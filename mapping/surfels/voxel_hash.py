@@ -1,0 +1,92 @@
+"""A hash table from cells of a grid to rows of arrays, whole arrays of keys at a time."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from mapping.surfels import cell_kernels as kernels
+from mapping.surfels.cell_kernels import ABSENT, Keys, Rows
+
+__all__ = ["ABSENT", "Keys", "Rows", "VoxelTable", "cell_keys", "key_cells", "key_steps", "point_keys"]
+
+_STRIDES = np.array([kernels.STRIDE_X, kernels.STRIDE_Y, 1], dtype=np.int64)
+
+_LARGEST_LOAD = 0.4
+_FIRST_BITS = 14
+
+
+def cell_keys(cells: NDArray[np.int64]) -> Keys:
+    """Keys (...) of cells (..., 3)."""
+    return np.asarray(cells @ _STRIDES + kernels.ORIGIN, dtype=np.int64)
+
+
+def key_cells(keys: Keys) -> NDArray[np.int64]:
+    """Cells (..., 3) of keys (...)."""
+    mask = (1 << kernels.BITS) - 1
+    shifted = [keys >> (2 * kernels.BITS), keys >> kernels.BITS, keys]
+    return np.stack([part & mask for part in shifted], axis=-1) - kernels.OFFSET
+
+
+def point_keys(points: FloatArray, cell_m: float) -> Keys:
+    """Keys (N,) of the cells that points (N, 3) lie in."""
+    keys = np.empty(len(points), dtype=np.int64)
+    kernels.point_keys(np.ascontiguousarray(points), cell_m, keys)
+    return keys
+
+
+def key_steps(offsets: NDArray[np.int64]) -> Keys:
+    """What to add to a cell's key to get that of the cell `offsets` (..., 3) away."""
+    return np.asarray(offsets @ _STRIDES, dtype=np.int64)
+
+
+class VoxelTable:
+    """Open addressing with linear probing; rows are numbered in the order of their first insertion."""
+
+    def __init__(self) -> None:
+        self._bits = _FIRST_BITS
+        self._keys = np.full(1 << self._bits, kernels.EMPTY, dtype=np.int64)
+        self._rows = np.zeros(1 << self._bits, dtype=np.int32)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def slots(self) -> tuple[int, Keys, Rows]:
+        """How many bits a slot's number has, and the keys and rows in the slots, as `cell_kernels` have them."""
+        return self._bits, self._keys, self._rows
+
+    def find(self, keys: Keys) -> Rows:
+        """Rows (...) of keys (...), `ABSENT` where there is none."""
+        rows = np.empty(keys.size, dtype=np.int32)
+        kernels.find(np.ascontiguousarray(keys).reshape(-1), *self.slots, rows)
+        return rows.reshape(keys.shape)
+
+    def insert(self, keys: Keys) -> Rows:
+        """Rows (N,) of keys (N,), new ones for keys that are not there yet; keys may repeat."""
+        rows, done = np.empty(len(keys), dtype=np.int32), 0
+        keys = np.ascontiguousarray(keys)
+        while True:
+            most = int(_LARGEST_LOAD * (1 << self._bits))
+            done, self._count = kernels.insert(keys, done, self._count, most, *self.slots, rows)
+            if done == len(keys):
+                return rows
+            self._grow()
+
+    def rebuild(self, keys: Keys) -> None:
+        """Hold these unique keys (N,) instead, in rows 0 to N-1."""
+        self._count = len(keys)
+        self._bits = _FIRST_BITS
+        while len(keys) > _LARGEST_LOAD * (1 << self._bits):
+            self._bits += 1
+        self._fill(np.ascontiguousarray(keys), np.arange(len(keys), dtype=np.int32))
+
+    def _grow(self) -> None:
+        used = np.flatnonzero(self._keys != kernels.EMPTY)
+        self._bits += 1
+        self._fill(self._keys[used], self._rows[used])
+
+    def _fill(self, keys: Keys, rows: Rows) -> None:
+        self._keys = np.full(1 << self._bits, kernels.EMPTY, dtype=np.int64)
+        self._rows = np.zeros(1 << self._bits, dtype=np.int32)
+        kernels.place(keys, rows, *self.slots)

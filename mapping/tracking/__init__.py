@@ -1,0 +1,1 @@
+"""Tracking state, registration attempts and relocalisation."""

@@ -1,0 +1,1 @@
+"""Point-to-plane alignment of range images."""

@@ -1,0 +1,1 @@
+"""Range images, normals and bird's-eye grids."""

@@ -1,0 +1,222 @@
+"""KISS-ICP (Vizzo et al., RA-L 2023) behind the odometry protocol.
+
+Two things differ from calling the library: it runs in a child process, because it aborts on some inputs; and its pose,
+which belongs to the end of the sweep, is expressed at the scan's stamp.
+"""
+
+import contextlib
+import fcntl
+import json
+import logging
+import subprocess
+import sys
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from lidarslam.core.errors import LidarSlamError
+from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved, State
+from odometry.config import KissConfig
+from odometry.interface import Motion
+from odometry.methods.kiss_worker import READY, REPLY_FLOATS, REQUEST_HEADER, read_array
+
+_log = logging.getLogger(__name__)
+
+# Fewer points do not fix six degrees of freedom, and one alone makes the library abort.
+_MIN_POINTS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class _TimedPose:
+    """KISS-ICP's pose and the instant it belongs to."""
+
+    time: float
+    T_map_lidar: FloatArray
+
+
+class OdometryError(LidarSlamError):
+    """A method cannot work on this machine."""
+
+
+class _Worker:
+    """The child process.
+
+    Raises:
+        OdometryError: it did not start.
+    """
+
+    def __init__(self, settings: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "odometry.methods.kiss_worker", settings],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            cwd=Path(__file__).resolve().parents[2],  # a folder called odometry where the user stands must not win
+        )
+        _widen(cast(FileIO, self._process.stdin))
+        if cast(FileIO, self._process.stdout).read(1) != READY:
+            raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?")
+
+    def register(self, points: FloatArray, stamps: FloatArray) -> FloatArray:
+        """Send one scan, wait for the reply (17,).
+
+        Raises:
+            EOFError, OSError: the child died.
+        """
+        stdin, stdout = cast(FileIO, self._process.stdin), cast(FileIO, self._process.stdout)
+        for part in (REQUEST_HEADER.pack(len(points), len(stamps)), _bytes(points), _bytes(stamps)):
+            view = memoryview(part)
+            while view:
+                view = view[stdin.write(view) :]
+        return read_array(stdout, (REPLY_FLOATS,))
+
+    def close(self) -> int:
+        """End the child; its exit status, negative for the signal that ended it."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        try:
+            return self._process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+
+class KissOdometry:
+    """KISS-ICP, untouched, with motions between the stamps of consecutive scans."""
+
+    def __init__(self, config: KissConfig) -> None:
+        self._settings = json.dumps(_library_settings(config))
+        self._deskews = config.deskew
+        self._worker: _Worker | None = _Worker(self._settings)
+        self._registered = 0  # scans in the child's map
+        self._last: _TimedPose | None = None  # the child's last pose, at the time it belongs to
+        self._previous: _TimedPose | None = None  # the previous scan, at its stamp
+        self._velocity = np.zeros(6)
+
+    def estimate(self, scan: Scan) -> Motion:
+        """Register one scan. One that KISS-ICP cannot take gives the last velocity again, and says why."""
+        if len(scan) < _MIN_POINTS:
+            return self._predict(scan.stamp, f"{len(scan)} points are too few to register")
+        offsets = self._usable_offsets(scan)
+        try:
+            if self._worker is None:
+                self._worker = _Worker(self._settings)
+            reply = self._worker.register(scan.points, np.empty(0) if offsets is None else offsets)
+        except (EOFError, OSError):
+            return self._predict(scan.stamp, self._bury_worker())
+        pose = _TimedPose(self._pose_time(scan.stamp, offsets), reply[:16].reshape(4, 4))
+        last, self._last = self._last, pose
+        self._registered += 1
+        if last is None:
+            return self._begin(_TimedPose(scan.stamp, pose.T_map_lidar))
+        return Motion(self._motion(last, pose, scan.stamp), int(reply[16]))
+
+    def state(self) -> State | None:
+        """None: the library does not give its state away."""
+        return None
+
+    def restore(self, saved: Saved) -> None:
+        """There is no state to go on from.
+
+        Raises:
+            InputError: always.
+        """
+        raise saved.refuse("KISS-ICP has no state")
+
+    def close(self) -> None:
+        """End the child process."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
+    def _usable_offsets(self, scan: Scan) -> FloatArray | None:
+        """The scan's times if the library can divide by their span, else None (it then does not deskew)."""
+        if not self._deskews or scan.time_offsets is None or np.ptp(scan.time_offsets) <= 0.0:
+            return None
+        return scan.time_offsets
+
+    def _pose_time(self, stamp: float, offsets: FloatArray | None) -> float:
+        """The instant KISS-ICP's next pose belongs to.
+
+        It moves every point to the end of the sweep with the motion before. The first two scans come before any
+        motion is known and stay smeared over the sweep: what is registered then is the sweep's middle.
+        """
+        if offsets is None:
+            return stamp
+        if self._registered < 2:
+            return stamp + 0.5 * float(offsets.min() + offsets.max())
+        return stamp + float(offsets.max())
+
+    def _motion(self, last: _TimedPose, pose: _TimedPose, stamp: float) -> FloatArray:
+        """T_prev_curr between the last two stamps, at constant velocity between the child's last two poses."""
+        assert self._previous is not None
+        previous = self._previous
+        interval = pose.time - last.time
+        if interval > 0.0:
+            self._velocity = log(inverse(last.T_map_lidar) @ pose.T_map_lidar) / interval
+        if self._registered == 2:  # only now is there a velocity that says where the first stamp was
+            previous = self._at(previous.time, last)
+        self._previous = self._at(stamp, pose)
+        return inverse(previous.T_map_lidar) @ self._previous.T_map_lidar
+
+    def _at(self, time: float, pose: _TimedPose) -> _TimedPose:
+        """Where the sensor was at a time close to a pose, at the current velocity."""
+        return _TimedPose(time, pose.T_map_lidar @ exp(self._velocity * (time - pose.time)))
+
+    def _begin(self, first: _TimedPose) -> Motion:
+        """The first scan of a map; nothing tells how it lies to the scans before, if there were any."""
+        previous, self._previous = self._previous, first
+        if previous is None:
+            return Motion(np.eye(4), 0)
+        T_prev_curr = exp(self._velocity * (first.time - previous.time))
+        return Motion(T_prev_curr, 0, "first scan in KISS-ICP's new map: the motion is a prediction")
+
+    def _predict(self, stamp: float, failure: str) -> Motion:
+        """The motion at the last velocity; the next scan registered is measured from where it leads."""
+        if self._previous is None:
+            return Motion(np.eye(4), 0, failure)
+        previous, self._previous = self._previous, self._at(stamp, self._previous)
+        return Motion(inverse(previous.T_map_lidar) @ self._previous.T_map_lidar, 0, failure)
+
+    def _bury_worker(self) -> str:
+        """After the child died: say so; the next scan begins an empty map."""
+        status = self._worker.close() if self._worker is not None else 0
+        self._worker, self._last, self._registered = None, None, 0
+        message = f"KISS-ICP's process ended (status {status}); it starts again with an empty map"
+        _log.warning(message)
+        return message
+
+
+def _widen(pipe: FileIO) -> None:
+    """Let a pipe hold more than the usual 64 kB: a scan in three pieces instead of fifty saves the switching."""
+    with contextlib.suppress(AttributeError, OSError):  # Linux alone can, and may have a lower limit
+        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 1 << 20)
+
+
+def _bytes(array: FloatArray) -> memoryview | bytes:
+    """An array's bytes, row by row, without a copy where it lies so in memory."""
+    return np.ascontiguousarray(array).data.cast("B") if array.size else b""
+
+
+def _library_settings(config: KissConfig) -> dict[str, dict[str, object]]:
+    voxel_size = config.voxel_size_m or config.max_range_m / 100.0
+    return {
+        "data": {"max_range": config.max_range_m, "min_range": config.min_range_m, "deskew": config.deskew},
+        "mapping": {"voxel_size": voxel_size, "max_points_per_voxel": config.max_points_per_voxel},
+        "registration": {
+            "max_num_iterations": config.max_iterations,
+            "convergence_criterion": config.convergence,
+            "max_num_threads": config.threads,
+        },
+        "adaptive_threshold": {
+            "initial_threshold": config.initial_threshold_m,
+            "min_motion_th": config.min_motion_m,
+            "fixed_threshold": config.fixed_threshold_m,
+        },
+    }

@@ -1,0 +1,193 @@
+"""Candidates of the motion between two scans: the highest peaks of the scores that the default network gives.
+
+Each peak of the scores of turns is followed; the current scan, seen from above and turned by it, is
+correlated with the previous one over all shifts by the fast Fourier transform, and each peak there is a candidate.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lidarslam.core.geometry import FloatArray
+from odometry.images.bird_eye import MOST_CELLS, SHIFTS, bird_eye
+
+Floats = NDArray[np.float32]
+
+# Turns and shifts that are followed, and the least probability beside the best one's.
+_TURNS, _SHIFT_PEAKS = 2, 3
+_LEAST_PROBABILITY = 0.02
+# Scores this near a peak belong to it: feature columns, cells.
+_NEAR_COLUMNS, _NEAR_CELLS = 6, 4
+_NEVER = np.float32(-1e4)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A motion that is possible by a network's scores.
+
+    Attributes:
+        T_prev_curr: (4, 4).
+        covariance: (6, 6) of a change of it from the left, rotation first.
+        log_probability: natural logarithm; of all candidates of a pair together at most 0.
+    """
+
+    T_prev_curr: FloatArray
+    covariance: FloatArray
+    log_probability: float
+
+    def is_motion(self) -> bool:
+        """Whether all of it is finite."""
+        variances = np.diag(self.covariance)
+        return bool(np.isfinite(self.T_prev_curr).all() and np.isfinite(variances).all() and (variances > 0.0).all())
+
+
+_NO_MOTION = Candidate(np.full((4, 4), np.nan), np.full((6, 6), np.nan), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """What is kept of a scan to compare the next one with.
+
+    Attributes:
+        columns: (1, C, H', W') features of the range image.
+        spectrum: (F, CELLS, CELLS / 2 + 1) of the features seen from above.
+        heading: angle by which the scan was turned for these, radians. It follows the sensor's turns, so that each scan
+            has to be seen from above only once.
+    """
+
+    columns: Floats
+    spectrum: NDArray[np.complex64]
+    heading: float
+
+
+class Search(Protocol):
+    """Finds candidates of the motion from one scan to the next."""
+
+    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
+        """A scan (3, H, W), points and normals, by itself."""
+
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
+        """The candidates, the most probable first, of the motion of a scan (3, H, W), and what is kept of it."""
+
+
+class Graphs(Protocol):
+    """The parts of the network `correlation`, on one scan or one pair at a time, in float32."""
+
+    def columns(self, points: Floats, normals: Floats) -> Floats:
+        """(1, 3, H, W) twice -> (1, C, H', W')."""
+
+    def turn_scores(self, previous: Floats, current: Floats) -> Floats:
+        """(1, C, H', W') twice -> (1, W')."""
+
+    def bird(self, grid: Floats) -> Floats:
+        """(1, CHANNELS, CELLS, CELLS) -> (1, F, CELLS, CELLS)."""
+
+    def peaks(self, turn_scores: Floats, shift_scores: Floats) -> tuple[float, Floats, Floats]:
+        """(1, W') and (1, SHIFTS, SHIFTS) -> turn, radians; shift (2,), metres; log sigma (6,)."""
+
+
+class CorrelationSearch:
+    """The search with the network `correlation`; implements `Search`."""
+
+    def __init__(self, graphs: Graphs) -> None:
+        self._graphs = graphs
+
+    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
+        """See `Search`."""
+        columns = self._graphs.columns(points[None], normals[None])
+        return Described(columns, self._spectrum(points, normals, heading), heading)
+
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
+        """See `Search`."""
+        columns = self._graphs.columns(points[None], normals[None])
+        turn_scores = self._graphs.turn_scores(previous.columns, columns)
+        found: list[tuple[float, Candidate, Described]] = []
+        for turns in _peaks(turn_scores, _TURNS, _NEAR_COLUMNS):
+            angle = float(turns[0].argmax()) * (2.0 * math.pi / turns.shape[1])
+            heading = math.remainder(previous.heading + angle, 2.0 * math.pi)
+            current = Described(columns, self._spectrum(points, normals, heading), heading)
+            shift_scores = _shift_scores(previous.spectrum, current.spectrum)
+            for shifts in _peaks(shift_scores, _SHIFT_PEAKS, _NEAR_CELLS):
+                # Of both correlations together: a wrong turn has no high peak among the shifts.
+                score = float(turns.max() + shifts.max())
+                found.append((score, self._candidate(previous, turns, shifts), current))
+        if not found:  # weights can be finite, and what they make of a scan is not a number
+            return (_NO_MOTION,), Described(columns, previous.spectrum, previous.heading)
+        found.sort(key=lambda one: -one[0])
+        scores = np.array([score for score, _, _ in found])
+        log_probabilities = scores - np.logaddexp.reduce(scores)
+        kept = tuple(
+            replace(one, log_probability=float(log_probability))
+            for (_, one, _), log_probability in zip(found, log_probabilities, strict=True)
+            if log_probability >= log_probabilities[0] + math.log(_LEAST_PROBABILITY)
+        )
+        return kept, found[0][2]
+
+    def _spectrum(self, points: Floats, normals: Floats, heading: float) -> NDArray[np.complex64]:
+        features = self._graphs.bird(bird_eye(points, normals, heading)[None])[0]
+        return np.asarray(fft.rfft2(features), dtype=np.complex64)
+
+    def _candidate(self, previous: Described, turns: Floats, shifts: Floats) -> Candidate:
+        angle, shift, log_sigma = self._graphs.peaks(turns, shifts)
+        # The shift is seen in the frame of the previous grid, which is turned by its heading.
+        c, s = math.cos(previous.heading), math.sin(previous.heading)
+        back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        T = np.eye(4)
+        T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        T[:3, 3] = back @ [shift[0], shift[1], 0.0]
+        axes = np.zeros((6, 6))
+        axes[:3, :3], axes[3:, 3:] = back, back
+        variances = np.exp(2.0 * log_sigma.astype(np.float64))
+        return Candidate(T, axes @ np.diag(variances) @ axes.T, 0.0)
+
+
+class WholePairs:
+    """The search with a network that sees nothing but pairs: its one motion is the only candidate; implements `Search`.
+
+    Args:
+        network: (1, 6, H, W) points and normals of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
+    """
+
+    def __init__(self, network: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> None:
+        self._network = network
+
+    def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
+        """The image itself."""
+        return Described(np.concatenate([points, normals])[None], np.zeros((0, 0, 0), dtype=np.complex64), heading)
+
+    def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
+        """See `Search`."""
+        current = self.describe(points, normals)
+        T_prev_curr, log_sigma = self._network(previous.columns, current.columns)
+        variances = np.exp(2.0 * log_sigma[0].astype(np.float64))
+        return (Candidate(T_prev_curr[0].astype(np.float64), np.diag(variances), 0.0),), current
+
+
+def _shift_scores(previous: NDArray[np.complex64], current: NDArray[np.complex64]) -> Floats:
+    """(1, SHIFTS, SHIFTS) correlation of features with these spectra, with the current scan shifted along y and x."""
+    product = np.einsum("fij,fij->ij", previous, current.conj())
+    scores = fft.irfft2(product)
+    scores = np.roll(scores, (MOST_CELLS, MOST_CELLS), (0, 1))[:SHIFTS, :SHIFTS]
+    return np.ascontiguousarray(scores[None], dtype=np.float32)
+
+
+def _peaks(scores: Floats, most: int, near: int) -> list[Floats]:
+    """The scores (1, S) of turns or (1, S, S) of shifts, again and again without what lies near the peaks before."""
+    found: list[Floats] = []
+    best = float(scores.max())
+    left = scores
+    while len(found) < most and float(left.max()) > best + math.log(_LEAST_PROBABILITY):
+        found.append(left)
+        left = left.copy()
+        peak = np.unravel_index(int(left[0].argmax()), left[0].shape)
+        if len(peak) == 1:
+            left[0][np.arange(peak[0] - near, peak[0] + near + 1) % left.shape[1]] = _NEVER
+        else:
+            rows, columns = (slice(max(0, i - near), i + near + 1) for i in peak)
+            left[0][rows, columns] = _NEVER
+    return found

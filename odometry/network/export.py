@@ -1,0 +1,168 @@
+"""A trained network as ONNX: for inference without torch, and for other programs.
+
+The default network becomes one graph for each of its parts; between them only the fast Fourier transform is left to do,
+see `odometry.network.candidates`. Other networks are one graph of pairs.
+"""
+
+import json
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from lidarslam.core.errors import ConfigError, OutputError
+from odometry.images import bird_eye
+from odometry.images.bird_eye import SHIFTS
+from odometry.network.checkpoint import Checkpoint, network_of
+from odometry.network.correlation import CorrelationNetwork, PairImages
+from odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
+
+# Not a size of anything else, so that no dimension is taken for another.
+_EXAMPLE_BATCH = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """One file: a module, examples of its inputs, and the names of inputs and outputs."""
+
+    name: str
+    module: nn.Module
+    inputs: tuple[Tensor, ...]
+    takes: Sequence[str]
+    gives: Sequence[str]
+
+
+class _Turns(nn.Module):
+    """(B, C, H', W') features of two scans -> (B, W') scores of turns."""
+
+    def __init__(self, network: CorrelationNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Correlate."""
+        return self.network.turn_scores(previous, current)
+
+
+class _Pairs(nn.Module):
+    """(B, 6, H, W) points and normals of two scans -> motion (B, 4, 4), log sigma (B, 6)."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, previous: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
+        """Compare."""
+        estimate = self.network(PairImages(previous, current))
+        return estimate.T_prev_curr, estimate.log_sigma
+
+
+def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
+    """Write the graphs and a description into a folder, which `--weights` takes.
+
+    The number of scans and pairs stays free, the size of the images does not.
+
+    Raises:
+        ConfigError: the packages for it are not installed.
+        OutputError: the folder cannot be written.
+    """
+    _require_packages()
+    graphs = _graphs(checkpoint)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=out) as workplace:
+            folder = Path(workplace)
+            for graph in graphs:
+                _write(graph, folder / graph.name)
+            description = describe(checkpoint.network, checkpoint.images)
+            (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+            names = [*(graph.name for graph in graphs), DESCRIPTION]
+            for name in names:
+                (folder / name).replace(out / name)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror or error})") from error
+    return [out / name for name in names]
+
+
+def _graphs(checkpoint: Checkpoint) -> list[_Graph]:
+    network = network_of(checkpoint)
+    rows, columns = checkpoint.images.rows, checkpoint.images.columns
+    points, normals = torch.rand(2, _EXAMPLE_BATCH, 3, rows, columns)
+    if not isinstance(network, CorrelationNetwork):
+        images = torch.cat([points, normals], dim=1)
+        gives = ["T_prev_curr", "log_sigma"]
+        return [_Graph(PAIR, _Pairs(network).eval(), (images, images + 1.0), ["previous", "current"], gives)]
+    with torch.no_grad():
+        features = network.columns(points, normals)
+    grids = torch.rand(_EXAMPLE_BATCH, bird_eye.CHANNELS, bird_eye.CELLS, bird_eye.CELLS)
+    scores = torch.rand(_EXAMPLE_BATCH, features.shape[-1]), torch.rand(_EXAMPLE_BATCH, SHIFTS, SHIFTS)
+    return [
+        _Graph(COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
+        _Graph(TURNS, _Turns(network).eval(), (features, features.flip(0)), ["previous", "current"], ["scores"]),
+        _Graph(BIRD, network.bird, (grids,), ["grids"], ["features"]),
+        _Graph(PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),
+    ]
+
+
+def _write(graph: _Graph, path: Path) -> None:
+    batch = torch.export.Dim("batch", min=1)
+    with _quiet_exporter():
+        program = torch.export.export(
+            graph.module, graph.inputs, dynamic_shapes=tuple({0: batch} for _ in graph.inputs)
+        )
+        torch.onnx.export(
+            program,
+            (),
+            str(path),
+            input_names=list(graph.takes),
+            output_names=list(graph.gives),
+            dynamic_shapes=tuple({0: "batch"} for _ in graph.inputs),
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+    _forget_origin(path)
+
+
+def _forget_origin(path: Path) -> None:
+    """Take out which lines of which files the graph came from: no business of those it is passed on to."""
+    import onnx
+
+    model = onnx.load(str(path))
+    graphs = [model.graph, *model.functions]
+    for part in (model, *graphs, *(node for graph in graphs for node in graph.node)):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    for value in (*model.graph.value_info, *model.graph.initializer, *model.graph.input, *model.graph.output):
+        value.ClearField("metadata_props")
+    onnx.save(model, str(path))
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Without the exporter's warnings about itself and what else could be installed."""
+    exporter = logging.getLogger("torch.onnx")
+    level = exporter.level
+    exporter.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        exporter.setLevel(level)
+
+
+def _require_packages() -> None:
+    try:
+        import onnx  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            f"{error.name} is not installed, which writing ONNX needs; pip install 'lidarslam[export]'"
+        ) from error

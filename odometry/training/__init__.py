@@ -1,0 +1,1 @@
+"""Training: losses, pairs, preparation."""

@@ -1,0 +1,140 @@
+"""What training minimises: the paper's geometric losses, and the distance to the motion that a teacher finds."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor
+from torch.nn import functional
+
+from odometry.images import bird_eye
+from odometry.network.correlation import Estimate
+from odometry.training.losses import Surfaces, geometric_loss
+from odometry.training.pairs import PairBatch
+from odometry.training.torch_geometry import inverse, log
+from odometry.training.torch_images import has_normal
+from odometry.training.training_config import TrainingConfig
+
+# Errors are squared up to this size, a degree and five centimetres, where they cost a half; beyond they cost linearly.
+_ROTATION = math.radians(1.0)
+_TRANSLATION_M = 0.05
+# Two columns and two cells: within these an error is that of the right peak.
+_NEAR_ROTATION, _NEAR_TRANSLATION_M = math.radians(4.0), 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """A loss and its parts, means over the pairs that are believed; parts that are switched off are zero."""
+
+    total: Tensor
+    alignment: Tensor
+    confidence: Tensor
+    turn: Tensor
+    shift: Tensor
+    point_to_plane: Tensor
+    plane_to_plane: Tensor
+
+
+def objective(estimate: Estimate, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
+    """The loss of a batch; the generator draws the points that the geometric losses look at."""
+    zero = estimate.log_sigma.new_zeros(())
+    total, alignment, confidence, turn, shift, planes, normals = (zero,) * 7
+    if config.alignment_weight:
+        error = motion_error(estimate.T_prev_curr, batch.T_prev_curr)
+        is_near = _is_near(error) if estimate.turn_scores.shape[1] else torch.ones_like(batch.believed)
+        alignment = _mean(_distance(error), batch.believed & is_near)
+        confidence = _mean(_negative_log_likelihood(error, estimate.log_sigma), batch.believed)
+        if estimate.turn_scores.shape[1]:
+            turn = _mean(_turn_loss(estimate.turn_scores, batch.T_prev_curr), batch.believed)
+        if estimate.shift_scores.shape[1]:
+            in_reach = _cells(batch.T_prev_curr).abs().amax(1) < bird_eye.MOST_CELLS - 1
+            shift = _mean(_shift_loss(estimate.shift_scores, batch.T_prev_curr), batch.believed & in_reach)
+        total = total + config.alignment_weight * (0.3 * alignment + 0.1 * confidence + turn + shift)
+    surfaces = batch.previous_surfaces, batch.current_surfaces
+    if config.geometric is not None and surfaces[0] is not None and surfaces[1] is not None:
+        current = _surfaces(surfaces[1], config.geometric_points, generator)
+        loss = geometric_loss(estimate.T_prev_curr, current, _surfaces(surfaces[0]), config.geometric)
+        planes, normals = (_mean(part, batch.believed) for part in (loss.point_to_plane, loss.plane_to_plane))
+        total = total + config.geometric_weight * _mean(loss.total, batch.believed)
+    return Objective(total, alignment, confidence, turn, shift, planes, normals)
+
+
+def motion_error(T_prev_curr: Tensor, target: Tensor) -> Tensor:
+    """(B, 6) change from the left that takes the target to the estimate, rotation first."""
+    return log(T_prev_curr @ inverse(target))
+
+
+def _distance(error: Tensor) -> Tensor:
+    """(B,) rotation and translation, each in its unit, squared when small and linear when large."""
+    rotation = error[:, :3].norm(dim=1) / _ROTATION
+    translation = error[:, 3:].norm(dim=1) / _TRANSLATION_M
+    return functional.smooth_l1_loss(
+        torch.stack([rotation, translation], dim=1), error.new_zeros(len(error), 2), reduction="none"
+    ).sum(dim=1)
+
+
+def _is_near(error: Tensor) -> Tensor:
+    """(B,) whether the right peak was found; drawing at a wrong one would teach nothing."""
+    rotation, translation = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
+    near: Tensor = (rotation < _NEAR_ROTATION) & (translation < _NEAR_TRANSLATION_M)
+    return near
+
+
+def _negative_log_likelihood(error: Tensor, log_sigma: Tensor) -> Tensor:
+    """(B,) of errors that are distributed as Laplace said, each direction with its own standard deviation.
+
+    Its gradient reaches the confidence alone: were the motion drawn by it as well, pairs that are hard would be
+    given up rather than learnt.
+    """
+    scale = math.sqrt(2.0)
+    return (scale * error.detach().abs() * (-log_sigma).exp() + log_sigma).sum(dim=1)
+
+
+def _turn_loss(scores: Tensor, target: Tensor) -> Tensor:
+    """(B,) cross entropy of the scores of turns (B, W') with the turn about z, shared by the two columns around it."""
+    width = scores.shape[1]
+    column = torch.atan2(target[:, 1, 0], target[:, 0, 0]).remainder(2.0 * math.pi) * (width / (2.0 * math.pi))
+    low = column.floor()
+    share = column - low
+    likelihood = scores.log_softmax(dim=1)
+    both = torch.stack([low, low + 1.0], dim=1).long().remainder(width)
+    weights = torch.stack([1.0 - share, share], dim=1)
+    return -(likelihood.gather(1, both) * weights).sum(dim=1)
+
+
+def _cells(T_prev_curr: Tensor) -> Tensor:
+    """(B, 2) translation along x and y of motions (B, 4, 4), in cells of the bird's-eye grid."""
+    cells: Tensor = T_prev_curr[:, :2, 3] / bird_eye.CELL_M
+    return cells
+
+
+def _shift_loss(scores: Tensor, target: Tensor) -> Tensor:
+    """(B,) cross entropy of the scores of shifts (B, S, S) with the translation, shared by the four cells around it."""
+    count = scores.shape[-1]
+    most = count // 2
+    cell = _cells(target).clamp(-most, most - 1e-3) + most
+    low = cell.floor()
+    share = cell - low  # (B, 2) along x, along y
+    column, row = low.long().unbind(1)
+    likelihood = scores.flatten(1).log_softmax(dim=1)
+    loss = torch.zeros_like(share[:, 0])
+    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        along_x = share[:, 0] if across else 1.0 - share[:, 0]
+        along_y = share[:, 1] if down else 1.0 - share[:, 1]
+        index = ((row + down) * count + column + across)[:, None]
+        loss = loss - along_x * along_y * likelihood.gather(1, index)[:, 0]
+    return loss
+
+
+def _mean(values: Tensor, believed: Tensor) -> Tensor:
+    return (values * believed).sum() / believed.sum().clamp(min=1)
+
+
+def _surfaces(images: Tensor, most: int | None = None, generator: Generator | None = None) -> Surfaces:
+    """The pixels of images (B, 6, H, W), or as many of them with a normal as are wanted, drawn at random."""
+    values = images.flatten(2).mT  # (B, N, 6)
+    if most is not None and most < values.shape[1]:
+        order = torch.rand(values.shape[:2], generator=generator).to(values.device) + has_normal(values[..., 3:], -1)
+        values = values.gather(1, order.topk(most, dim=1).indices[..., None].expand(-1, -1, 6))
+    points, normals = values[..., :3], values[..., 3:]
+    return Surfaces(points, normals, has_normal(normals, -1))

@@ -1,0 +1,114 @@
+"""Training of a network, one step after another; whoever calls it chooses devices, writes files and draws curves."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Generator, Tensor, nn
+
+from odometry.network.candidates import Search
+from odometry.network.networks import PairNetwork
+from odometry.network.torch_graphs import torch_search
+from odometry.training.objective import Objective, motion_error, objective
+from odometry.training.pairs import PairBatch, pair_of
+from odometry.training.preparation import PreparedRecording
+from odometry.training.torch_geometry import full_precision
+from odometry.training.training_config import TrainingConfig
+
+_LEAST_RATE = 0.01  # of the learning rate, at the end
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How far a network is from the motions that the teacher found on recordings it does not learn from.
+
+    Attributes:
+        rotation_rms_deg, translation_rms_m: over all believed pairs.
+        rotation_median_deg, translation_median_m: likewise.
+        covered_percent: of the errors that lie within one, two and three standard deviations.
+        pairs: how many; where there is none, all else is not a number.
+    """
+
+    rotation_rms_deg: float
+    translation_rms_m: float
+    rotation_median_deg: float
+    translation_median_m: float
+    covered_percent: tuple[float, float, float]
+    pairs: int
+
+
+def learning_rate(step: int, config: TrainingConfig) -> float:
+    """Rises linearly, then falls along half a cosine."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    done = (step - config.warmup_steps) / max(1, config.steps - config.warmup_steps)
+    return config.learning_rate * (_LEAST_RATE + (1.0 - _LEAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * done)))
+
+
+def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
+    """AdamW; biases, scales and the like are not decayed."""
+    decayed = [p for p in network.parameters() if p.ndim > 1]
+    others = [p for p in network.parameters() if p.ndim <= 1]
+    groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.98))
+
+
+def loss_of(network: PairNetwork, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
+    """The loss of a network on a batch."""
+    estimate = network(batch.shown)
+    with full_precision(batch.previous.device):
+        return objective(estimate, batch, config, generator)
+
+
+def validate(
+    network: nn.Module, recordings: Sequence[PreparedRecording], gap: int = 1, device: torch.device | None = None
+) -> Validation:
+    """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none.
+
+    The network, in evaluation mode, is asked as in use: by its most probable candidate.
+    """
+    errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
+    search = torch_search(network, device or torch.device("cpu"))
+    for recording in recordings:
+        for first in range(gap):
+            error, sigma = _errors(search, recording, range(first, len(recording), gap))
+            errors.append(error)
+            sigmas.append(sigma)
+    return summarise(torch.cat(errors), torch.cat(sigmas))
+
+
+def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
+    """Statistics of errors (N, 6) with standard deviations (N, 6)."""
+    if not len(errors):
+        return Validation(math.nan, math.nan, math.nan, math.nan, (math.nan, math.nan, math.nan), 0)
+    rotation = torch.rad2deg(errors[:, :3].norm(dim=1))
+    translation = errors[:, 3:].norm(dim=1)
+    covered = [100.0 * float((errors.abs() <= k * sigmas).float().mean()) for k in (1, 2, 3)]
+    return Validation(
+        _rms(rotation), _rms(translation), float(rotation.median()), float(translation.median()),
+        (covered[0], covered[1], covered[2]), len(errors),
+    )  # fmt: skip
+
+
+def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tuple[Tensor, Tensor]:
+    """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where it is believed."""
+    errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
+    points, normals = recording.images.points.numpy(), recording.images.normals.float().numpy()
+    before = None
+    for number in chosen:
+        if before is None:
+            before = search.describe(points[number], normals[number])
+            continue
+        candidates, before = search.compare(before, points[number], normals[number])
+        pair = pair_of(recording, number - chosen.step, number, surfaces=False)
+        if bool(pair.believed):
+            T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
+            errors.append(motion_error(T_prev_curr[None], pair.T_prev_curr))
+            sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
+    return torch.cat(errors), torch.cat(sigmas)
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt())
