@@ -124,7 +124,7 @@ def test_equal_thresholds_are_no_contradiction() -> None:
         "odometry.kiss_icp.max_range_m",
         "odometry.consistency.gate_min_m",
         "global_map.voxel_size_m",
-        "viewer.map_radius_m",
+        "checkpoints.interval_s",
     ],
 )
 def test_every_number_is_finite(key: str, value: str) -> None:

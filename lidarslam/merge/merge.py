@@ -23,8 +23,7 @@ from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, w
 from lidarslam.run.run import open_odometry, require_apart
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
-from lidarslam.run.tracking import NoScanError, Tracked, track
-from lidarslam.run.watch import Progress
+from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
 from lidarslam.viewer.viewer import NullViewer
 from mapping.global_map.moved_points import PlacedViews
 from mapping.pose_graph.g2o import format_g2o
@@ -148,8 +147,8 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
 
 def _begin(directory: RunDirectory, description: dict[str, Any], stack: ExitStack) -> Unfinished:
     """Say of a directory that what lies there is not whole, until it is."""
-    unfinished = stack.enter_context(Unfinished.claim(directory.path, description, False, lambda: directory.is_mixed))
-    unfinished.begin(None)
+    unfinished = stack.enter_context(Unfinished.claim(directory, description, resume=False))
+    unfinished.begin(0)
     return unfinished
 
 

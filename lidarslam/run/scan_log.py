@@ -1,24 +1,23 @@
-"""What a run remembers of every scan: a row in scans.csv at once, and the few numbers the summary needs."""
+"""The log of a run: a row of scans.csv for each scan, and its poses and timings in memory."""
 
 import contextlib
 import csv
+import io
 import os
 import shutil
 import zlib
-from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import Saved, Shape, State, Stateful, decode
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.pipeline import STAGES, ScanResult
+from lidarslam.pipeline.estimates import STAGES, ScanResult
 from lidarslam.run.directory import SCANS_CSV, RunDirectory
 
 COLUMNS = (
@@ -36,82 +35,85 @@ COLUMNS = (
 )
 
 
-def _doubles(values: FloatArray | None = None) -> "array[float]":
-    """Numbers (whatever their shape) after one another, and more to come."""
-    numbers = array("d")
-    if values is not None:
-        numbers.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-    return numbers
+# What is kept of each scan, beside status and message: 320 bytes.
+_ROW = np.dtype(
+    [
+        ("stamp", np.float64),
+        ("total_ms", np.float64),
+        ("stage_ms", np.float64, len(STAGES)),
+        ("T_world_lidar", np.float64, (4, 4)),
+        ("T_odom_lidar", np.float64, (4, 4)),
+    ]
+)
+_NUMBERS = _ROW.itemsize // np.dtype(np.float64).itemsize
 
 
-def _poses(numbers: "array[float]") -> FloatArray:
-    return np.array(numbers).reshape(-1, 4, 4)
+class _Table(Stateful):
+    """A CSV file that is written row by row, with its size and checksum so far."""
 
+    _size: int
+    _checksum: int
 
-class _Rows:
-    """A table that is written row by row, and knows how far it is."""
-
-    def __init__(self, out: BinaryIO, size: int = 0, checksum: int = 0) -> None:
+    def __init__(self, out: BinaryIO) -> None:
         self._out = out
-        self._size, self._checksum = size, checksum
-        self._writer = csv.writer(self, lineterminator="\n")
-        if not size:
-            self.add(COLUMNS)
-
-    @classmethod
-    def restored(cls, out: BinaryIO, saved: Saved) -> "_Rows":
-        """The table as it was; rows that came later are cut off."""
-        size, checksum = saved.integer("size"), saved.integer("checksum")
-        if zlib.crc32(out.read(size)) != checksum:
-            raise InputError(f"{out.name}: is damaged; begin again with --overwrite")
-        out.truncate(size)
-        out.seek(size)
-        return cls(out, size, checksum)
+        self._size = self._checksum = 0
 
     def add(self, row: Any) -> None:
         """One row."""
-        self._writer.writerow(row)
-
-    def write(self, text: str) -> int:
-        """What the writer of rows calls."""
-        content = text.encode()
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(row)
+        content = text.getvalue().encode()
         self._size, self._checksum = self._size + len(content), zlib.crc32(content, self._checksum)
-        return self._out.write(content)
+        self._out.write(content)
 
     def state(self) -> State:
-        """How far it is; up to there it is on the disk by now."""
+        """Size and checksum; the rows are on the disk by now."""
         self._out.flush()
         os.fsync(self._out.fileno())
-        return {"size": self._size, "checksum": self._checksum}
+        return super().state()
+
+    def _after_restore(self) -> None:
+        """Cut off the rows that came later."""
+        self._out.seek(0)
+        if zlib.crc32(self._out.read(self._size)) != self._checksum:
+            raise InputError(f"{self._out.name}: is damaged; begin again with --overwrite")
+        self._out.truncate(self._size)
+        self._out.seek(self._size)
 
 
-@dataclass
-class ScanLog:
-    """The scans of a run so far; two poses and a few numbers each, some 350 bytes, and no points."""
+class ScanLog(Stateful):
+    """The scans of a run so far; no points.
 
-    _rows: _Rows
-    stamps: "array[float]" = field(default_factory=_doubles)
-    statuses: list[Status] = field(default_factory=list)
-    messages: list[str] = field(default_factory=list)
-    points_read: int = 0
-    points_dropped: int = 0
-    warnings: list[str] = field(default_factory=list)
-    # Numbers after one another: an array of its own for each pose would take twice the memory.
-    _stage_ms: "array[float]" = field(default_factory=_doubles)
-    _T_world_lidar: "array[float]" = field(default_factory=_doubles)
-    _T_odom_lidar: "array[float]" = field(default_factory=_doubles)
+    Attributes:
+        statuses, messages: of each scan.
+        points_read, points_dropped: of all scans.
+        warnings: sentences for the summary.
+    """
+
+    statuses: list[Status]
+    messages: list[str]
+    points_read: int
+    points_dropped: int
+    warnings: list[str]
+    _table: _Table
+
+    def __init__(self, out: BinaryIO) -> None:
+        self.statuses, self.messages, self.warnings = [], [], []
+        self.points_read = self.points_dropped = 0
+        self._table = _Table(out)
+        self._rows = bytearray()  # of `_ROW`: half the memory of an array for each pose
 
     def __len__(self) -> int:
-        return len(self.stamps)
+        return len(self.statuses)
 
     @classmethod
     @contextlib.contextmanager
     def open(cls, directory: RunDirectory, rows: Path | None = None, saved: Saved | None = None) -> Iterator["ScanLog"]:
-        """Log to the run's scans.csv, which appears when the run ends well.
+        """Log to the run's scans.csv, which appears when the block ends without an error.
 
         Args:
             directory: of the run.
-            rows: a file for the table until then, so that it outlives the program.
+            rows: a file for the table until then, which outlives the process.
             saved: a state to go on from, whose rows are there.
 
         Raises:
@@ -119,56 +121,38 @@ class ScanLog:
         """
         if rows is None:
             with directory.replacing(SCANS_CSV) as partial, partial.open("wb") as out:
-                yield cls(_Rows(out))
+                log = cls(out)
+                log._table.add(COLUMNS)
+                yield log
             return
         with rows.open("wb" if saved is None else "r+b") as out:
-            log = cls(_Rows(out)) if saved is None else cls._restored(out, saved)
+            log = cls(out)
+            if saved is None:
+                log._table.add(COLUMNS)
+            else:
+                log.restore(saved)
             yield log
             out.flush()
             with directory.replacing(SCANS_CSV) as partial:
                 shutil.copyfile(rows, partial)
 
     def state(self) -> State:
-        """All of it; the rows are on the disk by now.
+        """All of it; the rows of the table are on the disk by now."""
+        return super().state() | {"rows": np.frombuffer(bytes(self._rows)).reshape(-1, _NUMBERS)}
 
-        Raises:
-            OSError: the disk is full.
-        """
-        return {
-            "rows": self._rows.state(),
-            "stamps": np.array(self.stamps),
-            "statuses": [status.value for status in self.statuses],
-            "messages": list(self.messages),
-            "stage_ms": self.stage_ms,
-            "points_read": self.points_read,
-            "points_dropped": self.points_dropped,
-            "warnings": list(self.warnings),
-            "T_world_lidar": _poses(self._T_world_lidar),
-            "T_odom_lidar": _poses(self._T_odom_lidar),
-        }
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        super().restore(saved)
+        rows = decode(Annotated[FloatArray, Shape(len(self), _NUMBERS)], saved.value("rows"), saved.at("rows"))
+        self._rows = bytearray(rows.tobytes())
 
-    @classmethod
-    def _restored(cls, out: BinaryIO, saved: Saved) -> "ScanLog":
-        stamps = saved.array("stamps", (None,))
-        statuses, messages = saved.texts("statuses"), saved.texts("messages")
-        if not len(stamps) == len(statuses) == len(messages) or not set(statuses) <= {s.value for s in Status}:
-            raise saved.refuse(f"{len(stamps)} scans have {len(statuses)} statuses and {len(messages)} messages")
-        return cls(
-            _Rows.restored(out, saved.part("rows")),
-            _doubles(stamps),
-            [Status(status) for status in statuses],
-            messages,
-            saved.integer("points_read"),
-            saved.integer("points_dropped"),
-            saved.texts("warnings"),
-            _doubles(saved.array("stage_ms", (len(stamps), len(STAGES)))),
-            _doubles(saved.array("T_world_lidar", (len(stamps), 4, 4))),
-            _doubles(saved.array("T_odom_lidar", (len(stamps), 4, 4))),
-        )
+    def _after_restore(self) -> None:
+        if len(self.statuses) != len(self.messages):
+            raise ValueError(f"{len(self.statuses)} scans have {len(self.messages)} messages")
 
-    def add(self, result: ScanResult) -> None:
-        """Take note of one scan."""
-        ms = [result.stage_ms.get(stage, 0.0) for stage in STAGES]
+    def add(self, result: ScanResult, total_ms: float = 0.0) -> None:
+        """Log one scan; `total_ms` is the wall time since the scan before was done."""
+        stage_ms = [result.stage_ms.get(stage, 0.0) for stage in STAGES]
         row = [
             len(self),
             f"{result.stamp:.9f}",
@@ -179,18 +163,16 @@ class ScanLog:
             _number(result.residual_m),
             _number(result.inlier_ratio),
             " ".join(result.degenerate),
-            *(f"{value:.2f}" for value in ms),
+            *(f"{ms:.2f}" for ms in stage_ms),
             result.message,
         ]
-        self._rows.add(row)
-        self.stamps.append(result.stamp)
+        self._table.add(row)
+        numbers = (result.stamp, total_ms, stage_ms, result.T_world_lidar, result.T_odom_lidar)
+        self._rows += np.array(numbers, dtype=_ROW).tobytes()
         self.statuses.append(result.status)
         self.messages.append(result.message)
         self.points_read += result.points_read
         self.points_dropped += result.points_dropped
-        self._stage_ms.extend(ms)
-        self._T_world_lidar.extend(result.T_world_lidar.ravel())
-        self._T_odom_lidar.extend(result.T_odom_lidar.ravel())
 
     def warn(self, message: str) -> None:
         """Keep a sentence for the summary, once."""
@@ -198,25 +180,39 @@ class ScanLog:
             self.warnings.append(message)
 
     def correct(self, T_world_lidar: FloatArray) -> None:
-        """Take other poses (N, 4, 4), one for each scan, as the final ones."""
+        """Replace the poses (N, 4, 4) by those that the pose graph corrected."""
         if T_world_lidar.shape != (len(self), 4, 4):
             raise ValueError(f"expected a pose for each of {len(self)} scans, got {T_world_lidar.shape}")
-        self._T_world_lidar = _doubles(T_world_lidar)
+        rows = np.frombuffer(self._rows, _ROW)
+        rows["T_world_lidar"] = T_world_lidar
+
+    @property
+    def stamps(self) -> FloatArray:
+        """(N,) seconds."""
+        return self._column("stamp")
+
+    @property
+    def total_ms(self) -> FloatArray:
+        """(N,) wall time from one scan done to the next."""
+        return self._column("total_ms")
 
     @property
     def stage_ms(self) -> FloatArray:
         """(N, 6) wall time of each of the `STAGES`."""
-        return np.array(self._stage_ms).reshape(-1, len(STAGES))
+        return self._column("stage_ms")
 
     @property
     def trajectory(self) -> Trajectory:
         """The final poses."""
-        return Trajectory(np.array(self.stamps), _poses(self._T_world_lidar))
+        return Trajectory(self.stamps, self._column("T_world_lidar"))
 
     @property
     def odometry(self) -> Trajectory:
-        """The odometry's own poses."""
-        return Trajectory(np.array(self.stamps), _poses(self._T_odom_lidar))
+        """The poses of the odometry alone."""
+        return Trajectory(self.stamps, self._column("T_odom_lidar"))
+
+    def _column(self, name: str) -> FloatArray:
+        return np.frombuffer(self._rows, _ROW)[name].copy()  # a view would keep the buffer from growing
 
 
 def _number(value: float | None) -> str:

@@ -11,8 +11,8 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
+from lidarslam.pipeline.estimates import STAGES
 from lidarslam.pipeline.loop_closing import GraphOutcome, LoopReport
-from lidarslam.pipeline.pipeline import STAGES
 from lidarslam.run.scan_log import ScanLog
 from mapping.slides.slides import Contradiction
 
@@ -216,7 +216,6 @@ def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
 
 def summarise(
     log: ScanLog,
-    total_ms: list[float],
     written: WrittenMap,
     skipped: int,
     closed: GraphOutcome | None = None,
@@ -226,15 +225,14 @@ def summarise(
 
     Args:
         log: its scans.
-        total_ms: wall time of each scan, from the one before finished to this one finished.
         written: the map.
         skipped: scans that were asked for and did not come, for no reason that the log warns of.
         closed: what its pose graph did to it, if it had one.
         contradictions: where its map contradicts itself.
     """
     trajectory = log.trajectory
-    stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
-    elapsed_s = sum(total_ms) / 1e3
+    stages = {"total": log.total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
+    elapsed_s = float(log.total_ms.sum()) / 1e3
     return RunSummary(
         scans=len(log),
         length_m=trajectory.length_m,

@@ -15,7 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Ingredients, ingredients_of, mixture
 from lidarslam.train.config import SimulatedConfig
 from lidarslam.train.teacher import MapTeacher

@@ -43,20 +43,6 @@ def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
     return present
 
 
-def make_directory(path: Path) -> None:
-    """Make the directory, unless it is there.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise OutputError(f"{path}: a file is in the way; name another directory") from error
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
 def remove_results(path: Path, names: Iterable[str]) -> None:
     """Make room for another training."""
     for name in names:

@@ -11,7 +11,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.pipeline.prefetch import prefetch
+from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.train import directory as files
 from lidarslam.train.devices import Devices
 from lidarslam.train.log import TrainingLog

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from lidarslam.core.directory_lock import only_writer
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.files import make_directory, only_writer
 from lidarslam.run.directory import RunDirectory
 from lidarslam.train import directory as files
 from lidarslam.train.config import TrainConfig, dump_train_yaml
@@ -51,7 +51,7 @@ def execute(request: TrainRequest, narrator: TrainNarrator) -> TrainOutcome:
     if not stretches:
         raise ConfigError("there is nothing to train on; name a SOURCE, or set simulated.recordings=100")
     devices = Devices(request.device, config.training.precision)
-    files.make_directory(request.out)
+    make_directory(request.out)
     about = _about(request, stretches)
     alone = only_writer(request.out) if devices.is_first else contextlib.nullcontext()
     with alone, _interruption() as interrupted:

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from evaluation.report.error_colours import viridis
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import replacing
 from lidarslam.core.geometry import FloatArray
-from lidarslam.run.directory import RunDirectory
 
 _BACKGROUND = (255, 255, 255)
 # How far away the camera stands, in diameters of the cloud: near enough for perspective.
@@ -90,7 +90,7 @@ def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     if path.suffix.lower() not in _PICTURE_SUFFIXES:
         raise OutputError(f"{path}: the picture could not be written; it must end in .png or .jpg")
     image = o3d.geometry.Image(np.ascontiguousarray(picture).data)
-    with RunDirectory(path.parent).replacing(path.name) as partial:
+    with replacing(path) as partial:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             written = o3d.io.write_image(partial, image)
         if not (written and _is_whole(partial)):

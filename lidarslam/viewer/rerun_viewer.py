@@ -23,7 +23,7 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.pipeline import STAGES, ScanResult
+from lidarslam.pipeline.estimates import STAGES, ScanResult
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment
@@ -53,6 +53,8 @@ _SCAN_COLOUR = (240, 228, 66)
 _CLOSED_COLOUR = (86, 180, 233)
 _LOOP_COLOUR = (204, 121, 167)
 _RUN_COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0))
+# While a run is at work, the map is shown this far around the sensor.
+_NEAR_M = 60.0
 # Negative radii are in points on the screen, whatever the zoom.
 _PATH_RADIUS, _SCAN_RADIUS, _MAP_RADIUS = -3.0, -1.5, -1.0
 # Entity, title, and the names of its series.
@@ -138,7 +140,7 @@ class RerunViewer:
     def show_map(self, points: FloatArray) -> None:
         """The part of the map around the sensor, coloured by height."""
         if self._last_position is not None:
-            near = np.linalg.norm(points - self._last_position, axis=1) < self._config.map_radius_m
+            near = np.linalg.norm(points - self._last_position, axis=1) < _NEAR_M
             points = points[near]
         self.show_final_map(points)
 

@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.pipeline import ScanResult
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.scan_log import ScanLog

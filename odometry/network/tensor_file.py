@@ -1,7 +1,6 @@
 """Tensors and a description in one file: safetensors, which unlike a pickle runs no code of whoever wrote it."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.files import replacing
 
 _PROGRAM = "lidarslam"
 # A safetensors file begins with the length of its header in eight bytes, and the header is JSON.
@@ -54,16 +54,13 @@ def write_tensor_file(path: Path, kind: Kind, tensors: Mapping[str, Tensor], con
         "content": json.dumps(content, ensure_ascii=False),
     }
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(plain, partial, metadata=header)
-        partial.replace(path)
+        with replacing(path) as partial:
+            save_file(plain, partial, metadata=header)
     except (OSError, SafetensorError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise OutputError(f"{path}: cannot be written ({reason})") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def read_tensor_file(path: Path, kind: Kind) -> TensorFile:

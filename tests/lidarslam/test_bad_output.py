@@ -17,8 +17,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.core.directory_lock import only_writer
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.ply import read_ply
