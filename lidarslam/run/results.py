@@ -68,11 +68,12 @@ def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMa
 def write_results(
     directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None, drawn: DrawnMap
 ) -> RunOutcome:
-    """Write everything but scans.csv; the poses are final."""
+    """Write everything; the poses are final."""
     config, log = request.config, tracked.log
     directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
+    directory.write_text(files.SCANS_CSV, log.format_csv())
     metrics = _write_trajectories(directory, tracked)
     written = write_map(directory, drawn, request.pcd)
     log.warnings.extend(tracked.faults.warnings())

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from lidarslam.config.settings import load_model
+from lidarslam.config.settings import dump_yaml, load_model
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.train.directory import SOURCES_SECTION
 from odometry.training.loss_config import LossConfig
@@ -58,8 +57,7 @@ def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) ->
 
 def dump_train_yaml(config: TrainConfig, trained_on: dict[str, Any]) -> str:
     """The configuration as YAML, after the section that says what is trained on."""
-    tree = {SOURCES_SECTION: trained_on} | config.model_dump(mode="json")
-    return str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+    return dump_yaml(config, trained_on, SOURCES_SECTION)
 
 
 def loss_settings(name: str | None) -> list[str]:
