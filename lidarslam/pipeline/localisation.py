@@ -120,4 +120,4 @@ def make_localiser(config: Config) -> Localiser:
     """Scan-to-map registration when it is enabled, else the odometry alone."""
     if config.mapping.enabled:
         return ScanToMap(Mapper(config.mapping))
-    return OdometryAlone(ConsistencyCheck(config.odometry.consistency))
+    return OdometryAlone(ConsistencyCheck())
