@@ -102,7 +102,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
     for other in (("--odometry", "kiss-icp"), ("--odometry", "constant-velocity"), ("--prior", prior)):
         refused = lidarslam("run", recording, "--out", tmp_path / "other", "--weights", weights, *other)
         assert refused.exit_code == 2
-        assert "--weights are those of the learned odometry" in refused.stderr
+        assert "--weights belongs to --odometry learned" in refused.stderr
         assert not (tmp_path / "other").exists()
 
 
