@@ -20,8 +20,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.resume.config import CheckpointConfig
 from lidarslam.run.directory import RUN_SECTION
 from lidarslam.train.directory import SOURCES_SECTION
-from mapping.config import GlobalMapConfig, MappingConfig
-from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
 # The sections of a run's or a training's config.yaml that are no configuration.
@@ -54,7 +53,7 @@ class Config(BaseModel):
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()
     mapping: MappingConfig = MappingConfig()
-    pose_graph: SlamGraphConfig = SlamGraphConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
     checkpoints: CheckpointConfig = CheckpointConfig()
