@@ -2,7 +2,7 @@
 
     python benchmarks/mapping_ablation.py
 
-Every row of the Markdown table is a variant: with or without edges, with the velocity of the sweep estimated
+Every row of the Markdown table is a variant: with the velocity of the sweep estimated
 (continuous time) or taken from the pose before, and then compensated again or not (second deskew); each without any
 odometry, and with one that is wrong by `--wrong-deg` and `--wrong-m` at every scan (see `mapping_accuracy.py`). The
 columns are the ATE of each recording in metres after SE(3) alignment, lost scans in brackets, the mean, and the median
@@ -30,10 +30,9 @@ from mapping_accuracy import (
 from mapping.config import MappingConfig
 
 _PARTS: dict[str, dict[str, bool]] = {
-    "continuous time": {"edges": False, "continuous_time": True},
-    "continuous time, edges": {"edges": True, "continuous_time": True},
-    "second deskew": {"edges": False, "continuous_time": False, "second_deskew": True},
-    "one deskew": {"edges": False, "continuous_time": False, "second_deskew": False},
+    "continuous time": {"continuous_time": True},
+    "second deskew": {"continuous_time": False, "second_deskew": True},
+    "one deskew": {"continuous_time": False, "second_deskew": False},
 }
 
 

@@ -4,7 +4,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
-from mapping.loam.config import FeatureConfig
 
 
 class GlobalMapConfig(BaseModel):
@@ -81,7 +80,6 @@ class MappingConfig(BaseModel):
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
     max_range_m: float = Field(100.0, gt=0.0, description="farther points are left out")
     keypoints: int = Field(3000, ge=100, description="points of a scan that are registered, about")
-    edges: bool = Field(False, description="register LOAM's edges to lines, beside planes")
     continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
     second_deskew: bool = Field(
         True, description="without continuous time: compensate again with the refined motion where it differs"
@@ -95,7 +93,6 @@ class MappingConfig(BaseModel):
     prior_caution: float = Field(
         10.0, gt=0.0, description="factor on the standard deviations that an odometry gives itself: its errors repeat"
     )
-    features: FeatureConfig = FeatureConfig()
     refinement: RefinementConfig = RefinementConfig()
     tracking: TrackingConfig = TrackingConfig()
 

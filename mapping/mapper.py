@@ -355,7 +355,7 @@ class Mapper:
 
     def _is_blind(self, sampled: SampledScan) -> bool:
         """Whether the sensor sees next to nothing: it is covered, or looks into the open."""
-        return len(sampled.keys) + len(sampled.edges) < self._config.refinement.min_matches
+        return len(sampled.keys) < self._config.refinement.min_matches
 
     def _see_nothing(self, sampled: SampledScan, prediction: Prediction) -> MappedScan:
         """What has nothing to see says nothing of where it is: it waits, and the map with it."""
@@ -384,11 +384,9 @@ class Mapper:
     def _add(self, sampled: SampledScan, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap) -> None:
         self._scans_in_map += 1
         points = compensated(sampled.points, sampled.times, velocity)
-        edges = compensated(sampled.edges, sampled.edge_times, velocity)
         local_map.add(
             planes=transform_points(T_world_lidar, points),
             elevations=sampled.elevations,
-            edges=transform_points(T_world_lidar, edges),
             sensor=T_world_lidar[:3, 3],
         )
 

@@ -38,19 +38,12 @@ class Sweep:
     """The points of a scan that are registered, as measured: each in the LiDAR frame of its own instant.
 
     Attributes:
-        planes, edges: (N, 3) and (E, 3).
-        plane_times, edge_times: (N,) and (E,) seconds from the stamp; None when the scan is compensated already.
+        points: (N, 3).
+        times: (N,) seconds from the stamp; None when the scan is motion compensated already.
     """
 
-    planes: FloatArray
-    edges: FloatArray
-    plane_times: FloatArray | None = None
-    edge_times: FloatArray | None = None
-
-    @property
-    def is_rolling(self) -> bool:
-        """Whether the points were measured at different times."""
-        return self.plane_times is not None
+    points: FloatArray
+    times: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +88,18 @@ def refine(
         None when too few points meet a surface.
     """
     T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
-    rolling = with_velocity and sweep.is_rolling
+    times = sweep.times if with_velocity else None
     schedule = _Schedule(config, local_map.cell_m, coarse_first)
     while True:
-        points, matches = _match(sweep, T_world_lidar, velocity, local_map, schedule.level)
+        points = compensated(sweep.points, sweep.times, velocity)
+        world = transform_points(T_world_lidar, points)
+        matches = local_map.match_planes(world, T_world_lidar, first_level=schedule.level)
         if len(matches) < config.min_matches:
             return None
         system = _Linearised.at(T_world_lidar, points, matches, schedule.cell_m)
-        times = _times(sweep, matches) if rolling else None
         try:
-            solution = _solve(system, times, prediction, T_world_lidar, velocity)
+            matched_times = None if times is None else times.take(matches.index)
+            solution = _solve(system, matched_times, prediction, T_world_lidar, velocity)
         except np.linalg.LinAlgError:  # nothing holds the pose, not even the prediction
             return None
         T_world_lidar = T_world_lidar @ exp(solution.pose_step)
@@ -119,28 +114,6 @@ def refine(
 def compensated(points: FloatArray, times: FloatArray | None, velocity: FloatArray) -> FloatArray:
     """Points (N, 3) as they would have been seen at the stamp."""
     return points if times is None or not len(points) else move(points, times, velocity)
-
-
-def _match(
-    sweep: Sweep, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap, level: int
-) -> tuple[FloatArray, Matches]:
-    """The compensated points (N + E, 3), planes first, and what they are pulled to."""
-    planes = compensated(sweep.planes, sweep.plane_times, velocity)
-    matches = local_map.match_planes(transform_points(T_world_lidar, planes), T_world_lidar, first_level=level)
-    if not len(sweep.edges):
-        return planes, matches
-    edges = compensated(sweep.edges, sweep.edge_times, velocity)
-    lines = local_map.match_lines(transform_points(T_world_lidar, edges))
-    shifted = Matches(lines.index + len(planes), lines.points, lines.normals, lines.thickness_m, lines.tilt)
-    return np.concatenate([planes, edges]), Matches.join([matches, shifted])
-
-
-def _times(sweep: Sweep, matches: Matches) -> FloatArray:
-    assert sweep.plane_times is not None
-    times = sweep.plane_times
-    if sweep.edge_times is not None and len(sweep.edge_times):
-        times = np.concatenate([times, sweep.edge_times])
-    return times.take(matches.index)
 
 
 class _Schedule:

@@ -11,8 +11,6 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from mapping.config import MappingConfig
-from mapping.loam.features import extract_features
-from mapping.loam.rings import RingFinder
 from mapping.registration import Sweep
 
 # Spacing of the points that go into the map, and of those that are registered, in cells.
@@ -36,7 +34,6 @@ class SampledScan:
         elevations: (N,) the angles above the sensor's equator that they were seen at, radians.
         times: (N,) seconds from the stamp; None when the scan is compensated already.
         keys: (K,) which of them are registered.
-        edges, edge_times: (E, 3) and (E,) likewise, edges only.
     """
 
     stamp: float
@@ -46,21 +43,19 @@ class SampledScan:
     elevations: FloatArray
     times: FloatArray | None
     keys: NDArray[np.intp]
-    edges: FloatArray
-    edge_times: FloatArray | None
 
     def __len__(self) -> int:
         return len(self.points)
 
     def state(self) -> State:
         """All of it."""
-        names = ("stamp", "cell_m", "range_m", "points", "elevations", "times", "keys", "edges", "edge_times")
+        names = ("stamp", "cell_m", "range_m", "points", "elevations", "times", "keys")
         return {name: getattr(self, name) for name in names}
 
     @classmethod
     def restored(cls, saved: Saved) -> "SampledScan":
         """The sample with a state."""
-        points, edges = saved.array("points", (None, 3)), saved.array("edges", (None, 3))
+        points = saved.array("points", (None, 3))
         keys = saved.array("keys", (None,), np.intp)
         if len(keys) and not 0 <= keys.min() <= keys.max() < len(points):
             raise saved.refuse(f"keys go beyond {len(points)} points")
@@ -72,8 +67,6 @@ class SampledScan:
             saved.array("elevations", (len(points),)),
             saved.optional_array("times", (len(points),)),
             keys,
-            edges,
-            saved.optional_array("edge_times", (len(edges),)),
         )
 
     @property
@@ -90,7 +83,7 @@ class SampledScan:
     def sweep(self) -> Sweep:
         """What is registered."""
         times = None if self.times is None else self.times.take(self.keys)
-        return Sweep(self.points.take(self.keys, axis=0), self.edges, times, self.edge_times)
+        return Sweep(self.points.take(self.keys, axis=0), times)
 
 
 class Sampler:
@@ -98,18 +91,16 @@ class Sampler:
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
-        self._rings = RingFinder()
         self._cell_range_m = 0.0  # the median range that the cell size was chosen for
         self._range_m = 0.0
 
     def state(self) -> State:
-        """The scale of the scene, and how rings are found."""
-        return {"cell_range_m": self._cell_range_m, "range_m": self._range_m, "rings": self._rings.state()}
+        """The scale of the scene."""
+        return {"cell_range_m": self._cell_range_m, "range_m": self._range_m}
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state."""
         self._cell_range_m, self._range_m = saved.number("cell_range_m"), saved.number("range_m")
-        self._rings.restore(saved.part("rings"))
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
@@ -121,7 +112,6 @@ class Sampler:
         kept = kept[(inside > near) & (inside < far)]
         points = scan.points.take(kept, axis=0)
         ranges = np.sqrt(squared.take(kept))
-        edges = self._edges(scan, squared)
         times = scan.time_offsets
         return SampledScan(
             stamp=scan.stamp,
@@ -133,17 +123,7 @@ class Sampler:
             # Were they the last of the sweep, they would lie on the same side of every tree, and each scan would be
             # laid a little turned on the one before: a sensor that stands still would turn.
             keys=_thin_to(central_per_cell(points, _KEY_SPACING * cell_m), self._config.keypoints),
-            edges=scan.points.take(edges, axis=0),
-            edge_times=None if times is None else times.take(edges),
         )
-
-    def _edges(self, scan: Scan, squared: FloatArray) -> NDArray[np.intp]:
-        if not self._config.edges or not len(scan):
-            return np.empty(0, dtype=np.intp)
-        rings = self._rings.rings(scan.points, scan.rings)
-        edges = extract_features(scan.points, rings, self._config.features).edges
-        inside = squared.take(edges)
-        return edges[(inside > self._config.min_range_m**2) & (inside < self._config.max_range_m**2)]
 
     def _follow_scene(self, squared: FloatArray) -> float:
         """The cell size for the median range of the latest scans; it changes only when the scene has, clearly."""

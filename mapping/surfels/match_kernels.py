@@ -1,7 +1,7 @@
 """Which points are pulled towards the surfaces in cells: the loops behind `LocalMap.match_planes`, compiled.
 
-The columns of patches (M, 16) are those of `mapping.surfels.patches`: point, normal, direction, spreads (three each),
-spread of the elevation, points, whether it is a plane, whether it is a line.
+The columns of patches (M, 15) are those of `mapping.surfels.patches`: point, normal, direction, spreads (three each),
+spread of the elevation, points, whether it is a plane.
 """
 
 import math
@@ -51,7 +51,7 @@ def pull_to_planes(
         points: (N, 3) in the world.
         waiting: (W,) which of them look for a plane; those that found none come to its beginning.
         rows: (W,) of the cells of these, -1 where there is none.
-        patches: (M, 16).
+        patches: (M, 15).
         sensor: (3,) in the world.
         pulls: where the pulls are written.
         begin: how many there are.

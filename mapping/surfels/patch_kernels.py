@@ -21,11 +21,9 @@ _NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
 _FEWEST_POINTS = 6
 # A surface is seen from one side at no flatter an angle than asin of this; between, from neither.
 _LEAST_SINE = 0.17
-# Spreads are standard deviations along the principal axes. A plane is thin beside its width, and no line; a line is
-# long beside its width: LOAM asks for a largest eigenvalue of three times the next.
+# Spreads are standard deviations along the principal axes. A plane is thin beside its width, and no line.
 _MOST_THICKNESS = 0.4
 _LEAST_WIDTH = 0.15
-_LEAST_LENGTH = 3.0**0.5
 
 
 @compiled
@@ -35,7 +33,7 @@ def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: 
     Args:
         rows: which.
         cells: all of them.
-        patches: (M, 16), written.
+        patches: (M, 15), written.
         counts: (M,) how many points the cells had when they were last looked at, written.
     """
     room = np.empty(15), np.empty(6), np.empty(3)
@@ -96,7 +94,6 @@ def _judge(patch: FloatArray) -> None:
     thickness, width, length = patch[9], patch[10], patch[11]
     enough = patch[13] >= _FEWEST_POINTS
     patch[14] = enough and thickness < _MOST_THICKNESS * width and width > _LEAST_WIDTH * length
-    patch[15] = enough and length > _LEAST_LENGTH * width
 
 
 @compiled

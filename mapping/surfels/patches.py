@@ -1,4 +1,4 @@
-"""What cells of the map show of a surface: a plane, a line, or neither."""
+"""What cells of the map show of a surface: a plane, or none."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 
-PATCH_COLUMNS = 16
+PATCH_COLUMNS = 15
 _POINT, _NORMAL, _DIRECTION, _SPREADS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-_ELEVATION, _COUNT, _IS_PLANE, _IS_LINE = 12, 13, 14, 15
+_ELEVATION, _COUNT, _IS_PLANE = 12, 13, 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,7 @@ class PatchTable:
     """N patches, the columns of one array so that one lookup fetches them.
 
     Attributes:
-        values: (N, 16).
+        values: (N, 15).
     """
 
     values: FloatArray
@@ -63,8 +63,3 @@ class PatchTable:
     def is_plane(self) -> NDArray[np.bool_]:
         """(N,) whether it is a plane."""
         return np.asarray(self.values[:, _IS_PLANE] > 0.0)
-
-    @property
-    def is_line(self) -> NDArray[np.bool_]:
-        """(N,) whether it is a line."""
-        return np.asarray(self.values[:, _IS_LINE] > 0.0)

@@ -26,7 +26,7 @@ def belong_to_others(
 ) -> None:  # fmt: skip
     """Write which points (N,), seen from directions (N, 3), belong to the other sides of their cells, in rows (N,).
 
-    What the cells show, (M, 16), is worked out where it must be; see `mapping.surfels.patch_kernels.refresh`.
+    What the cells show, (M, 15), is worked out where it must be; see `mapping.surfels.patch_kernels.refresh`.
     """
     room = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):

@@ -1,6 +1,5 @@
 """The map around the sensor that scans are registered to: planes at several sizes of cells, and lines."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +10,6 @@ from lidarslam.core.state import Saved, State
 from mapping.surfels.cell_kernels import write_views
 from mapping.surfels.grid import SurfelGrid
 from mapping.surfels.match_kernels import Bodies, Pulls, pull_to_bodies, pull_to_planes
-from mapping.surfels.patches import PatchTable
-from mapping.surfels.voxel_hash import ABSENT
 
 # Sizes of the grids, in cells: the finest that shows a plane decides, the coarser reach farther.
 LEVELS = (1, 2, 4)
@@ -56,17 +53,6 @@ class Matches:
         index, first = np.unique(self.index, return_index=True)
         return Matches(index, self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first])
 
-    @classmethod
-    def join(cls, parts: Sequence["Matches"]) -> "Matches":
-        """All of them after one another."""
-        return cls(
-            np.concatenate([part.index for part in parts]),
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.thickness_m for part in parts]),
-            np.concatenate([part.tilt for part in parts]),
-        )
-
 
 class LocalMap:
     """Planes and lines within a radius of the sensor."""
@@ -75,13 +61,12 @@ class LocalMap:
         self.cell_m = cell_m
         self._radius_m = radius_m
         self._planes = [SurfelGrid(cell_m * level) for level in LEVELS]
-        self._lines = SurfelGrid(cell_m * LEVELS[1])
         self._centre: FloatArray | None = None
         self._scans = 0
 
     def __len__(self) -> int:
         """How many cells are held, all grids together."""
-        return sum(len(grid) for grid in (*self._planes, self._lines))
+        return sum(len(grid) for grid in self._planes)
 
     def state(self) -> State:
         """All of it."""
@@ -89,7 +74,6 @@ class LocalMap:
             "cell_m": self.cell_m,
             "radius_m": self._radius_m,
             "planes": [grid.state() for grid in self._planes],
-            "lines": self._lines.state(),
             "centre": self._centre,
             "scans": self._scans,
         }
@@ -101,33 +85,30 @@ class LocalMap:
         restored._planes = [SurfelGrid.restored(grid) for grid in saved.parts("planes")]
         if len(restored._planes) != len(LEVELS):
             raise saved.refuse(f"{len(restored._planes)} grids of planes instead of {len(LEVELS)}")
-        restored._lines = SurfelGrid.restored(saved.part("lines"))
         restored._centre = saved.optional_array("centre", (3,))
         restored._scans = saved.integer("scans")
         return restored
 
-    def add(self, planes: FloatArray, elevations: FloatArray, edges: FloatArray, sensor: FloatArray) -> None:
+    def add(self, planes: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
         """Add a scan.
 
         Args:
             planes: (N, 3) points, in the world.
             elevations: (N,) the angles above the sensor's equator that they were seen at, radians.
-            edges: (E, 3) points on edges, in the world.
             sensor: (3,) where they were seen from.
         """
         views = _views(planes, sensor)
         for grid in self._planes:
             grid.add(planes, elevations, views)
-        self._lines.add(edges, np.zeros(len(edges)), np.zeros((len(edges), 3)))  # both sides of an edge are the edge
         if self._centre is None:
             self._centre = sensor
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
             self._centre = sensor
-            for grid in (*self._planes, self._lines):
+            for grid in self._planes:
                 grid.forget_beyond(sensor, self._radius_m)
         self._scans += 1
         if self._scans % _TIDIED_AFTER == 0:
-            for grid in (*self._planes, self._lines):
+            for grid in self._planes:
                 grid.tidy()
 
     def match_planes(self, points: FloatArray, T_world_lidar: FloatArray, first_level: int = 0) -> Matches:
@@ -155,14 +136,6 @@ class LocalMap:
         index, towards, normals, thickness_m, tilt = pulls
         return Matches(index[:count], towards[:count], normals[:count], thickness_m[:count], tilt[:count])
 
-    def match_lines(self, points: FloatArray) -> Matches:
-        """For edge points (N, 3) of the world the lines they lie on."""
-        rows = self._lines.look_up(points)
-        occupied = np.flatnonzero(rows != ABSENT)
-        patches = self._lines.patches(rows[occupied])
-        chosen = np.flatnonzero(patches.is_line)
-        return _pull_to_lines(occupied[chosen], patches.select(chosen))
-
     def vertical(self) -> FloatArray:
         """The direction (3,) that floors and ceilings near the sensor face; the world's z axis when there are none."""
         grid = self._planes[-1]
@@ -183,7 +156,6 @@ class LocalMap:
         samples = self._planes[0].samples()
         for grid in other._planes:
             grid.add_samples(*samples)
-        other._lines.add(*self._lines.samples())
         return other
 
 
@@ -198,17 +170,3 @@ def _room_for(count: int) -> Pulls:
     vectors = np.empty((2, count, 3))
     numbers = np.empty((2, count))
     return Pulls(np.empty(count, dtype=np.intp), *vectors, *numbers)
-
-
-def _pull_to_lines(index: NDArray[np.intp], patches: PatchTable) -> Matches:
-    """Two directions across each line: the one it is thinnest in, and the other."""
-    spreads = patches.spreads_m
-    tilt = spreads[:, 1] / (np.maximum(spreads[:, 2], 1e-9) * np.sqrt(patches.counts))
-    across = np.cross(patches.directions, patches.normals)
-    return Matches(
-        np.concatenate([index, index]),
-        np.concatenate([patches.points, patches.points]),
-        np.concatenate([patches.normals, across]),
-        np.concatenate([spreads[:, 0], spreads[:, 1]]),
-        np.concatenate([tilt, tilt]),
-    )

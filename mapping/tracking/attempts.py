@@ -111,10 +111,10 @@ def place_surprised(
     """
     sweep, T_world_lidar = sampled.sweep, prediction.T_world_lidar
     starts = [prediction.velocity]
-    if config.continuous_time and sweep.plane_times is not None:
+    if config.continuous_time and sweep.times is not None:
         up = T_world_lidar[:3, :3].T @ local_map.vertical()
         velocities = prediction.velocity + np.outer(_TURNS, np.concatenate([up, np.zeros(3)]))
-        turned = best_velocity(sweep.planes, sweep.plane_times, velocities, T_world_lidar, local_map)
+        turned = best_velocity(sweep.points, sweep.times, velocities, T_world_lidar, local_map)
         starts += [] if np.array_equal(turned, prediction.velocity) else [turned]
     tried = [
         _place_patiently(sampled, replace(prediction, velocity=velocity), last, local_map, config)
@@ -140,7 +140,7 @@ def place_displaced(
         config: how.
     """
     sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
-    points = compensated(sweep.planes, sweep.plane_times, last.velocity)
+    points = compensated(sweep.points, sweep.times, last.velocity)
     if not len(points) or interval_s <= 0.0:
         return []
     radius_m, up = min(_FASTEST_M_S * interval_s, sampled.range_m), local_map.vertical()
@@ -173,7 +173,7 @@ def search(
 ) -> Placed | None:
     """Try a scan turned all around, where it is expected and where the last one was; None when nothing fits well."""
     sweep = sampled.sweep
-    points = compensated(sweep.planes, sweep.plane_times, prediction.velocity)
+    points = compensated(sweep.points, sweep.times, prediction.velocity)
     if not len(points):
         return None
     up, step_deg = local_map.vertical(), config.tracking.search_yaw_step_deg
@@ -191,7 +191,7 @@ def search_everywhere(
     None when it fits well nowhere, or at two places nearly alike: rooms in a row look the same.
     """
     sweep = sampled.sweep
-    points = compensated(sweep.planes, sweep.plane_times, prediction.velocity)
+    points = compensated(sweep.points, sweep.times, prediction.velocity)
     if not len(points):
         return None
     plan = Floorplan.of(local_map.surface(), local_map.vertical(), _DRAWN_CELLS * local_map.cell_m)
@@ -242,11 +242,11 @@ def _place_once(
 ) -> Placed:  # fmt: skip
     sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
     refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
-    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
+    if refined is not None and not (config.continuous_time and sweep.times is not None) and interval_s > 0.0:
         refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
     if refined is None:
         return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
-    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
+    points = compensated(sweep.points, sweep.times, refined.velocity)
     fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
     return Placed(refined, fit, fit.status(config.tracking))
 
@@ -262,7 +262,7 @@ def _with_own_motion(
     velocity = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)
     change = np.abs(velocity - prediction.velocity) * interval_s
     same = np.linalg.norm(change[:3]) < _SAME_ROTATION and np.linalg.norm(change[3:]) < _SAME_TRANSLATION_M
-    if sweep.is_rolling and config.second_deskew and not same:
+    if sweep.times is not None and config.second_deskew and not same:
         again = replace(prediction, T_world_lidar=refined.T_world_lidar, velocity=velocity)
         second = refine(sweep, again, local_map, config.refinement, coarse_first=False, with_velocity=False)
         if second is None:

@@ -25,7 +25,7 @@ def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> Flo
 def box_map(rng: np.random.Generator) -> LocalMap:
     local_map = LocalMap(0.2, 100.0)
     points = box_points(rng, 60_000)
-    local_map.add(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.empty((0, 3)), np.zeros(3))
+    local_map.add(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.zeros(3))
     return local_map
 
 
@@ -55,7 +55,7 @@ def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map: LocalMa
 
 
 def test_points_at_corners_count_once_each(box_map: LocalMap, rng: np.random.Generator) -> None:
-    """Whatever a point there is held against, planes, lines or bodies."""
+    """Whatever a point there is held against, planes or bodies."""
     points = transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 4_000))
     fit = measure_fit(points, T_WORLD_LIDAR, box_map, CONFIG)
     assert fit.matched <= len(points)
@@ -107,7 +107,7 @@ def test_far_points_may_lie_farther_from_their_surface(rng: np.random.Generator)
     for distance, expected in ((40.0, 1.0), (5.0, 0.0)):
         wall = np.column_stack([np.full(20_000, distance), rng.uniform(-3, 3, (20_000, 2))])
         local_map = LocalMap(0.5, 100.0)
-        local_map.add(wall, rng.uniform(-0.1, 0.1, 20_000), np.empty((0, 3)), np.zeros(3))
+        local_map.add(wall, rng.uniform(-0.1, 0.1, 20_000), np.zeros(3))
         asked = np.column_stack([np.full(500, distance - 0.4), rng.uniform(-2, 2, (500, 2))])
         fit = measure_fit(asked, np.eye(4), local_map, CONFIG)
         assert fit.inlier_ratio == expected

@@ -11,16 +11,15 @@ CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
 ORIGIN = np.zeros(3)
 HERE = np.eye(4)
-NO_EDGES = np.empty((0, 3))
 
 
 def elevations_of(points: FloatArray) -> FloatArray:
     return np.asarray(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
 
 
-def map_of(points: FloatArray, edges: FloatArray = NO_EDGES, cell_m: float = CELL) -> LocalMap:
+def map_of(points: FloatArray, cell_m: float = CELL) -> LocalMap:
     local_map = LocalMap(cell_m, 100.0)
-    local_map.add(points, elevations_of(points), edges, ORIGIN)
+    local_map.add(points, elevations_of(points), ORIGIN)
     return local_map
 
 
@@ -69,7 +68,7 @@ def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng: np.random.Genera
     sensors = [np.array([x, 0.0, 0.0]) for x in (0.0, 4.0)]
     local_map = LocalMap(0.07, 100.0)
     for wall, sensor in zip(sides, sensors, strict=True):
-        local_map.add(wall, rng.uniform(-0.3, 0.3, len(wall)), NO_EDGES, sensor)
+        local_map.add(wall, rng.uniform(-0.3, 0.3, len(wall)), sensor)
     for wall, sensor in zip(sides, sensors, strict=True):
         asked = wall[np.abs(wall[:, 1:]).max(axis=1) < 1.0]
         matches = local_map.match_planes(asked, make_transform(np.eye(3), sensor))
@@ -155,32 +154,11 @@ def test_two_rings_on_walls_show_them() -> None:
 def test_nothing_is_matched_in_an_empty_map(rng: np.random.Generator) -> None:
     empty = LocalMap(CELL, 100.0)
     assert len(empty.match_planes(floor_points(rng, 10), HERE)) == 0
-    assert len(empty.match_lines(floor_points(rng, 10))) == 0
 
 
 def test_no_points_have_no_matches(rng: np.random.Generator) -> None:
     local_map = map_of(floor_points(rng, 2_000))
     assert len(local_map.match_planes(np.empty((0, 3)), HERE)) == 0
-    assert len(local_map.match_lines(np.empty((0, 3)))) == 0
-
-
-def test_a_point_beside_a_line_is_pulled_across_it_both_ways(rng: np.random.Generator) -> None:
-    direction = np.array([0.6, 0.0, 0.8])
-    line = [1.0, 2.0, 0.0] + rng.uniform(-3.0, 3.0, (600, 1)) * direction
-    local_map = map_of(floor_points(rng, 100), edges=line)
-    foot = np.array([1.0, 2.0, 0.0]) + 0.3 * direction
-    point = foot + np.array([0.0, 0.07, 0.0])
-    matches = local_map.match_lines(point[None])
-    assert matches.index.tolist() == [0, 0]
-    np.testing.assert_allclose(matches.normals @ direction, 0.0, atol=1e-4)
-    pull = np.einsum("ij,ij->i", point - matches.points, matches.normals) @ matches.normals
-    np.testing.assert_allclose(pull, point - foot, atol=1e-4)
-
-
-def test_edges_are_no_planes_and_planes_no_edges(rng: np.random.Generator) -> None:
-    line = np.column_stack([rng.uniform(-3.0, 3.0, 600), np.zeros((600, 2))])
-    assert len(map_of(np.empty((0, 3)), edges=line).match_planes(line, make_transform(np.eye(3), [0.0, 0.0, 3.0]))) == 0
-    assert len(map_of(line).match_lines(line)) == 0
 
 
 def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
@@ -189,7 +167,7 @@ def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
     for step in range(200):
         sensor = np.array([10.0 * step, 0.0, 0.0])
         points = sensor + rng.uniform(-30.0, 30.0, (300, 3)) * [1.0, 1.0, 0.1]
-        local_map.add(points, np.zeros(300), points[:30], sensor)
+        local_map.add(points, np.zeros(300), sensor)
         sizes.append(len(local_map))
     assert max(sizes[100:]) < 1.2 * max(sizes[:30])
     assert min(sizes[100:]) > 0.5 * max(sizes[:30])
@@ -198,9 +176,9 @@ def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
 def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
     local_map = LocalMap(CELL, 20.0)
     floor = floor_points(rng, 20_000, half_size=3.0)
-    local_map.add(floor, elevations_of(floor), NO_EDGES, ORIGIN)
+    local_map.add(floor, elevations_of(floor), ORIGIN)
     away = floor + np.array([30.0, 0.0, 0.0])
-    local_map.add(away, elevations_of(floor), NO_EDGES, np.array([30.0, 0.0, 0.0]))
+    local_map.add(away, elevations_of(floor), np.array([30.0, 0.0, 0.0]))
     assert len(local_map.match_planes(floor[:200], HERE)) == 0
     assert len(local_map.match_planes(away[:200], make_transform(np.eye(3), [30.0, 0.0, 0.0]))) == 200
 
@@ -225,14 +203,6 @@ def test_grazed_ground_is_still_known_when_cells_change_their_size(rng: np.rando
     local_map = map_of(ground)
     before, after = (len(m.match_planes(ground[:500], HERE)) for m in (local_map, local_map.resized(2.0 * CELL)))
     assert after > 0.8 * before > 350
-
-
-def test_lines_stay_in_place_when_cells_change_their_size(rng: np.random.Generator) -> None:
-    line = np.column_stack([np.full(600, 1.03), np.full(600, 2.02), rng.uniform(-3.0, 3.0, 600)])
-    resized = map_of(floor_points(rng, 100), edges=line).resized(CELL * 2.0)
-    matches = resized.match_lines(line)
-    assert len(np.unique(matches.index)) > 0.9 * len(line)
-    assert distances(line, matches).max() < 1e-4
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 10.0, -35.0])
@@ -261,11 +231,11 @@ def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(
 
     def add(local_map: LocalMap) -> int:
         tidied.clear()
-        local_map.add(rng.uniform(-1.0, 1.0, (50, 3)), np.zeros(50), np.empty((0, 3)), np.zeros(3))
+        local_map.add(rng.uniform(-1.0, 1.0, (50, 3)), np.zeros(50), np.zeros(3))
         return len(tidied)
 
     local_map = LocalMap(0.1, 30.0)
-    assert [add(local_map) for _ in range(5)] == [0, 0, 4, 0, 0]
+    assert [add(local_map) for _ in range(5)] == [0, 0, 3, 0, 0]
     restored = LocalMap.restored(Saved(local_map.state()))
-    assert [add(restored) for _ in range(4)] == [4, 0, 0, 4]
-    assert [add(local_map.resized(0.2)), add(local_map)] == [4, 4]
+    assert [add(restored) for _ in range(4)] == [3, 0, 0, 3]
+    assert [add(local_map.resized(0.2)), add(local_map)] == [3, 3]

@@ -13,7 +13,6 @@ from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig, TrackingConfig
 from mapping.global_map import global_map
 from mapping.global_map.global_map import GlobalMap
-from mapping.loam.rings import RingFinder, RingSource
 from mapping.mapper import MappedScan, Mapper
 from mapping.pose_graph.graph_config import KeyframeConfig
 from mapping.pose_graph.keyframes import KeyframeSelector
@@ -69,7 +68,7 @@ def test_a_map_that_has_forgotten_goes_on(
 
     def add(local_map: LocalMap, step: int, seed: int) -> None:
         points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])
-        local_map.add(points, np.zeros(3000), points[:200], np.array([2.0 * step, 0.0, 0.0]))
+        local_map.add(points, np.zeros(3000), np.array([2.0 * step, 0.0, 0.0]))
 
     whole = LocalMap(0.3, 6.0)
     for step in range(4):
@@ -80,12 +79,9 @@ def test_a_map_that_has_forgotten_goes_on(
     for step in range(4, 8):
         add(whole, step, step)
         add(restored, step, step)
-        for one, other in (
-            (restored.match_planes(queries, np.eye(4)), whole.match_planes(queries, np.eye(4))),
-            (restored.match_lines(queries), whole.match_lines(queries)),
-        ):
-            for name, value in vars(other).items():
-                np.testing.assert_array_equal(getattr(one, name), value)
+        found = restored.match_planes(queries, np.eye(4))
+        for name, value in vars(whole.match_planes(queries, np.eye(4))).items():
+            np.testing.assert_array_equal(getattr(found, name), value)
 
 
 def test_a_global_map_goes_on(
@@ -105,32 +101,6 @@ def test_a_global_map_goes_on(
         for cloud in clouds[after:]:
             restored.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
         np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
-
-
-@pytest.mark.parametrize("source", ["ELEVATION", "STORAGE", "FIELD", "NONE"])
-def test_rings_are_found_as_before(source: str, rng: np.random.Generator, through_disk: ThroughDisk) -> None:
-    azimuth = np.tile(np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False), 8)
-    ring = np.repeat(np.arange(8), 720)
-    spread = {"ELEVATION": 0.0, "STORAGE": 0.015}.get(source, 0.3)
-    elevation = np.deg2rad(2.0 * ring) + spread * rng.normal(size=len(ring))
-    if source == "NONE":
-        shuffled = rng.permutation(len(ring))
-        azimuth, elevation, ring = azimuth[shuffled], elevation[shuffled], ring[shuffled]
-    if source == "FIELD":
-        elevation = np.deg2rad(2.0 * ring)
-    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    points = 5.0 * np.stack(rays, axis=1)
-    given = ring if source == "FIELD" else None
-    finder = RingFinder()
-    finder.rings(points, given)
-    assert finder.source is RingSource[source]
-    restored = RingFinder()
-    restored.restore(through_disk(finder.state()))
-    expected, found = finder.rings(points[::-1], given), restored.rings(points[::-1], given)
-    assert restored.source is finder.source
-    assert (found is None) == (expected is None)
-    if expected is not None:
-        np.testing.assert_array_equal(found, expected)
 
 
 def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: ThroughDisk) -> None:

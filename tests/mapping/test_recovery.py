@@ -54,7 +54,7 @@ def l_map(rng: np.random.Generator, l_shaped_room: RoomPoints) -> LocalMap:
     points = l_shaped_room(rng, 20_000)
     local_map = LocalMap(0.2, 100.0)
     elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
-    local_map.add(points, elevations, np.empty((0, 3)), np.zeros(3))
+    local_map.add(points, elevations, np.zeros(3))
     return local_map
 
 

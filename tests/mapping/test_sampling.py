@@ -69,8 +69,8 @@ def test_times_stay_with_their_points(rng: np.random.Generator) -> None:
     index = np.round(1e6 * sampled.times).astype(int)
     np.testing.assert_array_equal(sampled.points, scan.points[index])
     sweep = sampled.sweep
-    assert sweep.plane_times is not None
-    np.testing.assert_array_equal(sweep.planes, scan.points[np.round(1e6 * sweep.plane_times).astype(int)])
+    assert sweep.times is not None
+    np.testing.assert_array_equal(sweep.points, scan.points[np.round(1e6 * sweep.times).astype(int)])
 
 
 def test_elevations_are_those_of_their_points(rng: np.random.Generator) -> None:
@@ -82,17 +82,13 @@ def test_elevations_are_those_of_their_points(rng: np.random.Generator) -> None:
 def test_a_scan_without_times_is_sampled_without(rng: np.random.Generator) -> None:
     sampled = sample(Scan(shell(rng, 5.0).points, 1.5))
     assert sampled.times is None
-    assert not sampled.sweep.is_rolling
+    assert sampled.sweep.times is None
     assert sampled.stamp == 1.5
 
 
-def test_without_the_wish_for_edges_there_are_none(rng: np.random.Generator) -> None:
-    assert len(sample(shell(rng, 5.0)).edges) == 0
-
-
 def test_nothing_is_sampled_from_nothing() -> None:
-    sampled = sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)), edges=True)
-    assert len(sampled) == len(sampled.keys) == len(sampled.edges) == 0
+    sampled = sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)))
+    assert len(sampled) == len(sampled.keys) == 0
     assert sampled.cell_m > 0.0
 
 

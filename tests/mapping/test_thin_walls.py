@@ -14,7 +14,6 @@ from mapping.surfels.voxel_hash import VoxelTable, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005
-NO_EDGES = np.empty((0, 3))
 SENSORS = (np.array([0.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]))
 OFFSETS = np.arange(8) / 8.0
 ONE_AFTER_THE_OTHER, IN_TURNS = [0] * 20 + [1] * 20, [0, 1] * 20
@@ -31,7 +30,7 @@ def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float
         points = face(rng, faces[side], half_size, 1_000)
         local_map.match_planes(points, make_transform(np.eye(3), SENSORS[side]))  # as a scan is before it is added
         points[:, 0] += rng.normal(0.0, NOISE_M, len(points))
-        local_map.add(points, rng.uniform(-0.3, 0.3, len(points)), NO_EDGES, SENSORS[side])
+        local_map.add(points, rng.uniform(-0.3, 0.3, len(points)), SENSORS[side])
     return local_map
 
 
