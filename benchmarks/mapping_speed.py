@@ -45,14 +45,14 @@ from mapping import mapper, sampling
 from mapping.config import MappingConfig
 from mapping.mapper import Mapper
 from mapping.prediction import Prior
-from mapping.tracking import attempts as placement
+from mapping.tracking import attempts
 
 # Stage -> what is timed for it: the object that holds the function, and its name there.
 _STAGES: dict[str, tuple[Any, str]] = {
     "thin": (sampling.Sampler, "sample"),
-    "registration": (placement, "refine"),
-    "fit": (placement, "measure_fit"),
-    "map update": (mapper.Mapper, "_add"),
+    "registration": (attempts, "register"),
+    "fit": (attempts, "measure_fit"),
+    "map update": (mapper, "_insert"),
     "rest": (mapper.Mapper, "process"),
 }
 _OURS = {"default": MappingConfig()}

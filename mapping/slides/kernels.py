@@ -1,4 +1,4 @@
-"""Loops of the check for slides: normals from a spherical image of a scan, and votes for shifts between two scans."""
+"""Compiled loops: local moments from a spherical image of a scan, and votes for shifts between two scans."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ from lidarslam.core.geometry import FloatArray
 
 # Pixels of one degree.
 ROWS, COLUMNS = 180, 360
-# The neighbourhood of a pixel, in rows and columns to either side; beams are farther apart than points of a ring.
+# Neighbourhood of a pixel, in rows and columns to either side; rings are farther apart than points of a ring.
 _NEAR_ROWS, _NEAR_COLUMNS = 2, 1
-# Neighbours are no farther from a point than this share of its range.
+# Largest distance of a neighbour, as a share of the range.
 _REACH = 0.1
-# Normals of one surface, seen in two scans, have at least this cosine.
+# Least cosine between normals of one surface in two scans.
 _SAME_NORMAL = 0.9
 
 
@@ -80,7 +80,7 @@ def vote(
     held_normals: FloatArray, held_radii: FloatArray, direction: FloatArray, gate_m: float, bin_m: float,
     votes: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Add up which shifts of a scan along a direction lay its surfels on those of another.
+    """Add up votes for the shifts of a scan along a direction that lay its surfels on those of another.
 
     A surfel p with a normal like that n of a held surfel a lies in its plane after the shift n.(a - p) / n.d, and votes
     for it if it then lies within a's radius; the vote falls off to zero where it is `gate_m` off the plane. A surfel

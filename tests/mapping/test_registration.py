@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
-from mapping.config import RefinementConfig
+from mapping.deskew import Sweep
 from mapping.prediction import Prediction
-from mapping.registration import Refined, Sweep, refine
-from mapping.surfels.surfel_map import LocalMap
+from mapping.registration import Registration
+from mapping.registration import register as register_sweep
+from mapping.surfels.surfel_map import SurfelMap
 
-CONFIG = RefinementConfig()
 CELL = 0.2
 HALF = np.array([4.0, 3.0, 1.5])
 T_TRUE = exp([0.02, -0.03, 0.5, 0.6, -0.4, 0.1])
@@ -27,11 +27,11 @@ def sides(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2
     return points
 
 
-def map_of(planes: FloatArray, seen_from: FloatArray | None = None) -> LocalMap:
+def map_of(planes: FloatArray, seen_from: FloatArray | None = None) -> SurfelMap:
     sensor = np.zeros(3) if seen_from is None else seen_from
-    local_map = LocalMap(CELL, 100.0)
+    local_map = SurfelMap(CELL, 100.0)
     rays = planes - sensor
-    local_map.add(planes, np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)), sensor)
+    local_map.insert(planes, np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)), sensor)
     return local_map
 
 
@@ -60,15 +60,13 @@ def predicted(
     """A prediction that is hardly trusted."""
     variances = np.array([np.deg2rad(rotation_deg)] * 3 + [metres] * 3) ** 2
     motion = np.zeros(6) if velocity is None else velocity
-    return Prediction(T_world_lidar, motion, np.diag(np.concatenate([variances, 100.0 * variances])))
+    return Prediction(0.0, T_world_lidar, motion, np.diag(np.concatenate([variances, 100.0 * variances])))
 
 
-def register(
-    sweep: Sweep, prediction: Prediction, local_map: LocalMap, coarse_first: bool = True, config: Any = CONFIG
-) -> Refined:
-    refined = refine(sweep, prediction, local_map, config, coarse_first, with_velocity=True)
-    assert refined is not None
-    return refined
+def register(sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap, coarse_first: bool = True) -> Registration:
+    registration = register_sweep(sweep, prediction, surfel_map, with_velocity=True, coarse_first=coarse_first)
+    assert registration is not None
+    return registration
 
 
 def assert_at(T_found: FloatArray, T_true: FloatArray, metres: float, degrees: float) -> None:
@@ -78,13 +76,13 @@ def assert_at(T_found: FloatArray, T_true: FloatArray, metres: float, degrees: f
 
 
 @pytest.fixture(scope="module")
-def box_map() -> LocalMap:
+def box_map() -> SurfelMap:
     rng = np.random.default_rng(5)
     return map_of(sides(rng, 60_000))
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map: LocalMap, seed: int) -> None:
+def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map: SurfelMap, seed: int) -> None:
     rng = np.random.default_rng(seed)
     axes = rng.normal(size=(2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -94,13 +92,13 @@ def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map: L
     assert len(refined.degeneracy) == 0
 
 
-def test_fine_cells_alone_suffice_nearby(box_map: LocalMap, rng: np.random.Generator) -> None:
+def test_fine_cells_alone_suffice_nearby(box_map: SurfelMap, rng: np.random.Generator) -> None:
     off = exp([0.01, -0.01, 0.01, 0.03, -0.03, 0.02])
     refined = register(snapshot(rng), predicted(T_TRUE @ off), box_map, coarse_first=False)
     assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
 
 
-def test_the_true_pose_stays(box_map: LocalMap, rng: np.random.Generator) -> None:
+def test_the_true_pose_stays(box_map: SurfelMap, rng: np.random.Generator) -> None:
     refined = register(snapshot(rng), predicted(T_TRUE), box_map, coarse_first=False)
     assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
     assert refined.iterations <= 2
@@ -108,7 +106,7 @@ def test_the_true_pose_stays(box_map: LocalMap, rng: np.random.Generator) -> Non
 
 @pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
 def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(
-    box_map: LocalMap, rng: np.random.Generator, stamp_at: float
+    box_map: SurfelMap, rng: np.random.Generator, stamp_at: float
 ) -> None:
     """At 120 deg/s and 1.5 m/s the sweep is bent by 12 degrees and 15 cm."""
     refined = register(sweep_of(rng, TURNING, stamp_at=stamp_at), predicted(T_TRUE), box_map)
@@ -118,24 +116,24 @@ def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(
 
 
 def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(
-    box_map: LocalMap, rng: np.random.Generator
+    box_map: SurfelMap, rng: np.random.Generator
 ) -> None:
     off = exp([0.0, 0.0, 0.05, 0.1, 0.0, 0.0])
     prediction = predicted(T_TRUE @ off, TURNING)
-    refined = refine(sweep_of(rng, TURNING), prediction, box_map, CONFIG, coarse_first=True, with_velocity=False)
+    refined = register_sweep(sweep_of(rng, TURNING), prediction, box_map, with_velocity=False)
     assert refined is not None
     assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
     np.testing.assert_array_equal(refined.velocity, TURNING)
 
 
 @pytest.fixture(scope="module")
-def corridor_map() -> LocalMap:
+def corridor_map() -> SurfelMap:
     return map_of(sides(np.random.default_rng(5), 60_000, axes=(1, 2)))
 
 
 @pytest.mark.parametrize("along_m", [0.3, -0.7])
 def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(
-    corridor_map: LocalMap, rng: np.random.Generator, along_m: float
+    corridor_map: SurfelMap, rng: np.random.Generator, along_m: float
 ) -> None:
     """The corridor goes along x of the world; sensor and prediction look elsewhere."""
     shift = np.eye(4)
@@ -163,7 +161,7 @@ def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng: np.random.Ge
 
 
 def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(
-    corridor_map: LocalMap, rng: np.random.Generator
+    corridor_map: SurfelMap, rng: np.random.Generator
 ) -> None:
     T_level = np.eye(4)
     truth = np.concatenate([np.deg2rad([0.0, 0.0, 20.0]), [1.0, 0.3, 0.0]])
@@ -189,28 +187,27 @@ def test_a_few_points_on_its_end_hold_a_corridor(off_m: float) -> None:
     assert_at(refined.T_world_lidar, T_TRUE, 2e-3, 0.02)
 
 
-def test_too_few_points_make_no_pose(box_map: LocalMap, rng: np.random.Generator) -> None:
-    few = snapshot(rng, count=59)
-    assert refine(few, predicted(T_TRUE), box_map, RefinementConfig(min_matches=60), True, False) is None
-    assert refine(few, predicted(T_TRUE), box_map, RefinementConfig(min_matches=50), True, False) is not None
+@pytest.mark.parametrize(("count", "suffices"), [(59, False), (100, True)])
+def test_too_few_points_make_no_pose(box_map: SurfelMap, rng: np.random.Generator, count: int, suffices: bool) -> None:
+    few = snapshot(rng, count=count)
+    assert (register_sweep(few, predicted(T_TRUE), box_map, with_velocity=False) is not None) == suffices
 
 
 @pytest.mark.parametrize("count", [0, 500])
 def test_nothing_to_meet_makes_no_pose(rng: np.random.Generator, count: int) -> None:
-    assert refine(snapshot(rng, count=count), predicted(T_TRUE), LocalMap(CELL, 10.0), CONFIG, True, False) is None
+    assert register_sweep(snapshot(rng, count=count), predicted(T_TRUE), SurfelMap(CELL, 10.0), False) is None
 
 
-def test_no_more_iterations_than_allowed(box_map: LocalMap, rng: np.random.Generator) -> None:
+def test_no_more_iterations_than_allowed(
+    box_map: SurfelMap, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     off = exp([0.0, 0.0, 0.03, 0.05, -0.05, 0.0])
-    free, bound = (
-        register(snapshot(rng), predicted(T_TRUE @ off), box_map, False, RefinementConfig(max_iterations=most))
-        for most in (20, 2)
-    )
-    assert free.iterations > 2
-    assert bound.iterations == 2
+    assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations > 2
+    monkeypatch.setattr("mapping.registration._ITERATIONS", (3, 2))
+    assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations == 2
 
 
-def test_outliers_do_not_move_the_pose(box_map: LocalMap, rng: np.random.Generator) -> None:
+def test_outliers_do_not_move_the_pose(box_map: SurfelMap, rng: np.random.Generator) -> None:
     """A third of the points stands away from the walls, all on one side of them, as people and furniture do."""
     world = sides(rng, 3_000, margin=2.1 * CELL)
     world[::3] *= rng.uniform(0.8, 0.98, (1_000, 1))
@@ -219,7 +216,7 @@ def test_outliers_do_not_move_the_pose(box_map: LocalMap, rng: np.random.Generat
     assert_at(register(sweep, predicted(T_TRUE @ off), box_map).T_world_lidar, T_TRUE, 0.01, 0.1)
 
 
-def test_the_covariance_has_its_order_and_its_frame(corridor_map: LocalMap, rng: np.random.Generator) -> None:
+def test_the_covariance_has_its_order_and_its_frame(corridor_map: SurfelMap, rng: np.random.Generator) -> None:
     """Turned left by 90 degrees, the sensor sees the corridor go along its own y."""
     T_turned = exp([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0])
     prediction = predicted(T_turned, rotation_deg=3.0, metres=0.5)
@@ -241,7 +238,7 @@ def test_rotations_come_first_in_the_covariance(rng: np.random.Generator) -> Non
     assert sigmas[3:5].min() > 10.0 * sigmas[5]
 
 
-def test_the_covariance_is_symmetric_and_positive(box_map: LocalMap, rng: np.random.Generator) -> None:
+def test_the_covariance_is_symmetric_and_positive(box_map: SurfelMap, rng: np.random.Generator) -> None:
     covariance = register(sweep_of(rng, TURNING), predicted(T_TRUE), box_map).covariance
     assert covariance.shape == (12, 12)
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
@@ -275,14 +272,14 @@ def registrations(room: Any, sigma_m: float, count: int = 20) -> Consistency:
     start = exp([0.0, 0.0, 0.3, -4.0, 0.0, -0.4])
     found = []
     for seed in range(count):
-        local_map = LocalMap(CELL, 100.0)
+        local_map = SurfelMap(CELL, 100.0)
         for k in range(3):
             T = start @ exp(0.1 * k * velocity)
             points, times = noisy_scan(room, 100 * seed + k, T, velocity, sigma_m, 6_000)
             moved = exp(times[:, None] * velocity)
             straight = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
             elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
-            local_map.add(transform_points(T, straight), elevations, T[:3, 3])
+            local_map.insert(transform_points(T, straight), elevations, T[:3, 3])
         T_true = start @ exp(0.3 * velocity)
         points, times = noisy_scan(room, 100 * seed + 3, T_true, velocity, sigma_m, 2_500)
         rng = np.random.default_rng(seed)
