@@ -51,7 +51,7 @@ class MappingConfig(BaseModel):
     cell_m: float | None = Field(
         None, ge=0.01, description="edge of the finest surfel cells; null: a thirtieth of the scene's median range"
     )
-    radius_m: float = Field(100.0, gt=0.0, description="radius of the local map around the sensor")
+    radius_m: float = Field(100.0, ge=1.0, description="radius of the local map around the sensor")
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")
     max_range_m: float = Field(100.0, gt=0.0, description="farther points are ignored")
     keypoints: int = Field(3000, ge=100, description="points of a scan that are registered, at most")

@@ -4,11 +4,11 @@ Each scan is predicted from the last motion and the odometry, registered to the 
 inserted into the map. `mapping.tracking` has the cases in which the registration fails.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
+from lidarslam.core.geometry import displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
@@ -18,40 +18,13 @@ from mapping.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Predi
 from mapping.sampling import SampledScan, Sampler
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.fit import Fit
-from mapping.tracking.tracker import Tracker
+from mapping.tracking.tracker import MappedScan, Tracker
 
 # The velocity of a lost sensor fades by this factor a scan.
 _FADING = 0.7
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2
-
-
-@dataclass(frozen=True, eq=False)
-class MappedScan:
-    """Result of a scan.
-
-    Attributes:
-        state: pose at the stamp and velocity during the sweep, with their covariance.
-        T_world_expected: (4, 4) predicted pose.
-        registered: whether the pose is that of a registration; else it is the predicted one.
-        status, message: tracking status, and its reason.
-        fit: to the map; None where the scan was not compared with it.
-        degenerate: names of the directions along which the prediction was kept.
-        iterations: of the registration.
-        added: whether the scan was inserted into the map.
-        way_known: whether the sensor was tracked from the scan before; else it was relocalised, or only predicted.
-    """
-
-    state: MotionState
-    T_world_expected: FloatArray
-    registered: bool
-    status: Status
-    message: str = ""
-    fit: Fit | None = None
-    degenerate: tuple[str, ...] = ()
-    iterations: int = 0
-    added: bool = False
-    way_known: bool = True
+_AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 
 
 class Mapper(Stateful):
@@ -84,9 +57,7 @@ class Mapper(Stateful):
         first, self._first = self._first, None
         if self._map is None:
             mapped = self._begin(sampled, prior, last)
-        elif first is None or sampled.stamp <= last.stamp:
-            mapped = self._track(sampled, prior, last, self._map)
-        elif prior.velocity is None or first.is_followed_by(sampled):
+        elif first is not None and (prior.velocity is None or first.is_followed_by(sampled)):
             mapped = self._track_second(sampled, prior, last, first, self._map)
         else:
             mapped = self._track(sampled, prior, last, self._map)
@@ -94,7 +65,7 @@ class Mapper(Stateful):
         return mapped
 
     def _track(self, scan: SampledScan, prior: Prior, last: MotionState, surfel_map: SurfelMap) -> MappedScan:
-        """One step of the mapping."""
+        """Predict, register, judge, insert."""
         self._map = surfel_map = surfel_map.resized(scan.cell_m)
         # Predict the pose and the velocity from the last motion and the odometry.
         prediction = self._tracker.predict(scan, prior, last)
@@ -103,28 +74,15 @@ class Mapper(Stateful):
         # Register the keypoints to the surfels; where that fails, relocalise.
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.status is Status.LOST or attempt.registration is None:
-            reason = (
-                attempt.fit.explain(self._config.tracking) or "ambiguous: it fits elsewhere in the map nearly as well"
-            )
+            reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
             return self._lose(scan, attempt.prediction, surfel_map, attempt.fit, reason)
         # Judge the pose by its fit, and adapt the noise of process and odometry.
-        tracked = self._tracker.accept(attempt, scan, prior, prediction, last)
+        mapped = self._tracker.accept(attempt, scan, prior, prediction, last)
         # Insert the scan into the map that it was registered to, which may be an archived one.
         self._map = attempt.surfel_map
-        if tracked.insert:
-            _insert(scan, tracked.state, self._map)
-        return MappedScan(
-            state=tracked.state,
-            T_world_expected=attempt.prediction.T_world_lidar,
-            registered=True,
-            status=tracked.status,
-            message=tracked.message,
-            fit=attempt.fit,
-            degenerate=attempt.registration.degeneracy.names,
-            iterations=attempt.registration.iterations,
-            added=tracked.insert,
-            way_known=not attempt.relocalised,
-        )
+        if mapped.added:
+            _insert(scan, mapped.state, self._map)
+        return mapped
 
     def _begin(self, scan: SampledScan, prior: Prior, last: MotionState) -> MappedScan:
         """The first scan makes the map."""
@@ -145,9 +103,9 @@ class Mapper(Stateful):
 
         Two sweeps bent alike fit one another and hide a common motion, the motion between their poses does not.
         """
-        before = self._tracker.copy()
+        before = self._tracker.snapshot()
         mapped = self._track(scan, prior, last, surfel_map)
-        for _ in range(_REDRAWS):
+        for _ in range(_REDRAWS if scan.stamp > last.stamp else 0):
             motion = inverse(last.T_world_lidar) @ mapped.state.T_world_lidar
             if not mapped.registered or displacement_m(log(motion), scan.range_m) < surfel_map.cell_m:
                 break

@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.core.state import Shape
 from mapping.config import MappingConfig
 
-# No pose is known better than this, whatever the residuals say (standard deviations, rotation first).
+# Least standard deviations of any pose, rotation first.
 LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 # Covariances (12, 12) of pose and velocity, where the velocity is unknown, and where tracking was lost.
 _ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
@@ -31,7 +31,7 @@ _PROVEN_AFTER = 10
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Odometry's measurements of a scan; None for what was not measured.
+    """Odometry's measurements of a scan; None where it has none.
 
     Attributes:
         T_prev_curr: (4, 4) motion since the previous scan.

@@ -35,7 +35,7 @@ class SampledScan:
         range_m: smoothed median range of the scene.
         sweep: N points for the map.
         elevations: (N,) their angles above the sensor's equator, radians.
-        keypoints: those of them that are registered.
+        keypoints: the subset that is registered.
     """
 
     stamp: float

@@ -36,9 +36,10 @@ def write_moments(
     covariances: FloatArray, counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Write the mean (M, 3), covariance (M, 3, 3) and number (M,) of the points around pixels (M, 2) of an image."""
+    offset = np.empty(3)
     for m in range(len(pixels)):
-        centre = image[pixels[m, 0], pixels[m, 1]]
-        squared_range = points[centre, 0] ** 2 + points[centre, 1] ** 2 + points[centre, 2] ** 2
+        centre = points[image[pixels[m, 0], pixels[m, 1]]]
+        reach2 = _REACH * _REACH * (centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
         count = 0
         means[m, :] = 0.0
         covariances[m, :, :] = 0.0
@@ -47,31 +48,22 @@ def write_moments(
                 n = image[row, (pixels[m, 1] + step) % COLUMNS]
                 if n < 0:
                     continue
-                x, y, z = (
-                    points[n, 0] - points[centre, 0],
-                    points[n, 1] - points[centre, 1],
-                    points[n, 2] - points[centre, 2],
-                )
-                if x * x + y * y + z * z > _REACH * _REACH * squared_range:
+                for i in range(3):
+                    offset[i] = points[n, i] - centre[i]
+                if offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 > reach2:
                     continue
                 count += 1
-                means[m, 0] += x
-                means[m, 1] += y
-                means[m, 2] += z
-                covariances[m, 0, 0] += x * x
-                covariances[m, 1, 0] += x * y
-                covariances[m, 1, 1] += y * y
-                covariances[m, 2, 0] += x * z
-                covariances[m, 2, 1] += y * z
-                covariances[m, 2, 2] += z * z
+                for i in range(3):
+                    means[m, i] += offset[i]
+                    for j in range(i + 1):
+                        covariances[m, i, j] += offset[i] * offset[j]
         counts[m] = count
         for i in range(3):
             for j in range(i + 1):
                 value = covariances[m, i, j] / count - means[m, i] * means[m, j] / (count * count)
-                covariances[m, i, j] = value
-                covariances[m, j, i] = value
+                covariances[m, i, j] = covariances[m, j, i] = value
         for i in range(3):
-            means[m, i] = points[centre, i] + means[m, i] / count
+            means[m, i] = centre[i] + means[m, i] / count
 
 
 @compiled
@@ -82,8 +74,8 @@ def vote(
 ) -> None:  # fmt: skip
     """Add up votes for the shifts of a scan along a direction that lay its surfels on those of another.
 
-    A surfel p with a normal like that n of a held surfel a lies in its plane after the shift n.(a - p) / n.d, and votes
-    for it if it then lies within a's radius; the vote falls off to zero where it is `gate_m` off the plane. A surfel
+    A surfel p is in the plane of a held surfel a with a similar normal n after the shift n.(a - p) / n.d, and votes for
+    it if it is then within a's radius; the vote falls off to zero at a distance of `gate_m` from the plane. A surfel
     has at most one vote for each shift.
 
     Args:

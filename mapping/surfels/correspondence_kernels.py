@@ -1,6 +1,6 @@
 """Point-to-plane correspondences of points with surfels: the compiled loops of `SurfelMap.match`.
 
-The columns of surfels (M, 15) are those of `mapping.surfels.surfel_table`: mean, normal, direction, standard deviations
+The columns of surfels (M, 15) are as in `mapping.surfels.grid`: mean, normal, direction, standard deviations
 (three each), standard deviation of the elevation, number of points, whether it is a plane.
 """
 
@@ -43,16 +43,10 @@ def match_planes(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray, sensor: FloatArray,
     found: Rows, begin: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Write a correspondence for every point whose cell has a plane.
+    """Write a correspondence, from row `begin` on, for every unmatched point (N, 3) whose cell has a plane.
 
-    Args:
-        points: (N, 3) in the world.
-        unmatched: (W,) indices of the points; those without a plane are moved to its beginning.
-        rows: (W,) of their cells, -1 where there is none.
-        surfels: (M, 15).
-        sensor: (3,) in the world.
-        found: correspondences, written.
-        begin: number of correspondences before.
+    `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
+    without a plane are moved to the beginning of `unmatched`.
 
     Returns:
         Numbers of correspondences and of unmatched points.
@@ -86,18 +80,8 @@ def match_compact(
     The mean of a surfel is a point on the object only where the object ends within it, not in grass. Across the rings a
     surfel is as short as its rings are close: these axes are left out, or the map would follow the sensor.
 
-    Args:
-        points: (N, 3) in the world.
-        unmatched: (W,) indices of the points.
-        rows: (N,) of the cells of all points, -1 where there is none.
-        surfels: (M, 15).
-        T_world_lidar: (4, 4) pose of the sensor.
-        largest_m: standard deviation of a short axis, at most.
-        found: correspondences, written.
-        begin: number of correspondences before.
-
-    Returns:
-        Number of correspondences.
+    `unmatched` (W,) has the indices of the points (N, 3), `rows` (N,) the cells of all points, or -1. Axes are short
+    below a standard deviation of `largest_m`. Returns the number of correspondences.
     """
     count = begin
     sensor = T_world_lidar[:3, 3]

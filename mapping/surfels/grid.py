@@ -145,7 +145,7 @@ class SurfelGrid(Stateful):
         for column, (i, j) in enumerate(SYMMETRIC, _SECOND.start):
             covariance[:, i, j] = covariance[:, j, i] = sums[:, column] / counts - mean[:, i] * mean[:, j]
         values, axes = np.linalg.eigh(covariance)
-        # Three times the variance, as only one pair in three lies along each axis; and no farther than the cell goes.
+        # Three times the variance, as only one pair in three is along each axis; clipped to the cell.
         reach = np.minimum(np.sqrt(3.0 * np.maximum(values, 0.0)), 0.5)
         reach[counts < _SAMPLES] = 0.0
         arms = np.swapaxes(axes, 1, 2) * reach[:, :, None]
@@ -181,7 +181,7 @@ class SurfelGrid(Stateful):
         self._surfel_counts[:] = 0.0
 
     def _keep(self, kept: NDArray[np.intp]) -> None:
-        """Drop all cells but those in these rows."""
+        """Keep the cells in these rows only."""
         if len(kept) == len(self):
             return
         self._keys = self._keys[kept]

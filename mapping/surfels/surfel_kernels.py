@@ -1,6 +1,6 @@
 """Surfels from the moments of a cell and its neighbours: the compiled loops of `SurfelGrid.surfels`.
 
-The columns of surfels are those of `mapping.surfels.surfel_table`.
+The columns of surfels are as in `mapping.surfels.grid`.
 """
 
 import math
@@ -28,13 +28,9 @@ _LEAST_WIDTH = 0.15
 
 @compiled
 def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32]) -> None:
-    """Compute the surfels of the cells in these rows (N,), or -1, that have grown since their last computation.
+    """Compute the surfels (M, 15) of the cells in these rows (N,), or -1, that have grown since the last computation.
 
-    Args:
-        rows: of the cells.
-        cells: of the grid.
-        surfels: (M, 15), written.
-        counts: (M,) numbers of points at the last computation, written.
+    `counts` (M,) has the numbers of points at the last computation.
     """
     scratch = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):

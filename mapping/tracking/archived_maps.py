@@ -41,7 +41,7 @@ class ArchivedMaps(Stateful):
     ) -> Attempt | None:
         """Relocalise a scan in the archived maps, the latest first; None when no search is due, or it fits none.
 
-        The map, and those archived after it, are no longer archived then.
+        The map and all archived after it leave the archive.
         """
         self._scans_until_search -= 1
         if not self._maps or self._scans_until_search > 0:

@@ -150,7 +150,7 @@ class ScanMatcher:
         """Attempts with status ok from displacements since the last scan in every horizontal direction.
 
         A sensor at speed at the first scan, or with a wrong odometry, is out of reach of the predicted pose, and most
-        of a street fits there too. The rotations are those of the given poses (4, 4).
+        of a street fits there too. The rotations are taken from the given poses (4, 4).
         """
         last, interval_s = self.last, self.scan.stamp - self.last.stamp
         points = self.scan.keypoints.compensated(last.velocity)

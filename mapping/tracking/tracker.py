@@ -25,6 +25,7 @@ from mapping.sampling import SampledScan
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.archived_maps import ArchivedMaps
 from mapping.tracking.attempts import Attempt, ScanMatcher, best_of
+from mapping.tracking.fit import Fit
 from mapping.tracking.pose_status import judge
 from mapping.tracking.tracking_state import TrackingState
 
@@ -37,19 +38,31 @@ _BETTER, _CLEARLY_BETTER = 1.05, 1.1
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
-    """Verdict on a registered scan.
+class MappedScan:
+    """Result of a scan.
 
     Attributes:
-        state: pose and velocity that the next scan is predicted from.
+        state: pose at the stamp and velocity during the sweep, with their covariance.
+        T_world_expected: (4, 4) predicted pose.
+        registered: whether the pose is that of a registration; else it is the predicted one.
         status, message: tracking status, and its reason.
-        insert: whether the scan is good enough for the map.
+        fit: to the map; None where the scan was not compared with it.
+        degenerate: names of the directions along which the prediction was kept.
+        iterations: of the registration.
+        added: whether the scan is good enough for the map, and was inserted.
+        way_known: whether the sensor was tracked from the scan before; else it was relocalised, or only predicted.
     """
 
     state: MotionState
+    T_world_expected: FloatArray
+    registered: bool
     status: Status
-    message: str
-    insert: bool
+    message: str = ""
+    fit: Fit | None = None
+    degenerate: tuple[str, ...] = ()
+    iterations: int = 0
+    added: bool = False
+    way_known: bool = True
 
 
 class Tracker(Stateful):
@@ -99,7 +112,7 @@ class Tracker(Stateful):
 
     def accept(
         self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
-    ) -> Tracked:
+    ) -> MappedScan:
         """Judge a registration, and update noise and tracking state with it."""
         registration, interval_s, jumped = attempt.registration, scan.stamp - last.stamp, attempt.has_jumped
         assert registration is not None
@@ -117,8 +130,18 @@ class Tracker(Stateful):
             state = MotionState(scan.stamp, T_world_lidar, self._uncertain_velocity(attempt, scan, last), LOST_MOTION)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
-        insert = attempt.status is Status.OK and not jumped and not self._state.is_unconfirmed
-        return Tracked(state, status, message, insert)
+        return MappedScan(
+            state=state,
+            T_world_expected=attempt.prediction.T_world_lidar,
+            registered=True,
+            status=status,
+            message=message,
+            fit=attempt.fit,
+            degenerate=registration.degeneracy.names,
+            iterations=registration.iterations,
+            added=attempt.status is Status.OK and not jumped and not self._state.is_unconfirmed,
+            way_known=not attempt.relocalised,
+        )
 
     def lose(self, surfel_map: SurfelMap, has_points: bool) -> bool:
         """Update with a scan that was not registered; true where the map is archived and a new one must begin."""
@@ -130,7 +153,7 @@ class Tracker(Stateful):
         self._state.map_restarted()
         return True
 
-    def copy(self) -> "Tracker":
+    def snapshot(self) -> "Tracker":
         """A copy to `rewind` to."""
         copied = copy(self)
         copied._state = copy(self._state)

@@ -36,8 +36,9 @@ from lidarslam.simulation.worlds.featureless import even_tunnel, straight_drive
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig
 from mapping.deskew import Sweep
-from mapping.mapper import MappedScan, Mapper
+from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.tracking.tracker import MappedScan
 
 AT = 70
 COUNT = 100

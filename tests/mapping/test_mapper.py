@@ -12,8 +12,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from mapping.config import MappingConfig, TrackingConfig
-from mapping.mapper import MappedScan, Mapper
+from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.tracking.tracker import MappedScan
 
 Path = Callable[[FloatArray], FloatArray]
 VELOCITY = np.array([0.0, 0.01, 0.3, 0.8, 0.05, 0.0])  # of the drive

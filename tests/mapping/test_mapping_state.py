@@ -13,10 +13,11 @@ from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.global_map import global_map
 from mapping.global_map.global_map import GlobalMap
-from mapping.mapper import MappedScan, Mapper
+from mapping.mapper import Mapper
 from mapping.pose_graph.graph_config import KeyframeConfig
 from mapping.pose_graph.keyframes import KeyframeSelector
 from mapping.prediction import OdometryNoise, Prior, ProcessNoise
+from mapping.tracking.tracker import MappedScan
 
 ThroughDisk = Callable[[State], Saved]
 CONFIG = MappingConfig(keypoints=600)

@@ -13,8 +13,9 @@ from lidarslam.simulation.sensors.registry import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig
 from mapping.deskew import move
-from mapping.mapper import MappedScan, Mapper
+from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.tracking.tracker import MappedScan
 
 COUNT = 12
 # What an odometry states of itself: a tenth of a degree and a centimetre.
