@@ -14,6 +14,7 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.merge.summary import MergedRecording, MergeSummary
 from lidarslam.pipeline.loop_closing import FinishedGraph, GraphOutcome, begin_graph, finish_recordings
 from lidarslam.resume.unfinished import About, Unfinished, remove_unfinished
 from lidarslam.run import directory as files
@@ -22,10 +23,9 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry, require_apart
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
-from lidarslam.run.tracking import NoScanError, Tracked, track
-from lidarslam.run.watch import Progress
-from lidarslam.viewer.viewer import NullViewer
+from lidarslam.run.summary import GraphSummary, WrittenMap, peak_rss_mb
+from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
+from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.moved_points import PlacedViews
 from mapping.pose_graph.g2o import format_g2o
 
@@ -148,8 +148,8 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
 
 def _begin(directory: RunDirectory, description: dict[str, Any], stack: ExitStack) -> Unfinished:
     """Say of a directory that what lies there is not whole, until it is."""
-    unfinished = stack.enter_context(Unfinished.claim(directory.path, description, False, lambda: directory.is_mixed))
-    unfinished.begin(None)
+    unfinished = stack.enter_context(Unfinished.claim(directory, description, resume=False))
+    unfinished.begin(0)
     return unfinished
 
 
@@ -256,8 +256,8 @@ def _track(part: _Part, graph: "SlamGraph", progress: Progress, voxel_size_m: fl
     if voxel_size_m is not None:
         request = _with_voxels(request, voxel_size_m)
     chosen = range(len(part.recording))
-    with closing(open_odometry(request.config, None)) as odometry, ScanLog.open(part.directory) as log:
-        return track(request, part.recording, chosen, odometry, log, graph, NullViewer(), progress)
+    with closing(open_odometry(request.config, None)) as odometry:
+        return track(request, part.recording, chosen, odometry, ScanLog(), graph, Viewer(), progress)
 
 
 def _with_voxels(request: RunRequest, voxel_size_m: float) -> RunRequest:
