@@ -1,6 +1,6 @@
-"""What cells and those around them show of a surface: the loop behind `SurfelGrid.patches`, compiled.
+"""Surfels from the moments of a cell and its neighbours: the compiled loops of `SurfelGrid.surfels`.
 
-The columns of patches are those of `mapping.surfels.patches`.
+The columns of surfels are as in `mapping.surfels.grid`.
 """
 
 import math
@@ -13,60 +13,51 @@ from lidarslam.core.geometry import FloatArray
 from mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
 from mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
-# A patch is worked out again when its cell has this many times the points it had.
+# A surfel is computed again when its cell has grown by this factor.
 _GROWTH = np.float32(1.3)
-# Weight of a neighbour's points in a patch, by how many coordinates it differs in: near ones decide.
+# Weight of a neighbouring cell's points, by the number of coordinates in which it differs.
 _NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
-# Fewer points show nothing.
+# Fewer points make no plane.
 _FEWEST_POINTS = 6
-# A surface is seen from one side at no flatter an angle than asin of this; between, from neither.
+# Sine of the least angle to a plane at which one of its sides is seen.
 _LEAST_SINE = 0.17
-# Spreads are standard deviations along the principal axes. A plane is thin beside its width, and no line; a line is
-# long beside its width: LOAM asks for a largest eigenvalue of three times the next.
+# Largest ratio of thickness to width, and least ratio of width to length, of a plane (standard deviations).
 _MOST_THICKNESS = 0.4
 _LEAST_WIDTH = 0.15
-_LEAST_LENGTH = 3.0**0.5
 
 
 @compiled
-def refresh(rows: NDArray[np.int32], cells: Cells, patches: FloatArray, counts: NDArray[np.float32]) -> None:
-    """Work out what the cells in these rows (N,), or -1, show, if they have grown since they were last looked at.
+def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32]) -> None:
+    """Compute the surfels (M, 15) of the cells in these rows (N,), or -1, that have grown since the last computation.
 
-    Args:
-        rows: which.
-        cells: all of them.
-        patches: (M, 16), written.
-        counts: (M,) how many points the cells had when they were last looked at, written.
+    `counts` (M,) has the numbers of points at the last computation.
     """
-    room = np.empty(15), np.empty(6), np.empty(3)
+    scratch = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):
         row = rows[n]
         if row >= 0 and outdated(row, cells.sums, counts):
-            refresh_one(row, cells, patches, counts, room)
+            refresh_one(row, cells, surfels, counts, scratch)
 
 
 @compiled
 def is_steep(along: float, distance: float) -> bool:
-    """Whether a ray of this length goes along a plane's normal, so far along it, at no flat angle to the plane."""
+    """Whether a ray of some length meets a plane at no grazing angle, from the side of its normal."""
     return along > _LEAST_SINE * distance
 
 
 @compiled
 def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -> bool:
-    """Whether the cell in a row has grown since it was last looked at."""
+    """Whether the cell in a row has grown since its surfel was computed."""
     return bool(counts[row] * _GROWTH <= sums[row, 0])
 
 
 @compiled
 def refresh_one(
-    row: int, cells: Cells, patches: FloatArray, counts: NDArray[np.float32],
-    room: tuple[FloatArray, FloatArray, FloatArray],
+    row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
+    scratch: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:  # fmt: skip
-    """Work out what the cell in one row shows, in room for 15, 6 and 3 numbers.
-
-    To call it costs something: call it for cells that are `outdated`.
-    """
-    total, covariance, values = room
+    """Compute the surfel of one cell, with scratch arrays of 15, 6 and 3 numbers."""
+    total, covariance, values = scratch
     counts[row] = cells.sums[row, 0]
     _gather(row, cells, total)
     count, x, y, z = total[0], total[1] / total[0], total[2] / total[0], total[3] / total[0]
@@ -76,34 +67,27 @@ def refresh_one(
         covariance[column] += total[4 + column] / count
     write_eigenvalues(covariance, values)
     i, j, k = middle_of(cells.keys[row])
-    patch = patches[row]
-    patch[0], patch[1], patch[2] = (i + x) * cells.cell_m, (j + y) * cells.cell_m, (k + z) * cells.cell_m
-    write_eigenvector(covariance, values[0], patch[3:6])
-    if patch[3] * total[12] + patch[4] * total[13] + patch[5] * total[14] < 0.0:  # towards where it was seen from
-        patch[3], patch[4], patch[5] = -patch[3], -patch[4], -patch[5]
-    write_eigenvector(covariance, values[2], patch[6:9])
+    surfel = surfels[row]
+    surfel[0], surfel[1], surfel[2] = (i + x) * cells.cell_m, (j + y) * cells.cell_m, (k + z) * cells.cell_m
+    write_eigenvector(covariance, values[0], surfel[3:6])
+    if surfel[3] * total[12] + surfel[4] * total[13] + surfel[5] * total[14] < 0.0:  # towards where it was seen from
+        surfel[3], surfel[4], surfel[5] = -surfel[3], -surfel[4], -surfel[5]
+    write_eigenvector(covariance, values[2], surfel[6:9])
     for axis in range(3):
-        patch[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m
+        surfel[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m
     elevation = total[10] / count
-    patch[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0))
-    patch[13] = count
-    _judge(patch)
-
-
-@compiled
-def _judge(patch: FloatArray) -> None:
-    """Write what it is."""
-    thickness, width, length = patch[9], patch[10], patch[11]
-    enough = patch[13] >= _FEWEST_POINTS
-    patch[14] = enough and thickness < _MOST_THICKNESS * width and width > _LEAST_WIDTH * length
-    patch[15] = enough and length > _LEAST_LENGTH * width
+    surfel[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0))
+    surfel[13] = count
+    thickness, width, length = surfel[9], surfel[10], surfel[11]
+    enough = surfel[13] >= _FEWEST_POINTS
+    surfel[14] = enough and thickness < _MOST_THICKNESS * width and width > _LEAST_WIDTH * length
 
 
 @compiled
 def _gather(row: int, cells: Cells, total: FloatArray) -> None:
-    """Write the sums (15,) of a cell and the 26 around it, weighted, about its own centre.
+    """Write the weighted sums (15,) of a cell and its 26 neighbours, about its own centre.
 
-    What was seen from the other side is another surface: a thin wall has two.
+    Neighbours seen from the other side are another surface: a thin wall has two.
     """
     total[:] = 0.0
     own = cells.sums[row]
@@ -123,7 +107,7 @@ def _gather(row: int, cells: Cells, total: FloatArray) -> None:
 
 @compiled
 def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
-    """Of both sides of a cell, the one that was rather seen from where a cell with these sums (15,) was."""
+    """The row of that side of a cell whose view direction is nearer to that of the sums (15,)."""
     other = cells.others[row]
     if _view_cosine(own, cells.sums[other]) > _view_cosine(own, cells.sums[row]):
         return int(other)
@@ -132,14 +116,14 @@ def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
 
 @compiled
 def _view_cosine(own: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
-    """The cosine between the directions that two cells were seen from, times the length of the first one."""
+    """Cosine between the view directions of two cells, times the length of the first."""
     length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
     return float((own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9))
 
 
 @compiled
 def _add_shifted(sums: NDArray[np.float32], i: int, j: int, k: int, total: FloatArray) -> None:
-    """Add moments about the centre of a cell so many cells away to moments about the own centre."""
+    """Add moments about the centre of a cell at an offset of (i, j, k) cells to moments about the own centre."""
     weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]
     n, x, y, z = np.float64(sums[0]), np.float64(sums[1]), np.float64(sums[2]), np.float64(sums[3])
     total[0] += weight * n

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mapping.surfels.voxel_hash import ABSENT, VoxelTable, cell_keys, key_cells, key_steps, point_keys
+from mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps, point_keys
 
 Cell = tuple[int, int, int]
 near = st.integers(-3, 3)
@@ -24,7 +24,7 @@ def random_cells(rng: np.random.Generator, count: int, reach: int = 1000) -> NDA
 
 @given(st.lists(st.one_of(cells_near, cells_anywhere), max_size=6), cells_near)
 def test_equals_a_dictionary_after_any_insertions(batches: list[list[Cell]], asked: list[Cell]) -> None:
-    table, oracle = VoxelTable(), {}
+    table, oracle = VoxelHash(), {}
     for batch in batches:
         rows = table.insert(keys_of(batch))
         for cell, row in zip(batch, rows.tolist(), strict=True):
@@ -55,7 +55,7 @@ def test_points_below_zero_lie_in_the_cells_below_zero() -> None:
 
 
 def test_a_key_repeated_in_one_insertion_has_one_row() -> None:
-    table = VoxelTable()
+    table = VoxelHash()
     rows = table.insert(keys_of([(1, 2, 3), (0, 0, 0), (1, 2, 3), (1, 2, 3)]))
     assert len(table) == 2
     assert len({rows[0], rows[2], rows[3]}) == 1
@@ -63,7 +63,7 @@ def test_a_key_repeated_in_one_insertion_has_one_row() -> None:
 
 
 def test_rows_of_before_stay_while_the_table_grows(rng: np.random.Generator) -> None:
-    table = VoxelTable()
+    table = VoxelHash()
     first = cell_keys(random_cells(rng, 3_000))
     rows = table.insert(first)
     for _ in range(4):
@@ -76,17 +76,17 @@ def test_a_full_neighbourhood_is_told_apart(rng: np.random.Generator) -> None:
     """Cells side by side, as a wall's are, all find their own row."""
     cells = np.stack(np.meshgrid(*[np.arange(-15, 15)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     keys = cell_keys(rng.permutation(cells))
-    table = VoxelTable()
+    table = VoxelHash()
     table.insert(keys)
     assert np.unique(table.find(keys)).size == len(keys)
 
 
 def test_nothing_is_found_in_an_empty_table() -> None:
-    assert VoxelTable().find(keys_of([(0, 0, 0), (5, -5, 5)])).tolist() == [ABSENT, ABSENT]
+    assert VoxelHash().find(keys_of([(0, 0, 0), (5, -5, 5)])).tolist() == [ABSENT, ABSENT]
 
 
 def test_rows_have_the_shape_of_the_keys(rng: np.random.Generator) -> None:
-    table = VoxelTable()
+    table = VoxelHash()
     keys = cell_keys(random_cells(rng, 60).reshape(20, 3, 3))
     table.insert(keys.ravel())
     assert table.find(keys).shape == (20, 3)
@@ -94,7 +94,7 @@ def test_rows_have_the_shape_of_the_keys(rng: np.random.Generator) -> None:
 
 
 def test_rebuilt_it_holds_the_new_keys_only_in_their_order(rng: np.random.Generator) -> None:
-    table = VoxelTable()
+    table = VoxelHash()
     before = np.unique(cell_keys(random_cells(rng, 20_000)))
     table.insert(before)
     kept, dropped = before[::3], np.setdiff1d(before, before[::3])
@@ -106,7 +106,7 @@ def test_rebuilt_it_holds_the_new_keys_only_in_their_order(rng: np.random.Genera
 
 
 def test_goes_on_counting_after_a_rebuild() -> None:
-    table = VoxelTable()
+    table = VoxelHash()
     table.insert(keys_of([(k, 0, 0) for k in range(100)]))
     table.rebuild(keys_of([(7, 0, 0), (3, 0, 0)]))
     assert table.insert(keys_of([(3, 0, 0), (200, 0, 0), (7, 0, 0)])).tolist() == [1, 2, 0]
