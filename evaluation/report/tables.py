@@ -100,19 +100,17 @@ def _drift_table(
 
 
 def _map_table(sequence: SequenceComparison) -> Table:
-    quantities = [quantity for name, quantity in QUANTITIES.items() if name.startswith("map_")]
-    quantities = [q for q in quantities if any(q.of(method) is not None for method in sequence.methods)]
-    compared = any(method.map_metrics is not None for method in sequence.methods)
-    if not compared:  # the entropy alone stands in the summary
+    if all(method.map_metrics is None for method in sequence.methods):
         return Table("", [], [])
+    quantities = [q for name, q in QUANTITIES.items() if name.startswith("map_") and name != "map_entropy"]
     columns = [_column(quantity, prefix="map ") for quantity in quantities]
     rows = [TableRow(m.name, [_measured(m, quantity) for quantity in quantities]) for m in sequence.methods]
     note = (
         "Accuracy: mean distance of the map from the reference map; completeness: of the reference map from the map;"
         " chamfer: mean of the two. Coverage: share of the reference map within the tolerance of the map; deviation:"
-        " share of the map beyond the tolerance. Entropy: mean map entropy, lower is crisper."
+        " share of the map beyond the tolerance."
     )
-    return Table(f"{sequence.sequence}: map against the reference map", columns, rows, note)
+    return Table(f"{sequence.sequence}: map against the reference map", columns, rows, note).without_empty()
 
 
 def _time_table(sequence: SequenceComparison) -> Table:

@@ -154,8 +154,7 @@ def page(comparison, tmp_path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1200, 420])
+@pytest.mark.parametrize(("width", "theme"), [(1200, "light"), (420, "dark")])
 def test_the_report_opens_without_complaint_from_its_own_file_alone(width, theme, page, browser):
     browser.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
     visit = browser.visit(page, width)

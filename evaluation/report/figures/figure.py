@@ -21,6 +21,13 @@ _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cros
 _LONGEST_NAME = 40
 MOST_POINTS = 1000
 
+EQUAL_AXES: Mapping[str, Any] = {
+    "xaxis": {"automargin": False},
+    "yaxis": {"automargin": False, "scaleanchor": "x"},
+    "margin": {"l": 52, "r": 8, "t": 6, "b": 40},
+}
+"""Layout of axes with one scale, whose margins plotly cannot find by itself."""
+
 
 @dataclass(frozen=True)
 class Style:

@@ -5,7 +5,7 @@ import plotly.graph_objects as go
 from scipy.stats import binned_statistic_2d
 
 from evaluation.comparison.comparison import MapErrors, SequenceComparison
-from evaluation.report.figures.figure import Figure, Panel, Styles, line_trace, plot_text
+from evaluation.report.figures.figure import EQUAL_AXES, Figure, Panel, Styles, line_trace, plot_text
 from lidarslam.core.geometry import FloatArray
 
 _NOMINAL_WIDTH, _LOWEST, _TALLEST = 480.0, 220.0, 480.0
@@ -69,8 +69,9 @@ def _panel(name: str, errors: MapErrors, low: FloatArray, high: FloatArray, wors
         hovertemplate="x %{x:.1f} m, y %{y:.1f} m<br>%{z:.3f} m from the reference",
     )  # fmt: skip
     layout = {
-        "xaxis": {"title": {"text": "x [m]"}, "showgrid": False, "zeroline": False},
-        "yaxis": {"scaleanchor": "x", "showgrid": False, "zeroline": False},
+        **EQUAL_AXES,
+        "xaxis": {**EQUAL_AXES["xaxis"], "title": {"text": "x [m]"}, "showgrid": False, "zeroline": False},
+        "yaxis": {**EQUAL_AXES["yaxis"], "title": {"text": "y [m]"}, "showgrid": False, "zeroline": False},
         "hovermode": "closest",
         "coloraxis": {"cmin": 0.0, "cmax": worst_m, "colorbar": {"thickness": 10, "title": {"text": "[m]"}}},
     }

@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 
 from evaluation.comparison.comparison import MethodResult, SequenceComparison
 from evaluation.report.figures.errors import ALIGNED
-from evaluation.report.figures.figure import MOST_POINTS, Figure, Panel, Styles, line_trace, plot_text
+from evaluation.report.figures.figure import EQUAL_AXES, MOST_POINTS, Figure, Panel, Styles, line_trace, plot_text
 from evaluation.trajectory.alignment import align
 from lidarslam.core.geometry import FloatArray, inverse
 
@@ -34,15 +34,15 @@ def trajectory_figure(sequence: SequenceComparison, styles: Styles) -> Figure | 
     for across, up in views:
         title = f"{'Top' if up == 1 else 'Side'} view: {'xyz'[up]} over {'xyz'[across]} [m]"
         traces = _traces(sequence, paths, reference, styles, (across, up))
-        axes: dict[str, Any] = {
-            "xaxis": {"title": {"text": f"{'xyz'[across]} [m]"}, "range": _range(low[across], high[across])},
-            "yaxis": {"range": _range(low[up], high[up])},
+        given = EQUAL_AXES if up == 1 else {"xaxis": {}, "yaxis": {}}
+        layout = {
+            **given,
+            "xaxis": {**given["xaxis"], "title": {"text": f"{'xyz'[across]} [m]"}, "range": _range(low, high, across)},
+            "yaxis": {**given["yaxis"], "range": _range(low, high, up)},
+            "hovermode": "closest",
         }
-        height = _SIDE_HEIGHT
-        if up == 1:
-            axes["yaxis"] |= {"scaleanchor": "x"}
-            height = int(np.clip(_NOMINAL_WIDTH * extent[1] / extent[0], _LOWEST, _TALLEST))
-        panels.append(Panel(title, traces, {**axes, "hovermode": "closest"}, height))
+        height = int(np.clip(_NOMINAL_WIDTH * extent[1] / extent[0], _LOWEST, _TALLEST)) if up == 1 else _SIDE_HEIGHT
+        panels.append(Panel(title, traces, layout, height))
     name = "" if reference is None else sequence.reference_name
     return Figure("Trajectories", _caption(sequence, list(paths.values()), low, high), panels, list(paths), name)
 
@@ -123,9 +123,9 @@ def _view(paths: Sequence[FloatArray], reference: FloatArray | None) -> tuple[Fl
     return low - short, high + short
 
 
-def _range(low: float, high: float) -> list[float]:
-    margin = 0.05 * (high - low)
-    return [low - margin, high + margin]
+def _range(low: FloatArray, high: FloatArray, axis: int) -> list[float]:
+    margin = 0.05 * (high[axis] - low[axis])
+    return [float(low[axis] - margin), float(high[axis] + margin)]
 
 
 def _caption(sequence: SequenceComparison, paths: Sequence[FloatArray], low: FloatArray, high: FloatArray) -> str:

@@ -3,6 +3,7 @@
 (() => {
   const hidden = new Set();
   const dark = matchMedia("(prefers-color-scheme: dark)");
+  const LOG_TICKS = "D2"; // at 1, 2 and 5
   const plots = [...document.querySelectorAll(".plot")];
   const config = {
     responsive: true, displaylogo: false, displayModeBar: matchMedia("(hover: hover)").matches ? "hover" : false,
@@ -15,7 +16,7 @@
     const axis = {
       automargin: true, gridcolor: colour("--line"), linecolor: colour("--quiet"), tickcolor: colour("--quiet"),
       tickfont: { color: colour("--quiet") }, title: { font: { color: colour("--quiet"), size: 12 }, standoff: 6 },
-      zerolinecolor: colour("--zero"), zerolinewidth: 1, showspikes: false, exponentformat: "none",
+      zerolinecolor: colour("--zero"), zerolinewidth: 1, nticks: 6, exponentformat: "none",
     };
     const ends = ["#fde725", "#5ec962", "#21918c", "#3b528b", "#440154"]; // viridis: pale is small on white paper
     if (dark.matches) ends.reverse();
@@ -44,6 +45,7 @@
     const layout = {
       margin: { l: 8, r: 8, t: 6, b: 8 }, showlegend: false, dragmode: "zoom", ...figure.layout, template: template(),
     };
+    if (layout.yaxis?.type === "log") layout.yaxis.dtick = LOG_TICKS;
     Plotly.newPlot(plot, figure.data, layout, config);
   }
 
@@ -69,7 +71,8 @@
       scale.setAttribute("aria-pressed", String(log));
       const plot = scale.closest(".panel").querySelector(".plot");
       draw(plot);
-      Plotly.relayout(plot, { "yaxis.type": log ? "log" : "linear", "yaxis.autorange": true });
+      const axis = { "yaxis.type": log ? "log" : "linear", "yaxis.dtick": log ? LOG_TICKS : null };
+      Plotly.relayout(plot, { ...axis, "yaxis.autorange": true });
     }
   });
 
