@@ -50,11 +50,11 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
     yield "start", _instant(info.first_stamp)
     rate = "" if info.rate_hz is None else f" at {info.rate_hz:.2f} Hz"
     yield "duration", f"{info.duration_s:.1f} s{rate}"
-    dropped = f" and {info.dropped_points:,} invalid ones left out" if info.dropped_points else ""
-    yield "points", f"{info.points_per_scan:,} in the first scan{dropped}"
+    dropped = f" and {info.first.dropped:,} invalid ones left out" if info.first.dropped else ""
+    yield "points", f"{len(info.first):,} in the first scan{dropped}"
     if info.fields:
         yield "fields", ", ".join(f"{field.name} {field.type_name}" for field in info.fields)
-    yield "rings", "yes" if info.has_rings else "no"
+    yield "rings", "no" if info.first.rings is None else "yes"
     yield "point time", _point_time(info)
     yield "ground truth", str(info.ground_truth) if info.ground_truth else "none"
     for note in info.notes:

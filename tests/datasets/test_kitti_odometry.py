@@ -162,7 +162,7 @@ def test_describe(tmp_path, rng):
     cloud[5, 1] = np.nan
     cloud.tofile(scan)
     info = open_recording(tmp_path).describe()
-    assert (info.reader, info.scans, info.points_per_scan, info.dropped_points) == ("kitti-odometry", 6, 48, 2)
+    assert (info.reader, info.scans, len(info.first), info.first.dropped) == ("kitti-odometry", 6, 48, 2)
     assert info.duration_s == pytest.approx(5 * 0.1037, abs=1e-6)
     assert info.rate_hz == pytest.approx(1 / 0.1037, rel=1e-4)
     assert info.ground_truth == tmp_path / "poses" / "04.txt"
@@ -215,7 +215,7 @@ def test_sequence_04(real_data):
     info = recording.describe()
     assert info.reader == "kitti-odometry"
     assert info.scans == 51
-    assert 110_000 < info.points_per_scan < 130_000
+    assert 110_000 < len(info.first) < 130_000
     truth = recording.ground_truth
     assert len(truth) == 271
     assert is_rigid(truth.T_world_lidar, tolerance=1e-9)

@@ -255,7 +255,7 @@ def test_the_correction_changes_elevations_and_no_times(tmp_path, rng):
 def test_describe(tmp_path, rng):
     drive = _write_drive(tmp_path, rng)
     info = open_recording(drive).describe()
-    assert (info.reader, info.scans, info.points_per_scan, info.dropped_points) == ("kitti-raw", 8, 60, 0)
+    assert (info.reader, info.scans, len(info.first), info.first.dropped) == ("kitti-raw", 8, 60, 0)
     assert info.first_stamp == pytest.approx(FIRST_STAMP, abs=3e-7)
     assert info.rate_hz == pytest.approx(1 / MID_S, rel=1e-4)
     assert info.ground_truth.name == "oxts"

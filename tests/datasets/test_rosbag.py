@@ -203,9 +203,9 @@ def test_description(drive):
     assert info.first_stamp == STAMP_NS / 10**9
     assert info.duration_s == pytest.approx(0.5, abs=1e-6)
     assert info.rate_hz == pytest.approx(10.0, abs=1e-4)
-    assert info.points_per_scan == np.count_nonzero(sweeps[0].returns)
-    assert info.dropped_points == np.count_nonzero(~sweeps[0].returns)
-    assert info.has_rings
+    assert len(info.first) == np.count_nonzero(sweeps[0].returns)
+    assert info.first.dropped == np.count_nonzero(~sweeps[0].returns)
+    assert info.first.rings is not None
     assert info.ground_truth is None
     returned = sweeps[0].offsets[sweeps[0].returns]
     assert info.point_time == PointTime("time", "s", "relative", returned.min(), returned.max())

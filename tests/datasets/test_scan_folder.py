@@ -188,13 +188,13 @@ def test_reads_every_format_with_times_and_rings(tmp_path, rng, suffix):
             np.testing.assert_allclose(scan.time_offsets, table["t"] * 1e-9, atol=1e-12)
             np.testing.assert_array_equal(scan.rings, table["ring"])
     info = recording.describe()
-    assert (info.reader, info.scans, info.points_per_scan) == ("scan-folder", 3, 150)
+    assert (info.reader, info.scans, len(info.first)) == ("scan-folder", 3, 150)
     assert info.rate_hz == pytest.approx(10.0)
     if suffix != "bin":
         assert (info.point_time.source, info.point_time.unit, info.point_time.reference) == ("t", "ns", "relative")
         assert info.point_time.last_s == pytest.approx(0.099)
         assert [(f.name, f.type_name) for f in info.fields][4:6] == [("t", "uint32"), ("ring", "uint16")]
-        assert info.has_rings
+        assert info.first.rings is not None
 
 
 def test_invalid_points_go_with_their_times_and_rings(tmp_path, rng):
@@ -481,5 +481,9 @@ def test_scans_follow_range_and_a_file_is_no_folder(tmp_path, rng):
 def test_a_real_folder_of_bin(real_data):
     recording = open_recording(real_data / "kitti_raw_stop/2011_09_26/2011_09_26_drive_stop_sync/velodyne_points/data")
     info = recording.describe()
-    assert (info.scans, info.has_rings, [field.name for field in info.fields][-1]) == (78, False, "intensity")
-    assert 100_000 < info.points_per_scan < 130_000
+    assert (info.scans, info.first.rings is not None, [field.name for field in info.fields][-1]) == (
+        78,
+        False,
+        "intensity",
+    )
+    assert 100_000 < len(info.first) < 130_000

@@ -66,7 +66,7 @@ def test_every_driver_in_every_kind_of_bag(name, driver, tmp_path, sweeps, drive
     info = recording.describe()
     assert info.topic == DRIVERS[driver].topic
     assert info.point_time.reference == ("absolute" if driver in ("hesai", "livox") else "relative")
-    assert not info.dropped_points
+    assert not info.first.dropped
     assert not info.notes
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import SeveralTopicsError, Topic
-from lidarslam.datasets.ros.bag_file import CLOUD_TYPES
+from lidarslam.datasets.ros.bag_message import CLOUD_TYPES
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
