@@ -340,7 +340,7 @@ def test_a_file_that_went_bad_since_its_index_was_read_is_an_error(write_drive, 
     recording = open_recording(file)
     assert len(recording.warnings) == 0
     file.write_bytes(bytes(5000))
-    with pytest.raises(InputError, match="cannot be opened|index cannot be read|reading stopped after 0"):
+    with pytest.raises(InputError, match=r"cannot be opened|index cannot be read|reading stopped after 0"):
         list(recording.scans(faults=Faults()))
 
 

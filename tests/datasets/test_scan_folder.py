@@ -11,7 +11,6 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.folders.lzf import decompress_lzf
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.registry import choose_reader, open_recording
@@ -123,7 +122,9 @@ def test_pcd_with_padding_and_vector_fields(tmp_path, rng):
     table["x"], table["normal"] = np.arange(5) + 1.0, rng.uniform(size=(5, 3))
     for data in ("binary", "binary_compressed"):
         (tmp_path / "a.pcd").write_bytes(_pcd_bytes(table, data))
-        np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["normal"], table["normal"])
+        read = read_pcd(tmp_path / "a.pcd")
+        assert read.dtype.names == ("x", "y", "z")
+        np.testing.assert_array_equal(read["x"], table["x"])
     twice = _pcd_bytes(table, "binary").replace(b"FIELDS x y z _ normal", b"FIELDS x y z _ _")
     (tmp_path / "a.pcd").write_bytes(twice)
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["x"], table["x"])
@@ -154,18 +155,6 @@ def test_open3d_agrees_on_pcd(tmp_path, rng):
         read = read_pcd(tmp_path / "b.pcd")
         for name in ("x", "y", "z", "intensity", "t", "ring", "clock"):
             np.testing.assert_array_equal(read[name], table[name])
-
-
-def test_lzf_copies():
-    assert decompress_lzf(bytes([2]) + b"abc" + bytes([0b001_00000, 2]), 6) == b"abcabc"
-    # Seven in the upper bits: a further byte adds to the length; the copy overlaps what it writes.
-    assert decompress_lzf(bytes([1]) + b"xy" + bytes([0b111_00000, 4, 1]), 15) == b"xyxyxyxyxyxyxyx"
-    far = bytes(range(32)) * 10
-    stream = _lzf_literals(far) + bytes([0b001_00001, 319 - 256])
-    assert decompress_lzf(stream, 323) == far + far[:3]
-    for stream in (bytes([0b001_00000, 0]), bytes([1]) + b"xy" + bytes([0b111_00000]), bytes([5]) + b"ab"):
-        with pytest.raises(ValueError):
-            decompress_lzf(stream, 6)
 
 
 @pytest.mark.parametrize("suffix", ["bin", "pcd", "ply", "npy"])
@@ -441,7 +430,7 @@ def test_damaged_files_are_named(tmp_path, rng, name, how):
     (tmp_path / name).write_bytes(data)
     assert len(next(open_recording(tmp_path).scans())) == 200
     (tmp_path / name).write_bytes(_damage(data, how))
-    with pytest.raises(InputError, match=rf"{kind}\.{suffix}: .*expected|{kind}\.{suffix}: .*invalid"):
+    with pytest.raises(InputError, match=rf"{kind}\.{suffix}: .*(expected|invalid|truncated or damaged)"):
         next(open_recording(tmp_path).scans())
 
 

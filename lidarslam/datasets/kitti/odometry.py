@@ -5,6 +5,7 @@ LiDAR's frame here, once, and nowhere else.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
@@ -19,10 +20,12 @@ from lidarslam.core.trajectory_io import read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, numbered_scans, read_bin, scan_indices
+from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
-from lidarslam.datasets.kitti.correction import correct_elevation
 from lidarslam.datasets.recording import PointField, Recording, RecordingInfo
-from lidarslam.datasets.stamps import increasing_rows, read_stamps, scan_rate
+from lidarslam.datasets.stamps import increasing_rows, read_stamps
+
+_COMPENSATED = "The scans are motion compensated by the publishers; they have no per-point time and need none."
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -115,10 +118,6 @@ class KittiOdometryRecording:
         return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
 
     @property
-    def _has_calibration(self) -> bool:
-        return (self._folder / "calib.txt").is_file()
-
-    @property
     def _pose_file(self) -> Path | None:
         folder = self._folder.resolve()
         candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
@@ -139,8 +138,7 @@ class KittiOdometryRecording:
 
     def _read(self, index: int) -> Scan:
         points = read_bin(self._files[index])[:, :3]
-        angle_deg = self._config.kitti_elevation_correction_deg
-        return Scan.from_raw(correct_elevation(points, angle_deg) if angle_deg else points, self._stamps[index])
+        return Scan.from_raw(correction.correct_elevation(points, correction.ELEVATION_DEG), self._stamps[index])
 
     def describe(self) -> RecordingInfo:
         """What `lidarslam info` prints.
@@ -152,22 +150,13 @@ class KittiOdometryRecording:
         return RecordingInfo(
             reader="kitti-odometry",
             scans=len(self),
-            first_stamp=float(self._stamps[0]),
-            duration_s=float(self._stamps[-1] - self._stamps[0]),
-            rate_hz=scan_rate(self._stamps),
-            points_per_scan=len(first),
-            dropped_points=first.dropped,
-            has_rings=False,
-            ground_truth=self._pose_file if self._has_calibration else None,
+            first=first,
+            last_stamp=float(self._stamps[-1]),
+            ground_truth=self._pose_file if (self._folder / "calib.txt").is_file() else None,
             point_time=None,
             fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
-            notes=(*self._notes(), *self.warnings, *unreadable.warnings()),
+            notes=(_COMPENSATED, correction.NOTE, *self.warnings, *unreadable.warnings()),
         )
-
-    def _notes(self) -> Iterator[str]:
-        yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
-        if angle_deg := self._config.kitti_elevation_correction_deg:
-            yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -182,14 +171,11 @@ class KittiOdometryRecording:
             yield f"times.txt has {len(self._times)} lines for the scans up to number {last}."
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
-        if self._pose_file is not None and not self._has_calibration:
+        if self._pose_file is None:
+            return
+        if not (self._folder / "calib.txt").is_file():
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
-        elif self._pose_file is not None and (poses := self._count_poses(self._pose_file)) not in (0, last + 1):
-            yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
-
-    def _count_poses(self, path: Path) -> int:
-        """Zero where the file is damaged, which the truth tells when it is asked for."""
-        try:
-            return len(read_kitti_poses(path))
-        except InputError:
-            return 0
+            return
+        with suppress(InputError):  # damaged, an error of `ground_truth`
+            if (poses := len(read_kitti_poses(self._pose_file))) != last + 1:
+                yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."

@@ -16,12 +16,12 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, numbered_scans, read_bin, scan_indices
+from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_rectification, read_rotation_translation
-from lidarslam.datasets.kitti.correction import correct_elevation
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
 from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth, read_sweep_timing
 from lidarslam.datasets.recording import PointField, PointTime, Recording, RecordingInfo
-from lidarslam.datasets.stamps import increasing_rows, read_stamps, scan_rate
+from lidarslam.datasets.stamps import increasing_rows, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -131,8 +131,7 @@ class KittiRawRecording:
         if self._config.time_reference != "none":
             # The elevation correction turns points in their vertical plane, so azimuths are the same before it.
             offsets = offsets_from_azimuth(points, float(timing.before_s[index]), float(timing.after_s[index]))
-        angle_deg = self._config.kitti_elevation_correction_deg
-        corrected = correct_elevation(points, angle_deg) if angle_deg else points
+        corrected = correction.correct_elevation(points, correction.ELEVATION_DEG)
         return Scan.from_raw(corrected, timing.stamps[index], offsets)
 
     def describe(self) -> RecordingInfo:
@@ -142,22 +141,13 @@ class KittiRawRecording:
             InputError: no scan can be read, or an OXTS or calibration file is damaged.
         """
         _, first, unreadable = first_readable(self._drive, range(len(self)), self._read)
-        stamps = self._timing.stamps
-        point_time = None
-        if first.time_offsets is not None and len(first):
-            extent = float(first.time_offsets.min()), float(first.time_offsets.max())
-            point_time = PointTime("azimuth", "s", "relative", *extent)
         return RecordingInfo(
             reader="kitti-raw",
             scans=len(self),
-            first_stamp=float(stamps[0]),
-            duration_s=float(stamps[-1] - stamps[0]),
-            rate_hz=scan_rate(stamps),
-            points_per_scan=len(first),
-            dropped_points=first.dropped,
-            has_rings=False,
+            first=first,
+            last_stamp=float(self._timing.stamps[-1]),
             ground_truth=None if self.ground_truth is None else self._drive / "oxts",
-            point_time=point_time,
+            point_time=PointTime.of_scan(first, "azimuth", "s", "relative"),
             fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
             notes=(*self._notes(), *unreadable.warnings()),
         )
@@ -170,8 +160,7 @@ class KittiRawRecording:
         return (*self._timing.notes, *gaps)
 
     def _notes(self) -> Iterator[str]:
-        if angle_deg := self._config.kitti_elevation_correction_deg:
-            yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
+        yield correction.NOTE
         yield from self.warnings
         if self._oxts is None:
             yield "There is no oxts folder, so there is no ground truth."
