@@ -9,6 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.point_time import PointTimeModel
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,12 @@ class PointTime:
     last_s: float
 
     @classmethod
-    def of_scan(cls, scan: Scan, source: str, unit: str, reference: str) -> "PointTime | None":
+    def of_scan(cls, scan: Scan, model: PointTimeModel | None) -> "PointTime | None":
         """With the offsets of a scan; None where it has none."""
         offsets = scan.time_offsets
-        if offsets is None or not len(offsets):
+        if model is None or offsets is None or not len(offsets):
             return None
-        return cls(source, unit, reference, float(offsets.min()), float(offsets.max()))
+        return cls(model.field, model.unit, model.reference, float(offsets.min()), float(offsets.max()))
 
 
 @dataclass(frozen=True)

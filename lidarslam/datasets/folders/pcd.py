@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pypcd4 import PointCloud
+from pypcd4.pypcd4 import PointCloud
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.folders.scan_files import read_bytes
@@ -40,4 +40,4 @@ def read_pcd(path: Path) -> NDArray[np.void]:
         ) from error
     fields = zip(cloud.metadata.fields, cloud.metadata.count, strict=True)
     names = [name for name, count in fields if count == 1 and not name.startswith(_PADDING)]
-    return cast("NDArray[np.void]", table[names])
+    return table[names]

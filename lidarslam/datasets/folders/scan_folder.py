@@ -148,14 +148,14 @@ class ScanFolderRecording:
         """
         faults = Faults()
         index, first, unreadable = first_readable(self._folder, range(len(self)), lambda i: self._read(i, faults))
-        table, model = self._table(index)[0], self._point_time
+        table, _ = self._table(index)
         return RecordingInfo(
             reader="scan-folder",
             scans=len(self),
             first=first,
             last_stamp=self._last_stamp(),
             ground_truth=self._layout.truth,
-            point_time=model and PointTime.of_scan(first, model.field, model.unit, model.reference),
+            point_time=PointTime.of_scan(first, self._point_time),
             fields=tuple(PointField(n, str(table.dtype[n].base)) for n in table.dtype.names or ()),
             notes=(*self._layout.notes, *self.warnings, *unreadable.warnings()),
         )

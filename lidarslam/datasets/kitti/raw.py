@@ -20,6 +20,7 @@ from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_rectification, read_rotation_translation
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
 from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth, read_sweep_timing
+from lidarslam.datasets.point_time import PointTimeModel
 from lidarslam.datasets.recording import PointField, PointTime, Recording, RecordingInfo
 from lidarslam.datasets.stamps import increasing_rows, read_stamps
 
@@ -147,7 +148,7 @@ class KittiRawRecording:
             first=first,
             last_stamp=float(self._timing.stamps[-1]),
             ground_truth=None if self.ground_truth is None else self._drive / "oxts",
-            point_time=PointTime.of_scan(first, "azimuth", "s", "relative"),
+            point_time=PointTime.of_scan(first, PointTimeModel("azimuth", "s", "relative")),
             fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
             notes=(*self._notes(), *unreadable.warnings()),
         )

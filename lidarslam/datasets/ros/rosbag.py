@@ -221,14 +221,14 @@ class BagRecording:
             if not faults.left_out:
                 raise
             raise InputError(f"{error}; {'; '.join(faults.warnings())}") from error
-        cloud, model = self._decode(message), self._point_time
+        cloud = self._decode(message)
         return RecordingInfo(
             reader="rosbag",
             scans=len(self),
             first=first,
             last_stamp=self._last_stamp or first.stamp,
             ground_truth=self._truth_file,
-            point_time=model and PointTime.of_scan(first, model.field, model.unit, model.reference),
+            point_time=PointTime.of_scan(first, self._point_time),
             topic=self._topic.name,
             topics=self._bag.topics,
             fields=cloud.fields,
