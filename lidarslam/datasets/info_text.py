@@ -68,11 +68,11 @@ def _instant(stamp: float) -> str:
 
 
 def _point_time(info: RecordingInfo) -> str:
-    time = info.point_time
-    if time is None:
+    model, offsets = info.point_time, info.first.time_offsets
+    if model is None or offsets is None or not len(offsets):
         return "none (scans are taken as motion compensated or at one instant)"
-    span = f"{1e3 * time.first_s:+.1f} to {1e3 * time.last_s:+.1f} ms around the stamp"
-    return f"{time.source} in {time.unit}, {time.reference}; {span}"
+    span = f"{1e3 * offsets.min():+.1f} to {1e3 * offsets.max():+.1f} ms around the stamp"
+    return f"{model.field} in {model.unit}, {model.reference}; {span}"
 
 
 def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""What the readers hand out: a sequence of scans that can also describe itself."""
+"""A recording on disk: a sequence of scans with a description; the interface of the readers."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,32 +10,6 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.point_time import PointTimeModel
-
-
-@dataclass(frozen=True)
-class PointTime:
-    """What was inferred about the time of single points.
-
-    Attributes:
-        source: name of the point field, or words such as "azimuth".
-        unit: "s", "ms", "us" or "ns".
-        reference: "relative" (to the scan's stamp) or "absolute" (a clock reading).
-        first_s, last_s: smallest and largest offset from the stamp in the first scan, seconds.
-    """
-
-    source: str
-    unit: str
-    reference: str
-    first_s: float
-    last_s: float
-
-    @classmethod
-    def of_scan(cls, scan: Scan, model: PointTimeModel | None) -> "PointTime | None":
-        """With the offsets of a scan; None where it has none."""
-        offsets = scan.time_offsets
-        if model is None or offsets is None or not len(offsets):
-            return None
-        return cls(model.field, model.unit, model.reference, float(offsets.min()), float(offsets.max()))
 
 
 @dataclass(frozen=True)
@@ -74,7 +48,7 @@ class RecordingInfo:
         first: the first scan that can be read.
         last_stamp: stamp of the last scan, seconds.
         ground_truth: where the true trajectory was found, if it was.
-        point_time: None without per-point time.
+        point_time: what was inferred about the time of single points; None without.
         topics: of a bag, all of them; `topic` is the one that is read.
         fields: of the points as stored.
         notes: further facts for the user, one sentence each.
@@ -85,7 +59,7 @@ class RecordingInfo:
     first: Scan
     last_stamp: float
     ground_truth: Path | None
-    point_time: PointTime | None
+    point_time: PointTimeModel | None
     topic: str | None = None
     topics: tuple[Topic, ...] = ()
     fields: tuple[PointField, ...] = ()
@@ -116,7 +90,7 @@ class Recording(ScanSequence, Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with the recording as a whole, and what was mended; one sentence each, with counts."""
+        """Faults of the recording as a whole, and repairs; one sentence each, with counts."""
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -130,4 +104,8 @@ class Recording(ScanSequence, Protocol):
         """
 
     def describe(self) -> RecordingInfo:
-        """Look at the recording, its first scan included, and say what it holds."""
+        """The contents of the recording, by its first scan too.
+
+        Raises:
+            InputError: no scan can be read, or a file that belongs to the recording is damaged.
+        """

@@ -18,14 +18,13 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults, first_readable, readable_scans
-from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, numbered_scans, read_bin, scan_indices
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.file_recording import FileRecording
+from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
-from lidarslam.datasets.recording import PointField, Recording, RecordingInfo
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.stamps import increasing_rows, read_stamps
-
-_COMPENSATED = "The scans are motion compensated by the publishers; they have no per-point time and need none."
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -57,13 +56,14 @@ def _find_sequence(source: Path, wanted: str | None) -> Path:
     raise InputError(f"{source}: has no sequence {wanted!r} with scans; there are: {available}")
 
 
-class KittiOdometryRecording:
-    """One sequence; implements `Recording`."""
+class KittiOdometryRecording(FileRecording):
+    """One sequence."""
+
+    reader = "kitti-odometry"
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
-        self._folder = folder
-        self._config = config
-        self._files, self._numbers = numbered_scans(folder / "velodyne")
+        files, self._numbers = numbered_scans(folder / "velodyne")
+        super().__init__(folder, config, files)
         self._times = self._read_times()
         last = int(self._numbers[-1])
         if self._times is not None and last >= len(self._times):
@@ -71,7 +71,7 @@ class KittiOdometryRecording:
                 f"{folder / 'times.txt'}: expected a stamp for every scan up to {self._files[-1].name},"
                 f" {last + 1} lines, got {len(self._times)}; complete it, or remove it to use the rate"
             )
-        self._stamps = self._stamps_of(self._numbers)
+        self.stamps = self._stamps_of(self._numbers)
 
     def _read_times(self) -> FloatArray | None:
         path = self._folder / "times.txt"
@@ -102,11 +102,7 @@ class KittiOdometryRecording:
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """T_world_lidar of every pose that has a stamp, those of absent scans included.
-
-        Raises:
-            InputError: the pose file is damaged.
-        """
+        """T_world_lidar of every pose that has a stamp, those of absent scans included."""
         path, T_cam_lidar = self._pose_file, self.T_cam_lidar
         if path is None or T_cam_lidar is None:
             return None
@@ -123,40 +119,16 @@ class KittiOdometryRecording:
         candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
         return next((path for path in candidates if path.is_file()), None)
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def scans(
-        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
-    ) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)`, without times: they are motion compensated.
-
-        Raises:
-            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
-        """
-        return readable_scans(scan_indices(len(self), start, stop, step), self._read, faults)
-
-    def _read(self, index: int) -> Scan:
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         points = read_bin(self._files[index])[:, :3]
-        return Scan.from_raw(correction.correct_elevation(points, correction.ELEVATION_DEG), self._stamps[index])
+        return Scan.from_raw(correction.correct_elevation(points, correction.ELEVATION_DEG), self.stamps[index])
 
-    def describe(self) -> RecordingInfo:
-        """What `lidarslam info` prints.
+    def _truth_path(self) -> Path | None:
+        return self._pose_file if (self._folder / "calib.txt").is_file() else None
 
-        Raises:
-            InputError: no scan can be read.
-        """
-        _, first, unreadable = first_readable(self._folder, range(len(self)), self._read)
-        return RecordingInfo(
-            reader="kitti-odometry",
-            scans=len(self),
-            first=first,
-            last_stamp=float(self._stamps[-1]),
-            ground_truth=self._pose_file if (self._folder / "calib.txt").is_file() else None,
-            point_time=None,
-            fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
-            notes=(_COMPENSATED, correction.NOTE, *self.warnings, *unreadable.warnings()),
-        )
+    def _notes(self) -> Iterator[str]:
+        yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
+        yield correction.NOTE
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -171,11 +143,9 @@ class KittiOdometryRecording:
             yield f"times.txt has {len(self._times)} lines for the scans up to number {last}."
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
-        if self._pose_file is None:
-            return
-        if not (self._folder / "calib.txt").is_file():
+        if self._pose_file is not None and self._truth_path() is None:
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
-            return
-        with suppress(InputError):  # damaged, an error of `ground_truth`
-            if (poses := len(read_kitti_poses(self._pose_file))) != last + 1:
-                yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
+        elif self._pose_file is not None:
+            with suppress(InputError):  # damaged, an error of `ground_truth`
+                if (poses := len(read_kitti_poses(self._pose_file))) != last + 1:
+                    yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."

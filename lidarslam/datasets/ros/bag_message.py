@@ -10,9 +10,10 @@ from typing import cast
 
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
+from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
 
 from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
-from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, PointCloud2Message, decode_point_cloud2
+from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, decode_point_cloud2
 
 POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 CLOUD_TYPES = (POINT_CLOUD2_TYPE, *CUSTOM_MESSAGE_TYPES)
@@ -78,7 +79,7 @@ def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCl
         return decode_custom_message(message.raw, ros2)
     store = _typestore(ros2)
     deserialize = store.deserialize_cdr if ros2 else store.deserialize_ros1
-    return decode_point_cloud2(cast(PointCloud2Message, deserialize(message.raw, POINT_CLOUD2_TYPE)), time_field)
+    return decode_point_cloud2(cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE)), time_field)
 
 
 @cache

@@ -165,29 +165,11 @@ def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
         # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
         database.execute("PRAGMA writable_schema=ON")
         topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
-        rows = _rows(database, report)
-        for topic, record_ns, raw in _all_but_last(rows) if _is_cut(path) else rows:
+        for topic, record_ns, raw in _rows(database, report):
             if topic in topics and isinstance(record_ns, int) and isinstance(raw, bytes):
                 yield RecoveredMessage(*topics[topic], record_ns, raw)
             else:
                 report(f"a row of it is no message (its data are of type {type(raw).__name__})")
-
-
-def _is_cut(path: Path) -> bool:
-    """Whether pages are missing at the end (sqlite.org/fileformat2.html, 1.3)."""
-    with path.open("rb") as file:
-        header = file.read(32)
-    (page,), (pages,) = struct.unpack_from(">H", header, 16), struct.unpack_from(">I", header, 28)
-    return bool(path.stat().st_size < pages * (65536 if page == 1 else page))
-
-
-def _all_but_last(rows: Iterator[tuple[object, ...]]) -> Iterator[tuple[object, ...]]:
-    """Without the last row of a file that was cut, to whose missing pages SQLite gives zeros."""
-    held = next(rows, None)
-    for row in rows:
-        if held is not None:
-            yield held
-        held = row
 
 
 def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:

@@ -17,7 +17,7 @@ from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, rea
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.point_time import PointTimeModel, is_return
 from lidarslam.datasets.point_time_inference import TimedCloud, learn_point_time
-from lidarslam.datasets.recording import PointTime, Recording, RecordingInfo
+from lidarslam.datasets.recording import Recording, RecordingInfo
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
@@ -67,11 +67,7 @@ class BagRecording:
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """The TUM file beside the bag, or inside its folder, named like the bag or ground_truth.tum.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """The TUM file beside the bag, or inside its folder, named like the bag or ground_truth.tum."""
         return None if self._truth_file is None else read_tum(self._truth_file)
 
     def __len__(self) -> int:
@@ -92,9 +88,6 @@ class BagRecording:
 
         A message of another sensor, or one whose stamp is not after those before it, keeps its index but makes no
         scan; such messages are counted, in a warning where nobody counts.
-
-        Raises:
-            InputError: the range makes no sense, or the bag is damaged.
         """
         return self._scans(scan_indices(len(self), start, stop, step), faults)
 
@@ -208,11 +201,7 @@ class BagRecording:
             yield TimedCloud(cloud.time_field, times, self._stamps.stamp(message))
 
     def describe(self) -> RecordingInfo:
-        """What `lidarslam info` prints.
-
-        Raises:
-            InputError: the bag is damaged, or none of its messages makes a scan.
-        """
+        """Of the first readable scan; see `Recording`."""
         faults = Faults()
         messages = in_stamp_order(self._wanted(range(len(self)), faults), self._stamps.stamp, faults)
         try:
@@ -228,7 +217,7 @@ class BagRecording:
             first=first,
             last_stamp=self._last_stamp or first.stamp,
             ground_truth=self._truth_file,
-            point_time=PointTime.of_scan(first, self._point_time),
+            point_time=self._point_time,
             topic=self._topic.name,
             topics=self._bag.topics,
             fields=cloud.fields,
