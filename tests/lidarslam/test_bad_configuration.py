@@ -50,7 +50,7 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
             "odometry: {kiss_icp: {voxel_size: 1}}",
             "no odometry.kiss_icp.voxel_size; did you mean voxel_size_m?",
         ),
-        ("mapping: {refinement: {max_iteratons: 3}}", "did you mean max_iterations?"),
+        ("mapping: {tracking: {lost_belo: 0.3}}", "did you mean lost_below?"),
         (
             "odometry: {kiss_icp: {voxel_size_m: [1]}}",
             "voxel_size_m=[1]: input should be a valid number",
