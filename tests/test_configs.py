@@ -1,12 +1,16 @@
 """The configuration: closed, typed, and clear about what is wrong."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
 from lidarslam.core.errors import ConfigError
-from lidarslam.train.config import TrainConfig, load_train_config
+from lidarslam.train.settings import TrainConfig, load_train_config
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -143,3 +147,21 @@ def test_the_printed_configuration_has_a_comment_for_every_setting_and_loads_aga
     assert load_config(file) == Config()
     printed = file.read_text()
     assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed
+
+
+def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    for name, field in model.model_fields.items():
+        section = next((one for one in (field.annotation, *get_args(field.annotation)) if is_model(one)), None)
+        if section is None:
+            yield f"{prefix}{name}", field
+        else:
+            yield from leaves(section, f"{prefix}{name}.")
+
+
+def is_model(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def test_there_are_few_settings_and_each_is_described() -> None:
+    assert len(list(leaves(Config))) <= 50
+    assert [name for name, field in leaves(Config) if not field.description] == []
