@@ -62,7 +62,7 @@ def watch(simulation: Simulation, every: int) -> list[Sample]:
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
         unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
-        log = stack.enter_context(ScanLog.open(directory, unfinished.rows))
+        log = ScanLog()
         odometry = make_odometry(config.odometry)
         checkpoints = Checkpoints(unfinished, config.checkpoints, odometry, log, None)
         pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, checkpointer=checkpoints)

@@ -115,7 +115,6 @@ def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
     "key",
     [
         "reader.rate_hz",
-        "reader.kitti_elevation_correction_deg",
         "odometry.kiss_icp.max_range_m",
         "global_map.voxel_size_m",
         "checkpoints.interval_s",
@@ -130,3 +129,11 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
     file = tmp_path / "empty.yaml"
     file.write_text("# nothing\n")
     assert load_config(file) == Config()
+
+
+def test_the_printed_configuration_has_a_comment_for_every_setting_and_loads_again(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_yaml(Config()))
+    assert load_config(file) == Config()
+    printed = file.read_text()
+    assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed

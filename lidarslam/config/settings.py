@@ -13,14 +13,13 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.yaml_text import YamlError, parse_yaml
+from lidarslam.config.yaml_text import YamlError, parse_yaml, settings_as_yaml
 from lidarslam.config.yaml_text import read_yaml as read_yaml_file
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run.directory import RUN_SECTION
 from lidarslam.train.directory import SOURCES_SECTION
-from mapping.config import GlobalMapConfig, MappingConfig
-from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
 # The sections of a run's or a training's config.yaml that are no configuration.
@@ -61,7 +60,7 @@ class Config(BaseModel):
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()
     mapping: MappingConfig = MappingConfig()
-    pose_graph: SlamGraphConfig = SlamGraphConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
     checkpoints: CheckpointConfig = CheckpointConfig()
@@ -106,10 +105,12 @@ def setting(key: str, text: str) -> str:
     return f"{key}='{quoted}'"
 
 
-def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:
-    """The resolved configuration as YAML; `run` becomes the section that says what was run."""
-    tree: dict[str, Any] = {} if run is None else {RUN_SECTION: run}
-    return str(yaml.safe_dump(tree | config.model_dump(mode="json"), sort_keys=False, allow_unicode=True))
+def dump_yaml(config: BaseModel, described: dict[str, Any] | None = None, section: str = RUN_SECTION) -> str:
+    """The resolved configuration as commented YAML, after a section that says what was computed."""
+    if described is None:
+        return settings_as_yaml(config)
+    first = yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)
+    return f"{first}\n{settings_as_yaml(config)}"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

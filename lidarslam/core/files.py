@@ -91,9 +91,9 @@ def only_writer(directory: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def cannot_write(path: Path, error: OSError, remedy: str = "") -> OutputError:
-    """The error for the user when the system refuses to write a file."""
-    return OutputError(f"{path}: cannot be written ({error.strerror or error}){remedy}")
+def cannot_write(path: Path, error: Exception, remedy: str = "") -> OutputError:
+    """The error for the user when a file cannot be written."""
+    return OutputError(f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}){remedy}")
 
 
 def _sync(path: Path) -> None:

@@ -45,7 +45,7 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray | 
             except OSError as error:
                 raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
             return
-        from lidarslam.viewer.rerun_viewer import save_errors
+        from lidarslam.viewer.rerun_runs import save_errors
 
         save_errors(partial, comparison, positions, clip_m)
 

@@ -14,7 +14,8 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.loop_closing import FinishedGraph, GraphOutcome, begin_graph, finish_recordings
+from lidarslam.merge.summary import MergedRecording, MergeSummary
+from lidarslam.pipeline.loop_closing import FinishedGraph, GraphOutcome, begin_graph
 from lidarslam.resume.unfinished import About, Unfinished, remove_unfinished
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory, remove_run
@@ -22,9 +23,9 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry, require_apart
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
+from lidarslam.run.summary import GraphSummary, WrittenMap, peak_rss_mb
 from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
-from lidarslam.viewer.viewer import NullViewer
+from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.moved_points import PlacedViews
 from mapping.pose_graph.g2o import format_g2o
 
@@ -255,8 +256,8 @@ def _track(part: _Part, graph: "SlamGraph", progress: Progress, voxel_size_m: fl
     if voxel_size_m is not None:
         request = _with_voxels(request, voxel_size_m)
     chosen = range(len(part.recording))
-    with closing(open_odometry(request.config, None)) as odometry, ScanLog.open(part.directory) as log:
-        return track(request, part.recording, chosen, odometry, log, graph, NullViewer(), progress)
+    with closing(open_odometry(request.config, None)) as odometry:
+        return track(request, part.recording, chosen, odometry, ScanLog(), graph, Viewer(), progress)
 
 
 def _with_voxels(request: RunRequest, voxel_size_m: float) -> RunRequest:
@@ -274,7 +275,7 @@ def _write(
 ) -> MergeOutcome:
     """Optimise the graph, and write the runs and what they have in common."""
     scans = [0 if tracked is None else len(tracked.log) for tracked in way.tracked]
-    finished = None if way.voxel_size_m is None else finish_recordings(graph, scans, way.voxel_size_m)
+    finished = None if way.voxel_size_m is None else FinishedGraph.of_recordings(graph, scans, way.voxel_size_m)
     joined = [] if finished is None else finished.joined
     if way.voxel_size_m is not None:
         parts = [replace(part, request=_with_voxels(part.request, way.voxel_size_m)) for part in parts]
@@ -288,7 +289,7 @@ def _write(
     directory.write_text(files.CONFIG, dump_yaml(request.config, _describe(request)))
     written = WrittenMap(0, way.voxel_size_m, 0)
     if common is not None:
-        directory.write_text(files.POSE_GRAPH, format_g2o(common.graph))
+        directory.write_text(files.POSE_GRAPH, format_g2o(common.keyframe_poses, common.edges))
         views = _all_views(way, scans, joined, common)
         drawn = drawn_map(common.global_map, views, request.config.global_map)
         written = write_map(directory, drawn, request.pcd)
@@ -327,7 +328,7 @@ def _write_run(
     """The run of one recording, its poses as the graph corrected them."""
     if tracked is None:
         return None
-    closed: GraphOutcome | None = None if finished is None else finished.of([index])
+    closed: GraphOutcome | None = None if finished is None else finished.outcome([index])
     if closed is not None:
         tracked.log.correct(closed.T_world_lidar)
     if not is_joined:

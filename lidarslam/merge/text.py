@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.merge.merge import MergeOutcome
+from lidarslam.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary_text import format_map
 
 

@@ -79,7 +79,7 @@ class Checkpoints:
         self._cost_s = self._done - self._asked
 
     def begin(self, pipeline: Pipeline, scans: Iterator[Scan], is_recorded: bool) -> Iterator[Scan]:
-        """Restore pipeline and odometry, and mark the run as being at work; the scans that are left.
+        """Restore log, pipeline and odometry, and mark the run as being at work; the scans that are left.
 
         Args:
             pipeline: new.
@@ -91,6 +91,7 @@ class Checkpoints:
         """
         saved, self._unfinished.saved = self._unfinished.saved, None  # its arrays are in use now
         if saved is not None:
+            self._log.restore(saved.part("log"))
             pipeline.restore(saved.part("pipeline"))
             if pipeline.held is None:
                 raise saved.refuse("no scan is held")

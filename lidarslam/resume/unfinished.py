@@ -13,7 +13,7 @@ from lidarslam.core.state import Saved
 from lidarslam.resume.state_file import read_state
 from lidarslam.run.directory import ABOUT, FILES, UNFINISHED, RunDirectory
 
-_STATE, _ROWS, _SUBMAPS = "state.npz", "scans.csv", "submaps.bin"
+_STATE, _SUBMAPS = "state.npz", "submaps.bin"
 # Differences to another run that an error lists.
 _LISTED = 3
 
@@ -108,13 +108,13 @@ class Unfinished:
         run: its directory.
         about: which run it is.
         saved: the state to go on from, None to begin.
-        state, rows, submaps: the files of the state, of scans.csv so far, and of the pose graph's submaps.
+        state, submaps: the files of the state and of the pose graph's submaps.
     """
 
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
         self._folder = run / UNFINISHED
-        self.state, self.rows, self.submaps = (self._folder / name for name in (_STATE, _ROWS, _SUBMAPS))
+        self.state, self.submaps = self._folder / _STATE, self._folder / _SUBMAPS
         self.saved: Saved | None = None
 
     @classmethod
@@ -176,7 +176,7 @@ class Unfinished:
     def _remove_files(self) -> None:
         if self._folder.is_dir():
             remove_partial_files(self._folder)
-        for path in (self.state, self.rows, self.submaps):
+        for path in (self.state, self.submaps):
             path.unlink(missing_ok=True)
 
 

@@ -1,6 +1,7 @@
 """One run on disk: from a source to a run directory."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,12 +12,12 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.resume.resuming import describe_computed
 from lidarslam.resume.unfinished import Unfinished
-from lidarslam.run.directory import RunDirectory
+from lidarslam.run.directory import RERUN, RunDirectory
 from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Progress, track
-from lidarslam.viewer.viewer import viewing
+from lidarslam.viewer.viewer import Viewer
 from odometry.interface import Odometry
 from odometry.registry import make_odometry
 
@@ -50,8 +51,10 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         if request.resumable:
             description = describe_computed(request, recording)
             unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
-        log, graph = _open_log_and_graph(config, directory, unfinished, stack)
-        with viewing(request.rerun, recording.name, config.viewer, directory, log) as viewer:
+        log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+        if graph is not None:
+            stack.callback(graph.close)
+        with _viewing(request, recording.name, directory, log) as viewer:
             tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
             closed = close_loops(graph, tracked.global_map, log, viewer)
             drawn = final_map(tracked, closed, config.global_map)
@@ -63,27 +66,37 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     return outcome
 
 
-def _open_log_and_graph(
-    config: Config, directory: RunDirectory, unfinished: Unfinished | None, stack: ExitStack
-) -> tuple[ScanLog, "SlamGraph | None"]:
-    """New, or as they were saved; the stack closes them.
+def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished | None) -> "SlamGraph | None":
+    """The pose graph, if there is one: new, or as it was saved.
 
     Raises:
         InputError: the checkpoint is damaged.
     """
     if unfinished is None:
-        log, graph = stack.enter_context(ScanLog.open(directory)), begin_graph(config, directory.path)
-    else:
-        saved = unfinished.saved
-        log_state = None if saved is None else saved.part("log")
-        log = stack.enter_context(ScanLog.open(directory, unfinished.rows, log_state))
-        if saved is None:
-            graph = begin_graph(config, file=unfinished.submaps)
-        else:
-            graph = restore_graph(config, saved.part("graph"), unfinished.submaps) if saved.has("graph") else None
-    if graph is not None:
-        stack.callback(graph.close)
-    return log, graph
+        return begin_graph(config, directory.path)
+    saved = unfinished.saved
+    if saved is None:
+        return begin_graph(config, file=unfinished.submaps)
+    return restore_graph(config, saved.part("graph"), unfinished.submaps) if saved.has("graph") else None
+
+
+@contextmanager
+def _viewing(request: RunRequest, name: str, directory: RunDirectory, log: ScanLog) -> Iterator[Viewer]:
+    """The viewer of a run; a Rerun recording that cannot be written is a warning."""
+    if request.rerun == "off":
+        yield Viewer()
+        return
+    from lidarslam.viewer.rerun_recording import IncompleteRecordingError
+    from lidarslam.viewer.rerun_viewer import rerun_viewer
+
+    try:
+        with (
+            directory.replacing(RERUN) as path,
+            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn") as viewer,
+        ):
+            yield viewer
+    except IncompleteRecordingError as error:
+        log.warn(f"no {RERUN}: {error}")
 
 
 def require_apart(out: Path, source: Path) -> None:

@@ -91,7 +91,7 @@ def track(
     Args:
         request: of the run.
         recording, chosen: the source, and the indices of the scans.
-        odometry, log, graph: new, or log and graph as they were saved, where the run is resumed.
+        odometry, log, graph: new, but for a graph that is resumed.
         viewer, progress: called for every scan.
         unfinished: where checkpoints are saved; None: nowhere.
 
@@ -99,17 +99,16 @@ def track(
         NoScanError: no scan could be used.
         InputError: the recording is not the one that the run was begun with.
     """
-    config = request.config
-    truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
-    with suppress(InputError):  # raised again when the scans are read
-        for warning in recording.warnings:
-            log.warn(warning)
-    faults = Faults()
+    config, faults = request.config, Faults()
     scans = take_in(recording, chosen, faults)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, checkpoints)
     if checkpoints is not None:
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
+    truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
+    with suppress(InputError):  # raised again when the scans are read
+        for warning in recording.warnings:
+            log.warn(warning)
     error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     if not log.points_read:
         why = "; ".join(_why_none(log, faults, error))

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import BaseModel, ConfigDict
 
-from lidarslam.config.settings import load_model
+from lidarslam.config.settings import dump_yaml, load_model
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.train.directory import SOURCES_SECTION
 from odometry.training.config import SimulatedConfig, TrainingConfig
@@ -43,5 +42,4 @@ def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) ->
 
 def dump_train_yaml(config: TrainConfig, trained_on: dict[str, Any]) -> str:
     """The configuration as YAML, after the section that names the recordings."""
-    tree = {SOURCES_SECTION: trained_on} | config.model_dump(mode="json")
-    return str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+    return dump_yaml(config, trained_on, SOURCES_SECTION)

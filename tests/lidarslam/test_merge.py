@@ -25,7 +25,7 @@ from lidarslam.merge.text import format_merge
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.run.directory import FILES
 from lidarslam.run.finished_run import load_map, load_run
-from lidarslam.run.watch import Progress
+from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion.motions import Motion
 from lidarslam.simulation.motion.mounts import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route

@@ -103,7 +103,7 @@ def test_who_passed_is_not_in_the_map(source: Path, tmp_path: Path) -> None:
     left_out = len(all_points) - len(points)
     assert [summary["map_points_moved"] for summary in summaries] == [left_out, 0]
     assert [summary["map_points"] for summary in summaries] == [len(points), len(all_points)]
-    assert f"one in every voxel of 10 cm; {left_out:,} points of what moved left out" in said
+    assert f"voxels of 10 cm; {left_out:,} points of moving objects removed" in said
 
 
 def test_the_last_map_that_rerun_shows_is_the_written_one(source: Path, tmp_path: Path) -> None:

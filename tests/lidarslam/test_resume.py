@@ -442,7 +442,7 @@ def test_another_recording_is_not_taken_for_it(
     assert ended.said.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["state.npz", "scans.csv", "run.json"])
+@pytest.mark.parametrize("name", ["state.npz", "run.json"])
 def test_damage_is_told_in_one_line(
     run: Run, whole: Callable[[str], Whole], source: Path, killed: Path, name: str
 ) -> None:
