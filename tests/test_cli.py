@@ -19,9 +19,8 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.merge.merge import MergeOutcome
 from lidarslam.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary import WrittenMap
-from odometry.images.image_config import ImageConfig
+from odometry.config import ImageConfig, NetworkConfig
 from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.network_config import CorrelationConfig, NetworkConfig
 from odometry.network.networks import make_network
 
 
@@ -90,7 +89,7 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
 
 
 def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Path) -> None:
-    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), bird_width=4))
+    network = NetworkConfig()
     weights = tmp_path / "weights of mine: 1.safetensors"
     images = ImageConfig(columns=180)
     save_checkpoint(weights, checkpoint_of(make_network(network), network, images))

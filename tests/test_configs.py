@@ -71,7 +71,6 @@ def test_the_readers_options_stay_text(text: str) -> None:
             ["odometry.kiss_icp.max_range_m=5", "odometry.kiss_icp.min_range_m=6"],
             r"kiss_icp: min_range_m=6 must be less",
         ),
-        (["odometry.consistency.lost_below=0.8"], r"consistency: lost_below=0\.8 must not exceed degraded_below=0\.7,"),
         (["mapping.tracking.lost_below=0.8"], r"tracking: lost_below=0\.8 must not exceed degraded_below=0\.6,"),
         (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),
     ],
@@ -115,17 +114,12 @@ def test_the_origin_is_the_one_that_was_given(tmp_path: Path) -> None:
     assert str(error.value).startswith(f"configuration ({file} or --set): ")
 
 
-def test_equal_thresholds_are_no_contradiction() -> None:
-    assert load_config(None, ["odometry.consistency.lost_below=0.7"]).odometry.consistency.lost_below == 0.7
-
-
 @pytest.mark.parametrize("value", [".inf", "-.inf", ".nan"])
 @pytest.mark.parametrize(
     "key",
     [
         "reader.rate_hz",
         "odometry.kiss_icp.max_range_m",
-        "odometry.consistency.gate_min_m",
         "global_map.voxel_size_m",
         "checkpoints.interval_s",
     ],
