@@ -55,7 +55,10 @@ def test_the_readers_options_stay_text(text: str) -> None:
     [
         (["odometry.kiss_icp.voxelsize=1"], r"no odometry\.kiss_icp\.voxelsize; did you mean voxel_size_m\?"),
         (["odometry.colour=1"], r"no odometry\.colour; there are: method"),
-        (["global_map.voxel_size_m=-1"], r"global_map\.voxel_size_m=-1: input should be greater than 0"),
+        (
+            ["global_map.voxel_size_m=-1"],
+            r"global_map\.voxel_size_m=-1: input should be greater than or equal",
+        ),
         (["odometry.method=loam"], r"odometry\.method='loam': input should be 'learned'"),
         (["global_map"], r"expected key\.path=value"),
         (["global_map.voxel_size_m=2", "global_map.voxel_size_m.x=1"], "voxel_size_m is a value, not a section"),

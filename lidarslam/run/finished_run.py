@@ -117,9 +117,12 @@ def _summary(path: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError(f"expected keys and values, got a {type(content).__name__}")
+    except (OSError, ValueError, RecursionError) as error:
         raise _damaged(file, "a run's summary", error) from error
+    return content
 
 
 def _loops(path: Path, scans: int) -> NDArray[np.intp]:
