@@ -27,7 +27,7 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.loop_closing import begin_graph, finish_graph
+from lidarslam.pipeline.loop_closing import FinishedGraph, begin_graph
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
 from odometry.registry import make_odometry
@@ -89,7 +89,9 @@ def _run_ours(method: str, scans: Sequence[Scan], warm_up: int) -> tuple[float, 
     if pipeline.map.global_map is not None:
         pipeline.map.global_map.points()  # what waits to be merged is part of the work
     if graph is not None and pipeline.map.global_map is not None:
-        finish_graph(graph, len(scans), pipeline.map.global_map.voxel_size_m)
+        finished = FinishedGraph.of_recordings(graph, [len(scans)], pipeline.map.global_map.voxel_size_m)
+        assert finished is not None
+        finished.outcome([0])
         graph.close()
     odometry.close()
     return clock()

@@ -1,31 +1,11 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
+import math
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
-
-
-class GlobalMapConfig(BaseModel):
-    """The merged map that a run leaves behind."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    voxel_size_m: float | None = Field(
-        None, gt=0.0, description="one point a voxel; null: follows the median range of the first scan"
-    )
-    min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
-    max_range_m: float = Field(80.0, gt=0.0, description="farther points, sparse and noisy, are left out")
-    min_hits: int = Field(1, ge=1, description="scans' points a voxel needs before it is written")
-    leave_out_moved: bool = Field(
-        True, description="leave out what other scans saw through where it was: people and vehicles that passed"
-    )
-    normal_neighbours: int = Field(20, ge=3, description="points that a normal is estimated from")
-
-    @model_validator(mode="after")
-    def _ranges_leave_something(self) -> Self:
-        require_range_left(self.min_range_m, self.max_range_m)
-        return self
 
 
 class TrackingConfig(BaseModel):
@@ -71,3 +51,68 @@ class MappingConfig(BaseModel):
     def _ranges_leave_points(self) -> Self:
         require_range_left(self.min_range_m, self.max_range_m)
         return self
+
+
+# The global map, keyframes, loop closures.
+
+
+class GlobalMapConfig(BaseModel):
+    """The merged map that a run leaves behind."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    voxel_size_m: float | None = Field(
+        None, ge=0.01, description="one point a voxel; null: follows the median range of the first scan"
+    )
+    min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
+    max_range_m: float = Field(80.0, gt=0.0, description="farther points, sparse and noisy, are left out")
+    min_hits: int = Field(1, ge=1, description="scans' points a voxel needs before it is written")
+    leave_out_moved: bool = Field(
+        True, description="leave out what other scans saw through where it was: people and vehicles that passed"
+    )
+
+    @model_validator(mode="after")
+    def _ranges_leave_something(self) -> Self:
+        require_range_left(self.min_range_m, self.max_range_m)
+        return self
+
+
+class KeyframeConfig(BaseModel):
+    """When a scan becomes a keyframe; see `mapping.pose_graph.keyframes`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    distance_m: float | None = Field(
+        None, gt=0.0, description="way from one to the next; null: a quarter of the median range, 0.5 to 4 m"
+    )
+    turn_deg: float = Field(25.0, gt=0.0, le=180.0, description="turn from one to the next")
+
+
+class LoopConfig(BaseModel):
+    """Loop detection and verification; see `mapping.loops.detection`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    max_range_m: float = Field(60.0, ge=1.0, description="farther points of a keyframe are left out")
+    drift_percent: float = Field(
+        1.0, gt=0.0, description="standard deviation of the drift; in attitude 2 degrees in 100 m for each percent"
+    )
+    min_way_m: float | None = Field(
+        None, ge=0.0, description="shorter ways back are no loops; null: three median ranges, at least 10 m"
+    )
+    min_overlap: float = Field(0.75, ge=0.0, le=1.0, description="inliers among what two keyframes see of each other")
+
+    @property
+    def drift_rates(self) -> tuple[float, float]:
+        """Standard deviations of attitude and position for each metre of the way, radians and metres."""
+        return math.radians(0.02 * self.drift_percent), 0.01 * self.drift_percent
+
+
+class PoseGraphConfig(BaseModel):
+    """Keyframes, loop closures and their optimisation; see `mapping.pose_graph.slam_graph`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    enabled: bool = Field(False, description="build a pose graph, close loops, and correct trajectory and map")
+    keyframes: KeyframeConfig = KeyframeConfig()
+    loops: LoopConfig = LoopConfig()

@@ -48,6 +48,8 @@ CONFINED = {
     "laspy": ("lidarslam.evaluate.reference_cloud",),
     "pye57": ("lidarslam.evaluate.reference_cloud",),
     "lightning_fabric": ("lidarslam.train.devices",),
+    "jinja2": ("evaluation.report.report",),
+    "plotly": ("evaluation.report.*",),
     "safetensors": ("odometry.network.tensor_file",),
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("odometry.network.export",),

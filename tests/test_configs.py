@@ -120,7 +120,6 @@ def test_equal_thresholds_are_no_contradiction() -> None:
     "key",
     [
         "reader.rate_hz",
-        "reader.kitti_elevation_correction_deg",
         "odometry.kiss_icp.max_range_m",
         "odometry.consistency.gate_min_m",
         "global_map.voxel_size_m",

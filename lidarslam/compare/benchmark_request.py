@@ -7,7 +7,7 @@ from pathlib import Path
 
 from evaluation.comparison.mean_table import TablePlan
 from evaluation.comparison.quantities import find_quantity
-from evaluation.comparison.summary_table import TableCell, TableRow
+from evaluation.comparison.table import TableCell, TableRow
 from lidarslam.compare.benchmark import Benchmark, BenchmarkMethod, BenchmarkRecording, BenchmarkTable, Published
 from lidarslam.compare.methods import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS

@@ -133,6 +133,7 @@ def collect(task: MethodTask, record: ProcessRecord) -> MethodResult:
         trajectory=finished.trajectory,
         lost=finished.lost,
         lost_reasons=reasons,
+        map_entropy=summary["map_entropy"],
         ms_per_scan_median=ms.pop("total"),
         ms_per_scan_p95=p95,
         stage_ms=ms,

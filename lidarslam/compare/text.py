@@ -7,7 +7,7 @@ from pathlib import Path
 
 from evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from evaluation.comparison.quantities import QUANTITIES, Quantity
-from evaluation.comparison.summary_table import SummaryTable, TableCell, TableColumn
+from evaluation.comparison.table import Table, TableCell, TableColumn
 from evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.compare.method_ending import WHOLE
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD
@@ -119,7 +119,7 @@ def _head(label: str, unit: str) -> str:
     return f"{label} {unit}".strip()
 
 
-def _summary_lines(table: SummaryTable) -> Iterator[str]:
+def _summary_lines(table: Table) -> Iterator[str]:
     yield table.title
     columns = [
         _Column(

@@ -19,8 +19,7 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run.directory import RUN_SECTION
 from lidarslam.train.directory import SOURCES_SECTION
-from mapping.config import GlobalMapConfig, MappingConfig
-from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
 # The sections of a run's or a training's config.yaml that are no configuration.
@@ -61,7 +60,7 @@ class Config(BaseModel):
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()
     mapping: MappingConfig = MappingConfig()
-    pose_graph: SlamGraphConfig = SlamGraphConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
     checkpoints: CheckpointConfig = CheckpointConfig()

@@ -50,11 +50,11 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
     yield "start", _instant(info.first_stamp)
     rate = "" if info.rate_hz is None else f" at {info.rate_hz:.2f} Hz"
     yield "duration", f"{info.duration_s:.1f} s{rate}"
-    dropped = f" and {info.dropped_points:,} invalid ones left out" if info.dropped_points else ""
-    yield "points", f"{info.points_per_scan:,} in the first scan{dropped}"
+    dropped = f" and {info.first.dropped:,} invalid ones left out" if info.first.dropped else ""
+    yield "points", f"{len(info.first):,} in the first scan{dropped}"
     if info.fields:
         yield "fields", ", ".join(f"{field.name} {field.type_name}" for field in info.fields)
-    yield "rings", "yes" if info.has_rings else "no"
+    yield "rings", "no" if info.first.rings is None else "yes"
     yield "point time", _point_time(info)
     yield "ground truth", str(info.ground_truth) if info.ground_truth else "none"
     for note in info.notes:
@@ -68,11 +68,11 @@ def _instant(stamp: float) -> str:
 
 
 def _point_time(info: RecordingInfo) -> str:
-    time = info.point_time
-    if time is None:
+    model, offsets = info.point_time, info.first.time_offsets
+    if model is None or offsets is None or not len(offsets):
         return "none (scans are taken as motion compensated or at one instant)"
-    span = f"{1e3 * time.first_s:+.1f} to {1e3 * time.last_s:+.1f} ms around the stamp"
-    return f"{time.source} in {time.unit}, {time.reference}; {span}"
+    span = f"{1e3 * offsets.min():+.1f} to {1e3 * offsets.max():+.1f} ms around the stamp"
+    return f"{model.field} in {model.unit}, {model.reference}; {span}"
 
 
 def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:

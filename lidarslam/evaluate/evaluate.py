@@ -6,10 +6,9 @@ from pathlib import Path
 
 from evaluation.map.entropy import MapEntropy, map_entropy
 from evaluation.report.error_colours import DEFAULT_CLIP_M
-from evaluation.trajectory.agreement import disagreement
 from evaluation.trajectory.alignment import AlignmentMethod
 from evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S
-from evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory, metrics_json
+from evaluation.trajectory.metrics import TrajectoryMetrics, disagreement, evaluate_trajectory, metrics_json
 from lidarslam.core.errors import InputError
 from lidarslam.evaluate.error_cloud import check_error_files, write_errors
 from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth

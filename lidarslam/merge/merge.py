@@ -15,7 +15,7 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.merge.summary import MergedRecording, MergeSummary
-from lidarslam.pipeline.loop_closing import FinishedGraph, GraphOutcome, begin_graph, finish_recordings
+from lidarslam.pipeline.loop_closing import FinishedGraph, GraphOutcome, begin_graph
 from lidarslam.resume.unfinished import About, Unfinished, remove_unfinished
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory, remove_run
@@ -275,7 +275,7 @@ def _write(
 ) -> MergeOutcome:
     """Optimise the graph, and write the runs and what they have in common."""
     scans = [0 if tracked is None else len(tracked.log) for tracked in way.tracked]
-    finished = None if way.voxel_size_m is None else finish_recordings(graph, scans, way.voxel_size_m)
+    finished = None if way.voxel_size_m is None else FinishedGraph.of_recordings(graph, scans, way.voxel_size_m)
     joined = [] if finished is None else finished.joined
     if way.voxel_size_m is not None:
         parts = [replace(part, request=_with_voxels(part.request, way.voxel_size_m)) for part in parts]
@@ -289,7 +289,7 @@ def _write(
     directory.write_text(files.CONFIG, dump_yaml(request.config, _describe(request)))
     written = WrittenMap(0, way.voxel_size_m, 0)
     if common is not None:
-        directory.write_text(files.POSE_GRAPH, format_g2o(common.graph))
+        directory.write_text(files.POSE_GRAPH, format_g2o(common.keyframe_poses, common.edges))
         views = _all_views(way, scans, joined, common)
         drawn = drawn_map(common.global_map, views, request.config.global_map)
         written = write_map(directory, drawn, request.pcd)
@@ -328,7 +328,7 @@ def _write_run(
     """The run of one recording, its poses as the graph corrected them."""
     if tracked is None:
         return None
-    closed: GraphOutcome | None = None if finished is None else finished.of([index])
+    closed: GraphOutcome | None = None if finished is None else finished.outcome([index])
     if closed is not None:
         tracked.log.correct(closed.T_world_lidar)
     if not is_joined:

@@ -61,7 +61,7 @@ def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMa
     if global_map is None:
         return DrawnMap(None, None)
     moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
-    cloud = global_map.cloud(config.normal_neighbours, config.min_hits, moved)
+    cloud = global_map.cloud(config.min_hits, moved)
     return DrawnMap(cloud, global_map.voxel_size_m, int(moved.sum()))
 
 
@@ -72,7 +72,7 @@ def write_results(
     config, log = request.config, tracked.log
     directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
     if closed is not None:
-        directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
+        directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))
     directory.write_text(files.SCANS_CSV, log.format_csv())
     metrics = _write_trajectories(directory, tracked)
     written = write_map(directory, drawn, request.pcd)

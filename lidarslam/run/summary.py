@@ -67,8 +67,8 @@ class GraphSummary:
     def of(cls, closed: GraphOutcome) -> "GraphSummary":
         """Of an optimised graph."""
         return cls(
-            keyframes=len(closed.graph.keys),
-            edges=len(closed.graph.edges),
+            keyframes=len(closed.keyframe_poses),
+            edges=len(closed.edges),
             loops=closed.loops,
             largest_correction_m=closed.largest_correction_m,
             ms_per_keyframe=Milliseconds.of(closed.keyframe_ms) if closed.keyframe_ms else None,

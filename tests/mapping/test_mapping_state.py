@@ -10,11 +10,10 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig
+from mapping.config import KeyframeConfig, MappingConfig
 from mapping.global_map import global_map
 from mapping.global_map.global_map import GlobalMap
 from mapping.mapper import Mapper
-from mapping.pose_graph.graph_config import KeyframeConfig
 from mapping.pose_graph.keyframes import KeyframeSelector
 from mapping.prediction import OdometryNoise, Prior, ProcessNoise
 from mapping.tracking.tracker import MappedScan
@@ -107,7 +106,7 @@ def test_a_global_map_goes_on(
         restored = GlobalMap.restored(through_disk(part.state()))
         for cloud in clouds[after:]:
             restored.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
+        np.testing.assert_array_equal(restored.means(), whole.means())
 
 
 def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: ThroughDisk) -> None:

@@ -1,6 +1,5 @@
 """Which function reads a scan file into a table of points."""
 
-import math
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -83,10 +82,12 @@ def read_npy(path: Path) -> NDArray[np.void]:
     """
     data = read_bytes(path)
     try:
-        array = _parse_npy(data)
+        array = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except Exception as error:  # NumPy parses the header as Python, which fails in many ways
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: cannot be read as .npy ({reason}); copy it again or remove it") from None
+        raise InputError(
+            f"{path}: cannot be read as .npy ({reason}); it is truncated or damaged: copy it again or remove it"
+        ) from None
     if array.dtype.names:
         return cast("NDArray[np.void]", array.reshape(-1))
     if array.ndim < 2 or not 3 <= array.shape[-1] <= _WIDEST_ARRAY or array.dtype.kind not in "fiu":
@@ -96,18 +97,3 @@ def read_npy(path: Path) -> NDArray[np.void]:
         )
     names = tuple("xyz") + tuple(f"column_{column}" for column in range(3, array.shape[-1]))
     return as_table(array.reshape(-1, array.shape[-1]), names)
-
-
-def _parse_npy(data: bytes) -> NDArray[np.generic]:
-    """The array of a .npy file. NumPy's own loader makes room for whatever the header promises before it reads."""
-    stream = BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, by_column, dtype = read_header(stream)
-    if dtype.hasobject:
-        raise ValueError("it holds pickled objects, which could run any program; save numbers")
-    count, body = math.prod(shape), data[stream.tell() :]
-    if min(shape, default=0) < 0 or dtype.itemsize == 0 or len(body) < count * dtype.itemsize:
-        raise ValueError(f"expected {shape} of {dtype}, got {len(body)} bytes: it is truncated")
-    array = np.frombuffer(body, dtype, count=count)
-    return array.reshape(shape[::-1]).T if by_column else array.reshape(shape)
