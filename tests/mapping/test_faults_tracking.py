@@ -161,7 +161,7 @@ def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: S
     results = process(mapper, replace(recorded, scans=recorded.scans[: AT + 18]))
     assert results[0].status is not Status.OK
     assert any("relocalised in the map" in result.message for result in results[:3])
-    assert not any(result.way_known for result in results if "relocalised in the map" in result.message)
+    assert not any(result.is_connected for result in results if "relocalised in the map" in result.message)
     assert not results[0].added
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded, 3)

@@ -41,8 +41,8 @@ def scans(room_scans: list[Scan]) -> list[Scan]:
 def assert_same(found: MappedScan, expected: MappedScan) -> None:
     for name, value in vars(expected.state).items():
         np.testing.assert_array_equal(getattr(found.state, name), value, err_msg=name)
-    np.testing.assert_array_equal(found.T_world_expected, expected.T_world_expected)
-    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "way_known"):
+    np.testing.assert_array_equal(found.T_world_predicted, expected.T_world_predicted)
+    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "is_connected"):
         assert getattr(found, name) == getattr(expected, name), name
 
 
