@@ -22,7 +22,7 @@ from lidarslam.core.state import Stateful
 from mapping.config import PoseGraphConfig
 from mapping.global_map.global_map import GlobalMap, means_points
 from mapping.loops.closure import LoopClosure, RelativePose
-from mapping.loops.detection import LoopDetector, Submap
+from mapping.loops.detection import LoopDetector
 from mapping.loops.refinement import DenseSubmap, refine
 from mapping.loops.revisits import as_registered
 from mapping.pose_graph.correction import Corrected, corrected, recordings_of
@@ -179,9 +179,7 @@ class SlamGraph(Stateful):
         submap, self._submap = self._submap or GlobalMap(1.0), None
         means = submap.means()
         self._store.append(means)
-        found = self._detector.add(
-            Submap(index, keyframe.segment, keyframe.path_m, means_points(means)), np.array(self._poses)
-        )
+        found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
         self._refine_closures(until=index - _REACH)
