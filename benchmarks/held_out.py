@@ -25,7 +25,7 @@ from evaluation.trajectory.drift import segment_errors
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.scan_stream import in_order
 from odometry.config import OdometryConfig
 from odometry.interface import Motion
 from odometry.methods.learned_config import LearnedConfig

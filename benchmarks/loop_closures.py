@@ -29,7 +29,7 @@ from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory, chain
-from lidarslam.pipeline.localisation import SweepMotion
+from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.simulation.motion.carriers import CARRIERS
 from lidarslam.simulation.motion.mounts import MOUNTS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route

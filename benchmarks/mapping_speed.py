@@ -41,7 +41,7 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.scan_stream import in_order
 from mapping import mapper, sampling
 from mapping.config import MappingConfig
 from mapping.mapper import Mapper

@@ -133,7 +133,3 @@ def entry_point() -> None:
         raise
     finally:
         leave_if_abandoned(status)
-
-
-if __name__ == "__main__":
-    entry_point()

@@ -1,5 +1,6 @@
 """The command line as a stranger meets it: help, exit statuses, one-line errors."""
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -16,8 +17,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.merge.merge import MergeOutcome
-from lidarslam.run.summary import MergedRecording, MergeSummary, WrittenMap
-from lidarslam.viewer.rerun_viewer import Served
+from lidarslam.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.summary import WrittenMap
 from odometry.images.image_config import ImageConfig
 from odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from odometry.network.network_config import CorrelationConfig, NetworkConfig
@@ -238,7 +239,7 @@ def test_options_that_the_source_has_no_use_for_are_named(recording: Path) -> No
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a full disk at hand")
 def test_a_full_disk_gets_one_line() -> None:
     with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "lidarslam.cli", "config"]
+        command = [sys.executable, "-m", "lidarslam", "config"]
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert ended.stderr == "lidarslam: No space left on device\n"
     assert ended.returncode == 1
@@ -257,9 +258,9 @@ def test_view_says_where_the_browser_is_served(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert lidarslam("run", recording, "--out", tmp_path / "run", "--stop", 2).exit_code == 0
-    served = Served("http://127.0.0.1:9090/?url=there", None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr("lidarslam.viewer.rerun_viewer.show_runs", lambda *_: served)
+    served = contextlib.nullcontext("http://127.0.0.1:9090/?url=there")
+    monkeypatch.setattr("lidarslam.viewer.rerun_runs.served_runs", lambda *_: served)
     monkeypatch.setattr("signal.pause", lambda: None)
     lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
     assert lines[0] == "http://127.0.0.1:9090/?url=there"
-    assert lines[1].startswith("serving this machine alone until you press Ctrl-C; ")
+    assert lines[1].startswith("serving this machine until Ctrl-C; ")

@@ -124,7 +124,7 @@ def test_equal_thresholds_are_no_contradiction() -> None:
         "odometry.kiss_icp.max_range_m",
         "odometry.consistency.gate_min_m",
         "global_map.voxel_size_m",
-        "viewer.map_radius_m",
+        "checkpoints.interval_s",
     ],
 )
 def test_every_number_is_finite(key: str, value: str) -> None:
@@ -136,3 +136,11 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
     file = tmp_path / "empty.yaml"
     file.write_text("# nothing\n")
     assert load_config(file) == Config()
+
+
+def test_the_printed_configuration_has_a_comment_for_every_setting_and_loads_again(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_yaml(Config()))
+    assert load_config(file) == Config()
+    printed = file.read_text()
+    assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed

@@ -19,8 +19,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
-from lidarslam.pipeline.pipeline import ScanResult
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.run.directory import FILES
 from lidarslam.run.finished_run import load_run
 from lidarslam.run.request import RunRequest

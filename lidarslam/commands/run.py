@@ -58,9 +58,10 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 @click.pass_context
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
+    from lidarslam.resume.resuming import lost_when_finished
     from lidarslam.run.progress import show_progress
     from lidarslam.run.request import RunRequest
-    from lidarslam.run.run import astray_when_finished, execute
+    from lidarslam.run.run import execute
     from lidarslam.run.summary_text import format_outcome
 
     if options["resume"] and options["overwrite"]:
@@ -75,9 +76,9 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     )
     config = take_config(options, settings, source)
     request = RunRequest(source, out, config, **options)
-    if request.resume and (astray := astray_when_finished(request)) is not None:
+    if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished, nothing is left to do")
-        ctx.exit(EXIT_LOST if astray else 0)
+        ctx.exit(EXIT_LOST if lost else 0)
     with show_progress(source.name) as progress:
         outcome = execute(request, progress)
     say(format_outcome(out, outcome))

@@ -49,5 +49,5 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> N
     """
     from lidarslam.train.command import TrainOptions, run_train
 
-    if run_train(TrainOptions(sources, **options), say).interrupted:
+    if not run_train(TrainOptions(sources, **options), say):
         ctx.exit(EXIT_MENDABLE)

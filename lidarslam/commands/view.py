@@ -39,15 +39,18 @@ def view(
         return
     config = resolve(config_file, settings)
     finished = [load_run(path) for path in runs]
-    from lidarslam.viewer.rerun_viewer import show_runs
+    from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs
 
-    served = show_runs(finished, config.viewer, save, web)
     if save is not None:
+        save_runs(finished, config.viewer, save)
         say(f"written to {save}")
-    elif served is not None:
-        say(served.address)
-        say("serving this machine alone until you press Ctrl-C; from another, forward ports 9090 and 9876 by ssh -L")
-        signal.pause()
+    elif web:
+        with served_runs(finished, config.viewer) as address:
+            say(address)
+            say("serving this machine until Ctrl-C; from another machine, forward ports 9090 and 9876 with ssh -L")
+            signal.pause()
+    else:
+        open_runs(finished, config.viewer)
 
 
 def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:

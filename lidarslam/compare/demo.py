@@ -69,9 +69,9 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
     )
     runs = _runs(out, outcome)
     if runs:
-        from lidarslam.viewer.rerun_viewer import show_runs
+        from lidarslam.viewer.rerun_runs import save_runs
 
-        show_runs([load_run(run) for run in runs], ViewerConfig(), out / REPLAY, web=False)
+        save_runs([load_run(run) for run in runs], ViewerConfig(), out / REPLAY)
     pictures = tuple(_picture(out, place) for place in (source, *runs))
     return Demo(out, outcome, pictures)
 

@@ -14,6 +14,7 @@ from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import remove_partial_files
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.finished_run import load_run
@@ -73,8 +74,7 @@ def run_method(
             progress(int(words[0]), int(words[1]))
 
     ending = supervise([*command, encode(task.run)], folder / LOG, limits, see, _ROOT)
-    for partial in folder.glob(".partial-*"):
-        partial.unlink()
+    remove_partial_files(folder)
     status, message = judge(ending, folder, folder / LOG, limits)
     record = ProcessRecord(status, message, ending.wall_s, ending.peak_rss_mb)
     RunDirectory(folder).write_json(PROCESS, asdict(record))

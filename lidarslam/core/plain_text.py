@@ -31,5 +31,10 @@ def printable(text: str) -> str:
     return _STEERING_BUT_LINES.sub(_spelt, text)
 
 
+def count(number: int, noun: str) -> str:
+    """A number with its noun: 1 scan, 2,000 scans."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def _spelt(match: re.Match[str]) -> str:
     return match.group().encode("unicode_escape").decode("ascii")

@@ -8,8 +8,8 @@ import numpy as np
 from evaluation.map.metrics import CloudErrors, MapComparison
 from evaluation.report.error_colours import error_colours
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import replacing
 from lidarslam.core.geometry import FloatArray
-from lidarslam.run.directory import RunDirectory
 from lidarslam.simulation.writers.ply import write_ply
 
 SUFFIXES = (".ply", ".rrd")
@@ -38,14 +38,14 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray | 
     Raises:
         OutputError: it cannot be written.
     """
-    with RunDirectory(path.parent).replacing(path.name) as partial:
+    with replacing(path) as partial:
         if path.suffix.lower() == ".ply":
             try:
                 write_ply(partial, _vertices(comparison.map_errors, clip_m))
             except OSError as error:
                 raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
             return
-        from lidarslam.viewer.rerun_viewer import save_errors
+        from lidarslam.viewer.rerun_runs import save_errors
 
         save_errors(partial, comparison, positions, clip_m)
 

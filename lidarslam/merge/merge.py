@@ -10,6 +10,7 @@ from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
+from lidarslam.merge.summary import MergedRecording, MergeSummary
 from lidarslam.pipeline.loop_closing import FinishedGraph, begin_graph
 from lidarslam.resume.unfinished import Unfinished
 from lidarslam.run import directory as files
@@ -18,10 +19,9 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary import GraphSummary, MergedRecording, MergeSummary, WrittenMap, peak_rss_mb
-from lidarslam.run.tracking import NoScanError, Tracked, track
-from lidarslam.run.watch import Progress
-from lidarslam.viewer.viewer import NullViewer
+from lidarslam.run.summary import GraphSummary, WrittenMap, peak_rss_mb
+from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
+from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.moved_points import PlacedViews
 from mapping.pose_graph.g2o import format_g2o
 
@@ -117,8 +117,8 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
 
 def _begin(directory: RunDirectory, description: dict[str, Any], stack: ExitStack) -> Unfinished:
     """Mark a directory as unfinished."""
-    unfinished = stack.enter_context(Unfinished.claim(directory.path, description, False, lambda: directory.is_mixed))
-    unfinished.begin(None)
+    unfinished = stack.enter_context(Unfinished.claim(directory, description, resume=False))
+    unfinished.begin(0)
     return unfinished
 
 
@@ -135,10 +135,9 @@ def _track_all(parts: Sequence[_Part], graph: "SlamGraph", show: Show) -> None:
             with (
                 show(f"{number}/{len(parts)} {part.recording.name}") as progress,
                 closing(open_odometry(part.request.config, None)) as odometry,
-                ScanLog.open(part.directory) as log,
             ):
                 scans = range(len(part.recording))
-                tracked = track(part.request, part.recording, scans, odometry, log, graph, NullViewer(), progress)
+                tracked = track(part.request, part.recording, scans, odometry, ScanLog(), graph, Viewer(), progress)
         except (NoScanError, KeyboardInterrupt) as error:
             of_user = isinstance(error, KeyboardInterrupt)
             part.missing = f"{part.request.source}: interrupted" if of_user else str(error)

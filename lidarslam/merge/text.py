@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from lidarslam.merge.merge import MergeOutcome
+from lidarslam.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary_text import format_map
 
 

@@ -10,8 +10,8 @@ from rich.text import Text
 
 from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
-from lidarslam.pipeline.pipeline import ScanResult
-from lidarslam.run.watch import Progress as ProgressCallback
+from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.run.tracking import Progress as ProgressCallback
 
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
 

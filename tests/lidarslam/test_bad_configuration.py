@@ -57,7 +57,7 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
         ),
         ("odometry: {kiss_icp: {voxel_size_m: .nan}}", "input should be a finite number"),
         ("odometry: 3", "odometry=3: expected a section"),
-        ("odometry: {method: kiss-icp}\nodometry: {method: learned}", "the key 'odometry' stands twice"),
+        ("odometry: {method: kiss-icp}\nodometry: {method: learned}", "the key 'odometry' occurs twice"),
         ("- 1\n- 2", "expected keys and values, got a list"),
         ("hello", "expected keys and values, got a str"),
         ("{{{:\n]", "not YAML"),

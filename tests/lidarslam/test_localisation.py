@@ -10,8 +10,9 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.localisation import Estimated, Localised, OdometryAlone, ScanToMap, SweepMotion
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, SweepMotion
+from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap
+from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig, MappingConfig
 from mapping.mapper import Mapper
 from odometry.interface import Motion, Odometry
@@ -56,7 +57,7 @@ def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> N
         for number, names in enumerate([(), (), ("x", "yaw")])
     ]
     assert [localised.status for localised in told[1:]] == [Status.OK, Status.DEGRADED]
-    assert (told[1].message, told[2].message) == ("", "nothing to see along x, yaw")
+    assert (told[1].message, told[2].message) == ("", "degenerate along x, yaw")
     assert told[2].degenerate == ("x", "yaw")
 
 
@@ -122,8 +123,8 @@ def check_poses_and_map(results: list[ScanResult], pipeline: Pipeline, room: Any
     assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.01
     assert np.rad2deg(rotation_angle(errors)).max() < 0.1
     assert all(result.status is Status.OK for result in results)
-    assert pipeline.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert pipeline.map.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 0.005
     assert np.percentile(distance, 99) < 0.06

@@ -48,7 +48,7 @@ def test_a_slide_is_a_warning_and_exit_status_3(tmp_path: Path, recording: Path,
     assert good.exit_code == 0, good.output
     assert fine["map_contradictions"] == []
     assert not any("contradicts itself" in warning for warning in fine["warnings"])
-    assert "mean entropy" in good.output
+    assert "mean map entropy" in good.output
     slid, summary = run(recording, room_truth, tmp_path / "slid", 0.4)
     assert slid.exit_code == 3, slid.output
     assert summary["lost_scans"] == 0

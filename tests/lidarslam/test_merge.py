@@ -23,10 +23,10 @@ from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.merge.merge import MergeOutcome, merge
 from lidarslam.merge.parts import MergeRequest
 from lidarslam.merge.text import format_merge
-from lidarslam.pipeline.pipeline import ScanResult
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.run.directory import FILES
 from lidarslam.run.finished_run import load_map, load_run
-from lidarslam.run.watch import Progress
+from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion.motions import Motion
 from lidarslam.simulation.motion.mounts import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route

@@ -12,8 +12,9 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import OdometryAlone
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig
 from mapping.pose_graph.graph_scan import GraphScan
 from odometry.config import ConsistencyConfig
@@ -41,8 +42,8 @@ def test_true_motions_give_true_poses_and_a_true_map(
     truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
     np.testing.assert_allclose([result.T_world_lidar for result in results], truth, atol=1e-9)
     assert all(result.status is Status.OK for result in results)
-    assert pipeline.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert pipeline.map.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     # A voxel's mean may lie off a corner by a part of the voxel; nothing else may lie off a surface.
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 1e-6
@@ -63,8 +64,8 @@ def test_a_single_scan_becomes_the_map(true_odometry: ExternalOdometry, room_sca
     pipeline = make_pipeline(true_odometry)
     (result,) = pipeline.run(room_scans[:1])
     np.testing.assert_array_equal(result.T_world_lidar, np.eye(4))
-    assert pipeline.global_map is not None
-    assert len(pipeline.global_map.points()) > 1_000
+    assert pipeline.map.global_map is not None
+    assert len(pipeline.map.global_map.points()) > 1_000
 
 
 def test_no_scans_give_no_results(true_odometry: ExternalOdometry) -> None:
@@ -103,8 +104,8 @@ def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(
     assert statuses(results[:18]) == [Status.OK] * 18
     assert statuses(results[18:]) in ([Status.OK, Status.LOST], [Status.DEGRADED, Status.LOST])
     assert failure is None or results[19].message == failure
-    assert pipeline.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert pipeline.map.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     assert room.distance_to_surface(in_room).max() < 0.06, "no wall is drawn twice"
 
 

@@ -1,23 +1,21 @@
 """A file that is filled through a pipe, whole or empty."""
 
-import errno
 import os
 import threading
 from pathlib import Path
 
 import pytest
 
-from lidarslam.viewer.rerun_file import PipedFile
+from lidarslam.viewer.rerun_recording import _PipedFile as PipedFile
 
 
 def test_what_goes_in_is_in_the_file(tmp_path: Path) -> None:
     content = os.urandom(5_000_000)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb") as entrance:
-        file.let_go()
+        file.close_entrance()
         entrance.write(content)
     assert file.finish()
-    assert file.failure is None
     assert (tmp_path / "file").read_bytes() == content
 
 
@@ -36,14 +34,13 @@ def test_a_write_that_fails_empties_the_file_and_swallows_the_rest(
         return taken
 
     written = os.write
-    monkeypatch.setattr("lidarslam.viewer.rerun_file.os.write", write)
+    monkeypatch.setattr("lidarslam.viewer.rerun_recording.os.write", write)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb") as entrance:
+        file.close_entrance()
         for _ in range(50):
             entrance.write(bytes(100_000))
     assert file.finish()
-    assert file.failure is not None
-    assert file.failure.errno == 28
     assert (tmp_path / "file").stat().st_size == 0
 
 
@@ -61,34 +58,17 @@ def test_a_file_that_cannot_even_be_emptied_holds_no_writer() -> None:
     writer = threading.Thread(target=write, daemon=True)
     writer.start()
     assert opened.wait(10.0)
-    file.let_go()
+    file.close_entrance()
     writer.join(10.0)
     assert not writer.is_alive()
     assert file.finish()
-    assert file.failure is not None
-    assert file.failure.errno == errno.ENOSPC
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_pipe_that_nobody_reads_any_more_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever ends the reading, the other writer is told instead of waiting."""
-
-    def run_out(_handle: int, _piece: bytes) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("lidarslam.viewer.rerun_file._write_all", run_out)
-    file = PipedFile(tmp_path / "file")
-    with file.entrance.open("wb", buffering=0) as entrance:
-        entrance.write(b"piece")
-        assert file.finish()
-        with pytest.raises(BrokenPipeError):
-            entrance.write(b"another")
 
 
 def test_a_writer_that_never_lets_go_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidarslam.viewer.rerun_file._LAST_PIECES_S", 0.1)
+    monkeypatch.setattr("lidarslam.viewer.rerun_recording._PIPE_S", 0.1)
     file = PipedFile(tmp_path / "file")
     with file.entrance.open("wb"):
+        file.close_entrance()
         assert not file.finish()
     monkeypatch.undo()  # what follows is waited for, however busy the machine is
     assert file.finish()
