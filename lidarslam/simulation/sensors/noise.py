@@ -1,4 +1,4 @@
-"""What a sensor makes of true ranges: pure functions of the truth, the sensor's figures and random numbers.
+"""Measurement noise: pure functions of the true ranges, the sensor's figures and random numbers.
 
 All take and give whole sweeps (N,), in the order of the pattern's rays, so that what happens to one ray does not
 depend on how many others returned; inf stands for no return.
@@ -21,11 +21,6 @@ _MIXED_STEP_M = 1.5
 _REFERENCE_REFLECTIVITY = 0.8
 # Stands for the range of a ray that meets nothing, where it has to be compared.
 _NOTHING_M = 1e6
-
-
-def scan_rng(seed: int, scan_index: int) -> np.random.Generator:
-    """The random numbers of one scan, the same whichever scans were made before."""
-    return np.random.default_rng([seed, scan_index])
 
 
 def reflectivity(surfaces: NDArray[np.int64]) -> FloatArray:
@@ -51,11 +46,10 @@ def return_probability(
     """Probability (N,) that a ray comes back.
 
     The echo's power falls with reflectivity * cosine / range^2; detection turns over from certain to none around the
-    power of a surface of 80 % reflectivity met head-on at the maximum range.
+    power of a surface of 80 % reflectivity met head-on at the maximum range. The fourth power makes the turnover as
+    wide as the published 10 % and 90 % ranges are apart.
     """
     power = reflectivities / _REFERENCE_REFLECTIVITY * np.maximum(cosines, _LEAST_COSINE)
-    # The fourth power of the power ratio makes the turnover about as wide as the published 10 % and 90 % ranges are
-    # apart.
     weakness = (ranges / model.max_range_m) ** 2 / power
     return np.asarray((1.0 - model.dropout) / (1.0 + weakness**4))
 

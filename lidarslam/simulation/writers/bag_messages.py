@@ -48,27 +48,36 @@ class MessageSerializer:
 
     def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
         """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
-        header = self._header(driver.frame_id, stamp_ns, sequence)
-        if driver.custom_message:
-            return self._custom_message(header, records, stamp_ns)
-        return self._serialized(self._cloud(header, records), _POINT_CLOUD2)
+        stamp = self.store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        counted = {} if self._ros2 else {"seq": sequence}
+        header = self.store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=driver.frame_id, **counted)
+        message_type = self.message_type(driver)
+        if not driver.custom_message:
+            return self._serialized(self._cloud(header, records), message_type)
+        rsvd = np.zeros(3, np.uint8)
+        message = self.store.types[message_type](header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
+        # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
+        # empty list, which ends the message with its length.
+        without_points = self._serialized(message, message_type)[:-4]
+        return without_points + len(records).to_bytes(4, "little") + self._packed(records)
 
     def _serialized(self, message: Any, message_type: str) -> bytes:
         serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
         return bytes(serialize(message, message_type))
 
-    def _header(self, frame_id: str, stamp_ns: int, sequence: int) -> Any:
-        stamp = self.store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        counted = {} if self._ros2 else {"seq": sequence}
-        return self.store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id, **counted)
-
     def _cloud(self, header: Any, records: Records) -> Any:
+        point_field: Any = self.store.types["sensor_msgs/msg/PointField"]
+        # The message names its constants FLOAT32, UINT16 and so on, as NumPy names its types.
+        fields = [
+            point_field(name=name, offset=offset, datatype=getattr(point_field, kind.name.upper()), count=1)
+            for name, (kind, offset, *_) in (records.dtype.fields or {}).items()
+        ]
         step = records.dtype.itemsize
         return self.store.types[_POINT_CLOUD2](
             header=header,
             height=1,
             width=len(records),
-            fields=self._fields(records.dtype),
+            fields=fields,
             is_bigendian=False,
             point_step=step,
             row_step=step * len(records),
@@ -76,29 +85,8 @@ class MessageSerializer:
             is_dense=True,
         )
 
-    def _fields(self, record: np.dtype[np.void]) -> list[Any]:
-        point_field: Any = self.store.types["sensor_msgs/msg/PointField"]
-        # The message names its constants FLOAT32, UINT16 and so on, as NumPy names its types.
-        return [
-            point_field(name=name, offset=offset, datatype=getattr(point_field, kind.name.upper()), count=1)
-            for name, (kind, offset, *_) in (record.fields or {}).items()
-        ]
-
-    def _custom_message(self, header: Any, records: Records, stamp_ns: int) -> bytes:
-        message = self.store.types[_CUSTOM_MESSAGE](
-            header=header,
-            timebase=stamp_ns,
-            point_num=len(records),
-            lidar_id=_LIDAR_ID,
-            rsvd=np.zeros(3, np.uint8),
-            points=[],
-        )
-        # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
-        # empty list, which ends the message with its length.
-        without_points = self._serialized(message, _CUSTOM_MESSAGE)[:-4]
-        return without_points + len(records).to_bytes(4, "little") + self._packed(records)
-
     def _packed(self, records: Records) -> bytes:
+        """Points one after the other; in CDR each begins at a multiple of four bytes."""
         size = records.dtype.itemsize
         if not self._ros2 or not len(records):
             return records.tobytes()

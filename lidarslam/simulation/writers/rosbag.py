@@ -12,9 +12,8 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from lidarslam.core.errors import OutputError
 from lidarslam.simulation.recording.recorder import SimulatedScan
 from lidarslam.simulation.writers.bag_messages import MessageSerializer
-from lidarslam.simulation.writers.clock import clock_ns
 from lidarslam.simulation.writers.driver_clouds import find_driver
-from lidarslam.simulation.writers.interface import Rig
+from lidarslam.simulation.writers.interface import Rig, clock_ns
 
 # The newest version that ROS 2 Humble still reads.
 _ROSBAG2_VERSION: Literal[8] = 8

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.world import Boxes, Cylinders, Mover, World
+from lidarslam.simulation.world import Boxes, Cylinders, World
 from lidarslam.simulation.worlds.building import Builder
 from lidarslam.simulation.worlds.clearance import Clearance
 from lidarslam.simulation.worlds.hall.decks import draw_decks
@@ -22,13 +22,13 @@ def build(seed: int) -> World:
     draw_decks(plan, builder, clearance)
     draw_shell(plan, builder, clearance, rng)
     movers = fill_floors(plan, Yard(builder, clearance, rng))
-    world = World("hall", seed, plan.route, boxes=builder.boxes, cylinders=builder.cylinders, movers=movers)
+    world = World("hall", seed, plan.route, *builder.solids, movers=movers)
     return _mirrored(world, rng.choice([-1.0, 1.0], 2))
 
 
 def _mirrored(world: World, signs: FloatArray) -> World:
     """The world with x, y or both turned to the other side: four halls from one plan."""
-    mirror = np.array([*signs, 1.0])
+    mirror = np.append(signs, 1.0)
     boxes, cylinders = world.boxes, world.cylinders
     return replace(
         world,
@@ -36,7 +36,5 @@ def _mirrored(world: World, signs: FloatArray) -> World:
         # A box is its own mirror image; turning both of its sides keeps the rotation right-handed.
         boxes=Boxes(boxes.centres * mirror, boxes.half_sizes, boxes.R_world_box * np.outer(mirror, mirror)),
         cylinders=Cylinders(cylinders.starts * mirror, cylinders.ends * mirror, cylinders.radii),
-        movers=tuple(
-            Mover(mover.boxes, mover.waypoints * mirror, mover.speed_mps, mover.start_m) for mover in world.movers
-        ),
+        movers=tuple(replace(mover, waypoints=mover.waypoints * mirror) for mover in world.movers),
     )

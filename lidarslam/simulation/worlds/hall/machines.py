@@ -1,29 +1,30 @@
 """Machinery, each kind drawn around the middle of its footprint: x along its length."""
 
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
-from lidarslam.simulation.worlds.interior import Spot
+from lidarslam.simulation.worlds.building import Spot
+from lidarslam.simulation.worlds.interior import Piece, Size
 
 
-def press(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def press(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A press: bed, two columns, a crown with its cylinder, a ram half way down."""
+    x, y, z = size
     a, b = 0.5 * x, 0.5 * y
     spot.box((-a, a), (-b, b), (0.0, 0.9))
     for sign in (-1.0, 1.0):
-        side = sorted((sign * a, sign * 0.6 * a))
-        spot.box((side[0], side[1]), (-0.7 * b, 0.7 * b), (0.9, z - 0.9))
+        spot.box((sign * a, sign * 0.6 * a), (-0.7 * b, 0.7 * b), (0.9, z - 0.9))
     spot.box((-a, a), (-0.8 * b, 0.8 * b), (z - 0.9, z - 0.3))
-    spot.rod((0.0, 0.0, z - 0.3), (0.0, 0.0, z), 0.3 * min(a, b))
+    spot.pillar(0.0, 0.0, (z - 0.3, z), 0.3 * min(a, b))
     ram = rng.uniform(1.3, z - 1.5)
     spot.box((-0.5 * a, 0.5 * a), (-0.5 * b, 0.5 * b), (ram, ram + 0.5))
-    spot.rod((0.0, 0.0, ram + 0.5), (0.0, 0.0, z - 0.9), 0.12)
+    spot.pillar(0.0, 0.0, (ram + 0.5, z - 0.9), 0.12)
 
 
-def machining_centre(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def machining_centre(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A cased machine: a window set back, a panel on an arm, a chip conveyor at its end."""
+    x, y, z = size
     a, b, top = 0.5 * x, 0.5 * y, 0.85 * z
     spot.box((-a, 0.7 * a), (-b, 0.55 * b), (0.1, top))
     spot.box((-a + 0.1, 0.7 * a - 0.1), (-b + 0.1, 0.5 * b), (0.0, 0.1))
@@ -34,44 +35,45 @@ def machining_centre(spot: Spot, x: float, y: float, z: float, rng: np.random.Ge
     spot.box((0.75 * a, a), (-0.3 * b, 0.3 * b), (0.0, 0.8))
     spot.rod((0.6 * a, 0.7 * b, top), (0.6 * a, 0.95 * b, top), 0.04)
     spot.box((0.45 * a, 0.7 * a), (0.88 * b, 0.98 * b), (1.1, 1.7))
-    spot.rod((-0.5 * a, 0.0, top), (-0.5 * a, 0.0, z), 0.15)
+    spot.pillar(-0.5 * a, 0.0, (top, z), 0.15)
 
 
-def tank(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def tank(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """An upright tank on legs with a flange on top, a pipe down its side and a ladder."""
+    x, y, z = size
     radius = 0.5 * min(x, y) - 0.15
     legs = 0.5 * rng.uniform(0.6, 1.2)
-    spot.rod((0.0, 0.0, legs), (0.0, 0.0, z - 0.3), radius)
-    spot.rod((0.0, 0.0, z - 0.3), (0.0, 0.0, z), 0.35 * radius)
-    spot.rod((0.0, 0.0, 0.6 * z), (0.0, 0.0, 0.6 * z + 0.08), radius + 0.05)
+    spot.pillar(0.0, 0.0, (legs, z - 0.3), radius)
+    spot.pillar(0.0, 0.0, (z - 0.3, z), 0.35 * radius)
+    spot.pillar(0.0, 0.0, (0.6 * z, 0.6 * z + 0.08), radius + 0.05)
     for angle in np.arange(4) * 0.5 * np.pi + 0.25 * np.pi:
-        foot = (0.8 * radius * np.cos(angle), 0.8 * radius * np.sin(angle))
-        spot.rod((*foot, 0.0), (*foot, legs), 0.07)
-    spot.rod((0.0, radius + 0.06, 0.0), (0.0, radius + 0.06, z - 0.5), 0.05)
+        spot.pillar(0.8 * radius * np.cos(angle), 0.8 * radius * np.sin(angle), (0.0, legs), 0.07)
+    spot.pillar(0.0, radius + 0.06, (0.0, z - 0.5), 0.05)
     for height in np.arange(0.4, z - 0.4, 0.35):
         spot.box((radius, radius + 0.12), (-0.2, 0.2), (height, height + 0.03))
 
 
-def conveyor(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def conveyor(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A belt on legs with side guides and parcels on it."""
+    x, y, z = size
     a, b, belt = 0.5 * x, min(0.5 * y, 0.5), min(0.9, z)
     spot.box((-a, a), (-b, b), (belt - 0.15, belt))
     for sign in (-1.0, 1.0):
-        edge = sorted((sign * b, sign * (b - 0.04)))
-        spot.box((-a, a), (edge[0], edge[1]), (belt, belt + 0.12))
+        spot.box((-a, a), (sign * b, sign * (b - 0.04)), (belt, belt + 0.12))
     for leg in np.linspace(-a + 0.2, a - 0.2, max(2, int(x / 1.5))):
         for sign in (-1.0, 1.0):
             spot.rod((leg, sign * (b - 0.08), 0.0), (leg, sign * (b - 0.08), belt - 0.1), 0.035)
     at = -a + 0.3
     while at < a - 0.6:
-        size = rng.uniform(0.25, 0.55, 2)
-        spot.box((at, at + size[0]), (-0.25, 0.2), (belt, belt + size[1]))
-        at += size[0] + rng.uniform(0.2, 1.2)
+        length, height = rng.uniform(0.25, 0.55, 2)
+        spot.box((at, at + length), (-0.25, 0.2), (belt, belt + height))
+        at += length + rng.uniform(0.2, 1.2)
     spot.box((-a + 0.3, -a + 0.9), (b, b + 0.3), (0.4, belt))
 
 
-def robot_cell(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def robot_cell(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A fence of posts and bars around a jointed arm and its fixture."""
+    x, y, z = size
     a, b, fence = 0.5 * x, 0.5 * y, min(2.0, z)
     for sign in (-1.0, 1.0):
         for post in np.linspace(-a, a, max(2, round(x / 1.2))):
@@ -80,7 +82,7 @@ def robot_cell(spot: Spot, x: float, y: float, z: float, rng: np.random.Generato
             spot.box((-a, a), (sign * b - 0.015, sign * b + 0.015), (bar, bar + 0.05))
             spot.box((sign * a - 0.015, sign * a + 0.015), (-b, b), (bar, bar + 0.05))
     spot.box((-0.35, 0.35), (-0.35, 0.35), (0.0, 0.4))
-    spot.rod((0.0, 0.0, 0.4), (0.0, 0.0, 0.9), 0.25)
+    spot.pillar(0.0, 0.0, (0.4, 0.9), 0.25)
     angle, reach = rng.uniform(0.0, 2.0 * np.pi), 0.45 * min(a, b)
     elbow = (reach * np.cos(angle), reach * np.sin(angle), 1.7)
     wrist = (1.6 * elbow[0], 1.6 * elbow[1], 1.2)
@@ -89,8 +91,9 @@ def robot_cell(spot: Spot, x: float, y: float, z: float, rng: np.random.Generato
     spot.box((0.4 * a, 0.8 * a), (-0.6 * b, 0.6 * b), (0.0, 0.8))
 
 
-def generator(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def generator(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A motor lying on a frame, a gear box, an exhaust with a bend and cooling ribs."""
+    x, y, z = size
     a, b, axis = 0.5 * x, 0.5 * y, 0.45 * z
     radius = min(0.6 * b, 0.3 * z)
     spot.box((-a, a), (-0.8 * b, 0.8 * b), (0.0, 0.2))
@@ -101,12 +104,13 @@ def generator(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator
     spot.rod((0.2 * a, 0.0, axis), (0.45 * a, 0.0, axis), 0.12)
     spot.box((0.45 * a, 0.95 * a), (-0.7 * b, 0.7 * b), (0.2, axis + 0.8 * radius))
     top = rng.uniform(0.85, 1.0) * z
-    spot.rod((-0.5 * a, 0.0, axis), (-0.5 * a, 0.0, top), 0.12)
+    spot.pillar(-0.5 * a, 0.0, (axis, top), 0.12)
     spot.rod((-0.5 * a, 0.0, top - 0.1), (-0.5 * a, 0.8 * b, top - 0.1), 0.1)
 
 
-def control_cabinets(spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None:
+def control_cabinets(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A row of switch cabinets of one height, doors proud, a cable duct on top."""
+    x, y, z = size
     a, b, top = 0.5 * x, min(0.5 * y, 0.35), min(z, 2.1)
     edges = np.linspace(-a, a, max(2, round(x / 0.8) + 1))
     for left, right in pairwise(edges):
@@ -115,14 +119,8 @@ def control_cabinets(spot: Spot, x: float, y: float, z: float, rng: np.random.Ge
     spot.box((-a, a), (-0.1, 0.1), (top, top + 0.15))
 
 
-class Machine(Protocol):
-    """Draws a machine of length x, width y and height z around the middle of its footprint."""
-
-    def __call__(self, spot: Spot, x: float, y: float, z: float, rng: np.random.Generator) -> None: ...
-
-
 # Each machine with the least and the most of its length, width and height.
-MACHINES: tuple[tuple[Machine, tuple[float, float, float], tuple[float, float, float]], ...] = (
+MACHINES: tuple[tuple[Piece, Size, Size], ...] = (
     (press, (1.8, 1.4, 3.0), (3.2, 2.2, 5.0)),
     (machining_centre, (2.8, 1.8, 2.0), (4.8, 2.8, 2.9)),
     (tank, (1.4, 1.4, 2.4), (2.8, 2.8, 5.0)),

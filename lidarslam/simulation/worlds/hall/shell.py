@@ -5,20 +5,18 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import Builder
+from lidarslam.simulation.worlds.building import Builder, Opening, Spot
 from lidarslam.simulation.worlds.clearance import Clearance
 from lidarslam.simulation.worlds.hall.plan import HallPlan
-from lidarslam.simulation.worlds.interior import Spot
-from lidarslam.simulation.worlds.pierced_wall import Opening, pierced_wall
 
-WALL_M = 0.4
-TRUSS_M = 1.6
+_WALL_M = 0.4
+_TRUSS_M = 1.6
 
 
 def draw_shell(plan: HallPlan, builder: Builder, clearance: Clearance, rng: np.random.Generator) -> None:
     """Everything that carries or closes the hall, and what is fastened to it."""
     middle = (0.5 * plan.width, 0.5 * plan.depth)
-    size = (plan.width + 2.0 * WALL_M, plan.depth + 2.0 * WALL_M)
+    size = (plan.width + 2.0 * _WALL_M, plan.depth + 2.0 * _WALL_M)
     builder.box((*middle, -0.2), (*size, 0.4))
     builder.box((*middle, plan.height + 0.2), (*size, 0.4))
     frames = np.linspace(0.0, plan.width, round(plan.width / rng.uniform(5.5, 7.0)) + 1)
@@ -50,30 +48,25 @@ def _draw_walls(plan: HallPlan, builder: Builder, rng: np.random.Generator) -> N
             at, width = rng.uniform(places[0], places[1] - 4.5), rng.uniform(3.6, 4.4)
             gates = [Opening((at, at + width), (0.0, rng.uniform(4.0, 4.6)))]
         upper = 0.5 * plan.height
-        reach = (-WALL_M, along + WALL_M)
-        pierced_wall(spot, reach, (-WALL_M, 0.0), upper, gates)
-        pierced_wall(
-            spot.shifted(0.0, 0.0, upper), reach, (-WALL_M, 0.0), plan.height - upper, _lowered(windows, upper)
-        )
+        reach = (-_WALL_M, along + _WALL_M)
+        spot.pierced_wall(reach, (-_WALL_M, 0.0), upper, gates)
+        lowered = [Opening(window.x, (window.z[0] - upper, window.z[1] - upper)) for window in windows]
+        spot.shifted(0.0, 0.0, upper).pierced_wall(reach, (-_WALL_M, 0.0), plan.height - upper, lowered)
         for window in windows:
-            spot.box(window.x, (-WALL_M, -WALL_M + 0.05), window.z)
+            spot.box(window.x, (-_WALL_M, -_WALL_M + 0.05), window.z)
             for x in np.linspace(*window.x, 4)[1:-1]:
-                spot.box((x - 0.03, x + 0.03), (-WALL_M, -WALL_M + 0.12), window.z)
+                spot.box((x - 0.03, x + 0.03), (-_WALL_M, -_WALL_M + 0.12), window.z)
         for gate in gates:
             _draw_gate(spot, gate)
         for k in range(bays + 1):
             spot.box((k * bay - 0.2, k * bay + 0.2), (0.0, 0.3), (0.0, plan.height))
 
 
-def _lowered(openings: list[Opening], z: float) -> list[Opening]:
-    return [Opening(o.x, (o.z[0] - z, o.z[1] - z)) for o in openings]
-
-
 def _draw_gate(spot: Spot, gate: Opening) -> None:
     """A roller shutter of broad slats, set back, with guides and its box above."""
     for z in np.arange(0.0, gate.z[1], 0.4):
-        spot.box(gate.x, (-WALL_M, -WALL_M + 0.08), (z, min(z + 0.34, gate.z[1])))
-    spot.box(gate.x, (-WALL_M, -WALL_M + 0.05), (0.0, gate.z[1]))
+        spot.box(gate.x, (-_WALL_M, -_WALL_M + 0.08), (z, min(z + 0.34, gate.z[1])))
+    spot.box(gate.x, (-_WALL_M, -_WALL_M + 0.05), (0.0, gate.z[1]))
     for x in gate.x:
         spot.box((x - 0.12, x + 0.12), (-0.02, 0.1), (0.0, gate.z[1]))
     spot.box((gate.x[0] - 0.2, gate.x[1] + 0.2), (0.0, 0.45), (gate.z[1], gate.z[1] + 0.5))
@@ -81,13 +74,13 @@ def _draw_gate(spot: Spot, gate: Opening) -> None:
 
 def _draw_truss(plan: HallPlan, x: float, builder: Builder) -> None:
     """A lattice girder across the hall: chords, posts, and diagonals that change direction in the middle."""
-    low, high = plan.height - TRUSS_M, plan.height - 0.25
+    low, high = plan.height - _TRUSS_M, plan.height - 0.25
     for z in (low, high):
         builder.box((x, 0.5 * plan.depth, z), (0.2, plan.depth, 0.16))
     ys = np.linspace(0.0, plan.depth, 15)
     for k, (a, b) in enumerate(pairwise(ys)):
         rising = k < 7
-        builder.beam(np.array([x, a, low if rising else high]), np.array([x, b, high if rising else low]), 0.1, 0.1)
+        builder.beam((x, a, low if rising else high), (x, b, high if rising else low), 0.1, 0.1)
         builder.box((x, b, 0.5 * (low + high)), (0.1, 0.1, high - low))
 
 
@@ -95,7 +88,7 @@ def _draw_columns(
     plan: HallPlan, frames: FloatArray, rows: tuple[float, float], builder: Builder, clearance: Clearance
 ) -> None:
     """Columns of H section on footings below the trusses, wherever the way and the ramps leave room; girders on top."""
-    top = plan.height - TRUSS_M - 0.08
+    top = plan.height - _TRUSS_M - 0.08
     for y in rows:
         builder.box((0.5 * plan.width, y, top - 0.3), (plan.width, 0.25, 0.6))
         for x in frames[1:-1]:
@@ -110,7 +103,7 @@ def _draw_columns(
 
 def _draw_crane(plan: HallPlan, rows: tuple[float, float], builder: Builder, rng: np.random.Generator) -> None:
     """A bridge crane under the girders of the column rows, its hook hanging."""
-    z, x = plan.height - TRUSS_M - 1.0, rng.uniform(0.35, 0.8) * plan.width
+    z, x = plan.height - _TRUSS_M - 1.0, rng.uniform(0.35, 0.8) * plan.width
     for y in rows:
         builder.box((x, y, z + 0.1), (3.2, 0.3, 0.45))
     for dx in (-0.9, 0.9):
@@ -118,23 +111,21 @@ def _draw_crane(plan: HallPlan, rows: tuple[float, float], builder: Builder, rng
     y = rng.uniform(rows[0] + 2.0, rows[1] - 2.0)
     builder.box((x, y, z + 0.2), (2.3, 1.4, 0.5))
     hook = z - rng.uniform(1.0, 2.2)
-    builder.pole(np.array([x, y]), (hook, z), 0.03)
+    builder.pole((x, y), (hook, z), 0.03)
     builder.box((x, y, hook - 0.2), (0.35, 0.2, 0.5))
 
 
 def _draw_ducts(plan: HallPlan, builder: Builder, rng: np.random.Generator) -> None:
     """Round ventilation ducts along the hall below the trusses, with outlets and hangers."""
     for y in (plan.aisle_y[0] + rng.uniform(1.5, 3.0), plan.aisle_y[1] + rng.uniform(0.5, 2.0)):
-        radius, z = rng.uniform(0.3, 0.5), plan.height - TRUSS_M - rng.uniform(0.8, 1.2)
+        radius, z = rng.uniform(0.3, 0.5), plan.height - _TRUSS_M - rng.uniform(0.8, 1.2)
         start, end = rng.uniform(2.0, 8.0), plan.width - rng.uniform(2.0, 8.0)
-        builder.cylinder(np.array([start, y, z]), np.array([end, y, z]), radius)
+        builder.cylinder((start, y, z), (end, y, z), radius)
         for x in np.arange(start + 1.5, end - 1.0, rng.uniform(4.0, 5.5)):
-            builder.pole(np.array([x, y]), (z, plan.height - TRUSS_M), 0.03)
-            builder.cylinder(np.array([x - 0.05, y, z]), np.array([x + 0.05, y, z]), radius + 0.05)
-            outlet = np.array([x + 1.0, y, z])
-            builder.cylinder(
-                outlet, outlet + np.array([0.0, rng.choice([-1.0, 1.0]) * (radius + 0.5), -0.5]), 0.5 * radius
-            )
+            builder.pole((x, y), (z, plan.height - _TRUSS_M), 0.03)
+            builder.cylinder((x - 0.05, y, z), (x + 0.05, y, z), radius + 0.05)
+            side = rng.choice([-1.0, 1.0]) * (radius + 0.5)
+            builder.cylinder((x + 1.0, y, z), (x + 1.0, y + side, z - 0.5), 0.5 * radius)
 
 
 def _draw_pipes(plan: HallPlan, builder: Builder, clearance: Clearance, rng: np.random.Generator) -> None:
@@ -142,10 +133,9 @@ def _draw_pipes(plan: HallPlan, builder: Builder, clearance: Clearance, rng: np.
     x = plan.width - 0.45
     for k in range(int(rng.integers(2, 5))):
         z, radius = 5.0 + 0.42 * k, rng.uniform(0.06, 0.16)
-        builder.cylinder(np.array([x, 0.5, z]), np.array([x, plan.depth - 0.5, z]), radius)
+        builder.cylinder((x, 0.5, z), (x, plan.depth - 0.5, z), radius)
         for y in rng.uniform(2.0, plan.depth - 12.0, 2):
-            low, high = np.array([x - 0.2, y - 0.2, 0.0]), np.array([x + 0.2, y + 0.2, z])
-            if clearance.claim(low, high):
-                builder.pole(np.array([x, y]), (0.0, z), 0.8 * radius)
-                builder.cylinder(np.array([x - 0.25, y, 1.2]), np.array([x - 0.2, y, 1.2]), 0.16)
-                builder.cylinder(np.array([x - 0.25, y, 1.2]), np.array([x, y, 1.2]), 0.03)
+            if clearance.claim(np.array([x - 0.2, y - 0.2, 0.0]), np.array([x + 0.2, y + 0.2, z])):
+                builder.pole((x, y), (0.0, z), 0.8 * radius)
+                builder.cylinder((x - 0.25, y, 1.2), (x - 0.2, y, 1.2), 0.16)
+                builder.cylinder((x - 0.25, y, 1.2), (x, y, 1.2), 0.03)

@@ -10,7 +10,14 @@ from lidarslam.simulation.worlds import furnishing
 from lidarslam.simulation.worlds.building import Builder, smooth_noise
 from lidarslam.simulation.worlds.furnishing import on_slope, upright
 from lidarslam.simulation.worlds.open_country import plants
-from lidarslam.simulation.worlds.paths import distance_to_loop, on_ground, prune, resample_loop, winding_loop
+from lidarslam.simulation.worlds.paths import (
+    distance_to_loop,
+    grid_nodes,
+    on_ground,
+    prune,
+    resample_loop,
+    winding_loop,
+)
 
 _CELL_M = 0.4
 _MARGIN_M = 32.0
@@ -22,24 +29,19 @@ def build(seed: int) -> World:
     """A forest; its track is just wide enough to pass."""
     rng = np.random.default_rng(seed)
     track = winding_loop(rng, rng.uniform(160.0, 290.0), 6, 0.6, 4.0)
-    track = track[:: rng.choice([-1, 1])]
     ground = _ground(rng, track)
     part = Builder()
     _trees(part, rng, track, ground)
     _floor(part, rng, track, ground)
     route = Route(on_ground(resample_loop(track, 1.5), ground), 1.5, _FREE_SIDE_M, 2.6, 3.0)
-    part = prune(part, route)
-    return World(
-        "forest", seed, route, boxes=part.boxes, cylinders=part.cylinders, height_fields=(ground,), map_spacing_m=0.1
-    )
+    return World("forest", seed, route, *prune(part, route).solids, (ground,), map_spacing_m=0.1)
 
 
 def _ground(rng: np.random.Generator, track: FloatArray) -> HeightField:
     """Slopes of up to a sixth or so, knolls, and bumps that are worn down on the track."""
     low = np.floor(track.min(axis=0) - _MARGIN_M)
-    shape = tuple(np.ceil((track.max(axis=0) + _MARGIN_M - low) / _CELL_M).astype(int) + 1)
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    distance = distance_to_loop((low + _CELL_M * grid).reshape(-1, 2), track).reshape(shape)
+    distance = distance_to_loop(grid_nodes(low, track.max(axis=0) + _MARGIN_M, _CELL_M), track)
+    shape = distance.shape
     untrodden = np.clip((distance - 0.5) / 1.5, 0.3, 1.0)
     heights = rng.uniform(1.0, 2.0) * smooth_noise(rng, shape, 16.0 / _CELL_M)
     heights += 0.22 * smooth_noise(rng, shape, 4.0 / _CELL_M)
@@ -77,7 +79,7 @@ def _trees(part: Builder, rng: np.random.Generator, track: FloatArray, ground: H
 
 
 def _floor(part: Builder, rng: np.random.Generator, track: FloatArray, ground: HeightField) -> None:
-    """What lies and grows under the trees."""
+    """Fallen trunks, boulders, bushes, stumps and piles of logs under the trees."""
     for where in _scatter(rng, track, 26, (_FREE_SIDE_M + 0.8, 25.0), 6.0):
         length, radius, yaw = rng.uniform(4.0, 11.0), rng.uniform(0.14, 0.38), rng.uniform(0.0, np.pi)
         ends = where + np.outer([-0.5, -0.25, 0.25, 0.5], length * np.array([np.cos(yaw), np.sin(yaw)]))

@@ -1,15 +1,16 @@
-"""A given path as the middle of a road: how far things are from all of it, and what stands where along its sides."""
+"""A given path as the middle of a road: places beside it, and distances from all of it."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.worlds.building import left_of
+from lidarslam.simulation.worlds.paths import lengths_along, points_along
 
 STEP_M = 0.5
 # The road goes on straight for this long before the path and behind it.
@@ -20,25 +21,18 @@ _SMOOTH_M = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """An open path, as points half a metre apart.
+    """An open path, as points half a metre apart."""
 
-    Attributes:
-        points: (N, 2) or (N, 3).
-    """
-
-    points: FloatArray
+    points: FloatArray  # (N, 2) or (N, 3)
 
     @classmethod
     def along(cls, path: FloatArray) -> "Course":
         """The course of a polyline (M, 2) or (M, 3), at least one metre long, longer than it at either end."""
-        at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
-        wanted = np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / STEP_M)) + 1))
-        points = np.stack([np.interp(wanted, at, column) for column in path.T], axis=1)
+        at = lengths_along(path[:, :2])
+        points = points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / STEP_M)) + 1)))
         ahead = STEP_M * np.arange(1, int(_BEYOND_M / STEP_M) + 1)[:, None]
-        directions = _directions(points)
-        level = np.zeros(path.shape[1] - 2)
-        before = points[0] - ahead[::-1] * np.append(directions[0], level)
-        return cls(np.concatenate([before, points, points[-1] + ahead * np.append(directions[-1], level)]))
+        first, last = (np.append(_directions(points)[end], np.zeros(path.shape[1] - 2)) for end in (0, -1))
+        return cls(np.concatenate([points[0] - ahead[::-1] * first, points, points[-1] + ahead * last]))
 
     @property
     def length_m(self) -> float:
@@ -48,8 +42,7 @@ class Course:
     @cached_property
     def lefts(self) -> FloatArray:
         """(N, 2) unit, to the left of the way."""
-        ahead = _directions(self.points)
-        return np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        return left_of(_directions(self.points))
 
     @cached_property
     def tree(self) -> "cKDTree[None]":
@@ -70,34 +63,6 @@ class Course:
         """Distance (M,) of points (M, 2) from the nearest part of the course."""
         nearest = self.tree.query(xy)[0]
         return np.asarray(np.sqrt(np.maximum(nearest**2 - (0.5 * STEP_M) ** 2, 0.0)))  # between two points it is nearer
-
-
-@dataclass
-class Land:
-    """Cells of one metre that something stands in already."""
-
-    _taken: set[tuple[int, int]] = field(default_factory=set)
-
-    def is_free(self, footprint: FloatArray) -> bool:
-        """Whether all points (M, 2) of a footprint are on free cells."""
-        return self._taken.isdisjoint(_cells(footprint))
-
-    def take(self, footprint: FloatArray) -> None:
-        """Keep others out of the cells of points (M, 2)."""
-        self._taken.update(_cells(footprint))
-
-
-def rectangle(origin: FloatArray, along: FloatArray, width: float, depth: float) -> FloatArray:
-    """Points (M, 2) all over a rectangle, less than a cell apart, from its corner (2,) along (2,) and to its left."""
-    x = np.linspace(0.0, width, int(np.ceil(width / 0.7)) + 1)
-    y = np.linspace(0.0, depth, int(np.ceil(depth / 0.7)) + 1)
-    left = np.array([-along[1], along[0]])
-    return np.asarray((origin + x[:, None, None] * along + y[:, None] * left).reshape(-1, 2))
-
-
-def _cells(points: FloatArray) -> list[tuple[int, int]]:
-    cells: NDArray[np.int64] = np.floor(points).astype(np.int64)
-    return list(map(tuple, cells.tolist()))
 
 
 def _directions(points: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Places along a tunnel's loop, and how far its walls are from them."""
+"""Places along a tunnel's loop, and the distance of its walls from them."""
 
 from dataclasses import dataclass
 
@@ -6,29 +6,21 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.worlds.building import UP
-from lidarslam.simulation.worlds.tunnel.plan import SPACING_M, Gallery, level_normals
+from lidarslam.simulation.worlds.tunnel.plan import SPACING_M, Gallery, loop_lefts
 from lidarslam.simulation.worlds.tunnel.rock import Rock
 
-STATION_M = 1.0
+_STATION_M = 1.0
 
 
 @dataclass(frozen=True)
 class Stations:
-    """Places along the loop, `STATION_M` apart.
+    """Places along the loop, `_STATION_M` apart."""
 
-    Attributes:
-        floor: (N, 3) on the ground in the middle.
-        left: (N, 2) unit vectors to the left.
-        half_widths: (N,) as planned.
-        rock: around them.
-        free_side_m, free_height_m: what must stay free of fittings.
-    """
-
-    floor: FloatArray
-    left: FloatArray
-    half_widths: FloatArray
-    rock: Rock
-    free_side_m: float
+    floor: FloatArray  # (N, 3) on the ground in the middle
+    left: FloatArray  # (N, 2) unit vectors to the left
+    half_widths: FloatArray  # (N,) as planned
+    rock: Rock  # around them
+    free_side_m: float  # to be kept free of fittings, as is the height
     free_height_m: float
 
     def __len__(self) -> int:
@@ -37,8 +29,7 @@ class Stations:
     def at(self, k: int, aside: float, up: float) -> FloatArray:
         """A point (3,) that far to the left of station k (counted round and round) and above its floor."""
         k %= len(self)
-        x, y = self.floor[k, :2] + aside * self.left[k]
-        return np.array([x, y, self.floor[k, 2] + up])
+        return np.append(self.floor[k, :2] + aside * self.left[k], self.floor[k, 2] + up)
 
     def on_ground(self, k: int, aside: float) -> FloatArray:
         """A point (3,) on the ground that far to the left of station k."""
@@ -50,7 +41,7 @@ class Stations:
         """Whether what reaches that far around a point (3,) keeps out of the free space along the way."""
         nearest = float(np.linalg.norm(self.floor[:, :2] - point[:2], axis=1).min())
         # Between two stations the way is up to this much closer.
-        return nearest > float(np.hypot(self.free_side_m + reach + 0.05, 0.5 * STATION_M))
+        return nearest > float(np.hypot(self.free_side_m + reach + 0.05, 0.5 * _STATION_M))
 
     def wall(self, side: float, up: float) -> FloatArray:
         """(N,) distance to the wall on one side (+1 left, -1 right), at a height above the floor."""
@@ -59,7 +50,7 @@ class Stations:
 
 def place_stations(loop: Gallery, rock: Rock, free_side_m: float, free_height_m: float) -> Stations:
     """Stations along the loop, on the carved ground."""
-    every = round(STATION_M / SPACING_M)
-    line, left = loop.line[::every].copy(), level_normals(loop.line, closed=True)[::every]
+    every = round(_STATION_M / SPACING_M)
+    line, left = loop.line[::every].copy(), loop_lefts(loop.line)[::every]
     line[:, 2] = rock.ground.height_at(line[:, :2])
     return Stations(line, left, loop.half_widths[::every], rock, free_side_m, free_height_m)
