@@ -17,7 +17,7 @@ class Boxes:
 
     def __post_init__(self) -> None:
         n = len(self.centres)
-        _check("Boxes", (self.centres, (n, 3)), (self.half_sizes, (n, 3)), (self.R_world_box, (n, 3, 3)))
+        _check(self, centres=(n, 3), half_sizes=(n, 3), R_world_box=(n, 3, 3))
         if (self.half_sizes <= 0.0).any():
             raise ValueError("Boxes.half_sizes must be positive")
 
@@ -40,7 +40,7 @@ class Cylinders:
 
     def __post_init__(self) -> None:
         n = len(self.starts)
-        _check("Cylinders", (self.starts, (n, 3)), (self.ends, (n, 3)), (self.radii, (n,)))
+        _check(self, starts=(n, 3), ends=(n, 3), radii=(n,))
         if (self.radii <= 0.0).any() or (np.linalg.norm(self.ends - self.starts, axis=1) <= 0.0).any():
             raise ValueError("Cylinders must have positive radii and lengths")
 
@@ -66,7 +66,7 @@ class HeightField:
     heights: FloatArray
 
     def __post_init__(self) -> None:
-        _check("HeightField", (self.origin_xy, (2,)))
+        _check(self, origin_xy=(2,))
         if self.heights.ndim != 2 or min(self.heights.shape) < 2 or not np.isfinite(self.heights).all():
             raise ValueError(f"HeightField.heights must be a finite grid of at least (2, 2), got {self.heights.shape}")
         if not self.cell_m > 0.0:
@@ -108,7 +108,7 @@ class Mover:
     start_m: float  # along the polyline at time 0
 
     def __post_init__(self) -> None:
-        _check("Mover", (self.waypoints, (len(self.waypoints), 3)))
+        _check(self, waypoints=(len(self.waypoints), 3))
         if not len(self.waypoints):
             raise ValueError("Mover.waypoints must hold a point")
 
@@ -141,7 +141,7 @@ class Route:
     speed_limit_mps: float
 
     def __post_init__(self) -> None:
-        _check("Route", (self.waypoints, (len(self.waypoints), 3)))
+        _check(self, waypoints=(len(self.waypoints), 3))
         if len(self.waypoints) < 3:
             raise ValueError(f"Route.waypoints must hold three corners or more, got {len(self.waypoints)}")
 
@@ -169,7 +169,7 @@ class World:
         return self.height_fields[0].height_at(xy) if self.height_fields else np.zeros(len(xy))
 
 
-def _check(owner: str, *arrays: tuple[FloatArray, tuple[int, ...]]) -> None:
-    for array, shape in arrays:
-        if array.shape != shape:
-            raise ValueError(f"{owner}: an array must be {shape}, got {array.shape}")
+def _check(owner: object, **shapes: tuple[int, ...]) -> None:
+    for name, shape in shapes.items():
+        if getattr(owner, name).shape != shape:
+            raise ValueError(f"{type(owner).__name__}.{name} must be {shape}, got {getattr(owner, name).shape}")

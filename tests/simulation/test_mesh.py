@@ -126,8 +126,8 @@ def test_nothing_gives_no_triangle():
 @pytest.mark.parametrize(
     ("vertices", "triangles", "told"),
     [
-        (np.zeros((4, 2)), np.zeros((1, 3), dtype=np.int32), "vertices must be"),
-        (np.zeros((4, 3)), np.zeros((1, 4), dtype=np.int32), "triangles must be"),
+        (np.zeros((4, 2)), np.zeros((1, 3), dtype=np.int32), "Mesh must be"),
+        (np.zeros((4, 3)), np.zeros((1, 4), dtype=np.int32), "Mesh must be"),
         (np.zeros((4, 3)), np.full((1, 3), 4, dtype=np.int32), "must index 4 vertices, got 4"),
     ],
 )

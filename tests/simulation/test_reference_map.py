@@ -117,4 +117,4 @@ def test_cutting_keeps_area_orientation_and_all_that_is_near():
     assert (high - low).max() <= 1.6
     assert area.sum() < 30.0
     assert high[:, 0].max() > 2.6
-    assert len(pieces_near(SQUARE, np.array([[0, 0, 50]]), 0.2)) == 0
+    assert len(pieces_near(SQUARE, np.array([[0, 0, 50]]), 0.2).corners) == 0

@@ -14,11 +14,11 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.recording.recorder import SimulatedScan
-from lidarslam.simulation.writers.bag_messages import MessageSerializer
 from lidarslam.simulation.writers.driver_clouds import DRIVERS, find_driver
 from lidarslam.simulation.writers.interface import CLOCK_START_NS, Rig, clock_ns
 from lidarslam.simulation.writers.kitti import T_CAM_LIDAR, compensate
 from lidarslam.simulation.writers.registry import FORMATS, find_format
+from lidarslam.simulation.writers.rosbag import MessageSerializer
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 SWEEP_S = 0.1

@@ -11,10 +11,8 @@ from lidarslam.simulation.casting.mesh import Mesh
 
 IntArray = NDArray[np.int64]
 
-# Pieces become as small as cells of 2^level voxels, one level after the other: with each, far pieces are dropped
-# before the rest is cut further, so that the work is that of the surface nearby and not of the mesh.
-_LEVELS = (8, 5, 3)
-PIECE_VOXELS = 2 ** _LEVELS[-1]
+# Pieces are no larger than cells of this many voxels.
+PIECE_VOXELS = 8
 _STRIDES = np.array([1, 1 << 20, 1 << 40])
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3) @ _STRIDES
 _BLOCK = 1 << 17
@@ -54,24 +52,19 @@ def pieces_near(mesh: Mesh, voxels: IntArray, voxel_m: float) -> Pieces:
     Cutting keeps the triangles' planes and orientation. The pieces are in the order of their places, z first;
     triangles without area are left out.
     """
-    cells = [np.unique((np.unique((voxels >> level) @ _STRIDES)[:, None] + _NEIGHBOURS).ravel()) for level in _LEVELS]
-    corners = mesh.vertices[mesh.triangles]
-    ends = np.cumsum(
-        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    )
-    whole = Pieces(corners, np.concatenate([[0.0], ends[:-1]]), ends)
+    size = voxel_m * PIECE_VOXELS
+    cells = np.unique((voxels // PIECE_VOXELS) @ _STRIDES)
+    near = np.unique((cells[:, None] + _NEIGHBOURS).ravel())
+    a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
+    ends = np.cumsum(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    starts = np.concatenate([[0.0], ends[:-1]])
     found = []
-    for first in range(0, max(len(corners), 1), _BLOCK):
-        block = np.arange(first, min(first + _BLOCK, len(corners)))
-        pieces = whole[block[whole.ends[block] > whole.starts[block]]]
-        for level, near in zip(_LEVELS, cells, strict=True):
-            size = voxel_m * 2.0**level
-            pieces = _cut(pieces, size)
-            # A piece no larger than a cell lies in its middle's cell and those that touch it.
-            pieces = pieces[np.isin(_place(pieces, size), near)]
-        found.append(pieces)
+    for block in np.array_split(np.flatnonzero(ends > starts), len(ends) // _BLOCK + 1):
+        pieces = _cut(Pieces(mesh.vertices[mesh.triangles[block]], starts[block], ends[block]), size)
+        # A piece no larger than a cell lies in its middle's cell and those that touch it.
+        found.append(pieces[np.isin(_place(pieces, size), near)])
     pieces = _together(found)
-    return pieces[np.argsort(_place(pieces, voxel_m * PIECE_VOXELS), kind="stable")]
+    return pieces[np.argsort(_place(pieces, size), kind="stable")]
 
 
 def _cut(pieces: Pieces, size: float) -> Pieces:

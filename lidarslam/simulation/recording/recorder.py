@@ -11,10 +11,9 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.casting.caster import Caster, Hits
-from lidarslam.simulation.casting.grass import ranges_in_grass
 from lidarslam.simulation.casting.mesh import first_ground_triangle
 from lidarslam.simulation.motion.motions import Motion
-from lidarslam.simulation.sensors.noise import bloom, intensities, measure, reflectivity
+from lidarslam.simulation.sensors.noise import bloom, intensities, measure, ranges_in_grass, reflectivity
 from lidarslam.simulation.sensors.scan_patterns import Rays
 from lidarslam.simulation.sensors.sensor import Sensor
 from lidarslam.simulation.world import World

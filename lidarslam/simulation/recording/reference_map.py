@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.casting.mesh import Mesh, world_mesh
-from lidarslam.simulation.casting.mesh_pieces import PIECE_VOXELS, Pieces, pieces_near
+from lidarslam.simulation.casting.mesh_pieces import Pieces, pieces_near
 from lidarslam.simulation.recording.recorder import Echoes, Simulation
 
 KeyArray = NDArray[np.int64]
@@ -82,7 +82,7 @@ def sample_seen(mesh: Mesh, seen: SeenSurfaces, spacing_m: float = 0.05) -> Refe
     Time and memory are those of the seen surfaces, not of the mesh, which is gone through once.
     """
     around = seen.around()
-    pieces = _facing_seen(pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m), around, seen.voxel_m)
+    pieces = pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m)
     facing = pieces.normals
     sectors = _sectors(facing)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
@@ -138,16 +138,6 @@ def _sectors(normals: FloatArray) -> KeyArray:
 def _cells(upper_bits: KeyArray) -> KeyArray:
     """The voxels (N, 3) of keys (N,) without their lowest four bits."""
     return np.asarray((upper_bits[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF)
-
-
-def _facing_seen(pieces: Pieces, around: KeyArray, voxel_m: float) -> Pieces:
-    """The pieces without those that face another way than everything seen nearby: the far sides of walls."""
-    coarse_m = PIECE_VOXELS * voxel_m
-    middles = np.asarray((_cells(around >> 4) + 0.5) * voxel_m, dtype=np.float64)
-    seen_keys = _spread(_unique(_voxels(middles, coarse_m) | (around & 0b1111)))
-    low, high = pieces.bounds
-    front, behind = _sides(seen_keys, _voxels(0.5 * (low + high), coarse_m) | _sectors(pieces.normals))
-    return pieces[front | behind]
 
 
 def _spread(keys: KeyArray) -> KeyArray:

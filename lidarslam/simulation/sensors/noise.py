@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.sensors.sensor import RangeModel
+from lidarslam.simulation.world import Grass
 
 # A surface seen at a smaller cosine than this (87 degrees) behaves as at it.
 _LEAST_COSINE = 0.05
@@ -21,6 +22,8 @@ _MIXED_STEP_M = 1.5
 _REFERENCE_REFLECTIVITY = 0.8
 # Stands for the range of a ray that meets nothing, where it has to be compared.
 _NOTHING_M = 1e6
+# The tips of the blades are between this share of the grass's height and all of it.
+_SHORTEST_BLADE = 0.5
 
 
 def reflectivity(surfaces: NDArray[np.int64]) -> FloatArray:
@@ -93,3 +96,18 @@ def measure(
 def intensities(cosines: FloatArray, reflectivities: FloatArray) -> NDArray[np.float32]:
     """Calibrated intensities (N,), whole numbers on the drivers' scale of 0 to 255, without the effect of range."""
     return np.round(255.0 * reflectivities * cosines).astype(np.float32)
+
+
+def ranges_in_grass(
+    grass: Grass, points: FloatArray, ranges: FloatArray, cosines: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Ranges (N,) of rays to points (N, 3) on the ground that blades may shorten, and which (N,) ended at a blade.
+
+    The path among blades of height h at incidence cosine c is h / c long; until a blade is met it is exponentially
+    distributed (Beer and Lambert's law). Close by most rays reach the ground, far away hardly any.
+    """
+    tips = grass.heights.height_at(points[:, :2]) * rng.uniform(_SHORTEST_BLADE, 1.0, len(points))
+    path = np.minimum(tips / np.maximum(cosines, _LEAST_COSINE), ranges)
+    until_blade = rng.exponential(grass.free_path_m, len(points))
+    is_blade = until_blade < path
+    return ranges - np.where(is_blade, path - until_blade, 0.0), is_blade

@@ -8,9 +8,9 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Mover
 from lidarslam.simulation.worlds.building import Builder, Spot
 from lidarslam.simulation.worlds.clearance import Clearance
-from lidarslam.simulation.worlds.hall.machines import MACHINES
+from lidarslam.simulation.worlds.hall import equipment
+from lidarslam.simulation.worlds.hall.equipment import MACHINES, cabin, drums, loaded_pallet
 from lidarslam.simulation.worlds.hall.plan import HallPlan
-from lidarslam.simulation.worlds.hall.storage import BAY_M, RACK_DEPTH_M, cabin, drums, forklift, loaded_pallet, rack
 from lidarslam.simulation.worlds.interior import Piece, Size, crate
 
 _GAP_M = 0.5
@@ -64,7 +64,9 @@ def _send_forklifts(plan: HallPlan, yard: Yard) -> tuple[Mover, ...]:
             continue
         corners = np.array([[*low, 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
         corners = corners[:: int(rng.choice([-1, 1]))]
-        movers.append(Mover(forklift(rng), corners, rng.uniform(0.8, 1.8), rng.uniform(0.0, float(size.sum()))))
+        movers.append(
+            Mover(equipment.forklift(rng), corners, rng.uniform(0.8, 1.8), rng.uniform(0.0, float(size.sum())))
+        )
     return tuple(movers)
 
 
@@ -75,10 +77,10 @@ def _set_racks(plan: HallPlan, yard: Yard) -> None:
     for y in np.arange(plan.aisle_y[0] + 2.2, plan.aisle_y[1] + 1.5, spacing):
         x = plan.turn_x + 3.0
         while x < plan.width - 5.0:
-            size = (int(rng.integers(1, 4)) * BAY_M + 0.1, RACK_DEPTH_M + 0.2, 1.6 * levels)
+            size = (int(rng.integers(1, 4)) * equipment.BAY_M + 0.1, equipment.RACK_DEPTH_M + 0.2, 1.6 * levels)
             middle = np.array([x + 0.5 * size[0], y, 0.0])
             fits = middle[0] + 0.5 * size[0] < plan.width - 1.0
-            x += size[0] + rng.choice([0.55, 2.0]) if fits and yard.put(middle, size, False, rack) else 0.5
+            x += size[0] + rng.choice([0.55, 2.0]) if fits and yard.put(middle, size, False, equipment.rack) else 0.5
 
 
 def _set_machines(plan: HallPlan, yard: Yard) -> None:

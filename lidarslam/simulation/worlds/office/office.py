@@ -7,16 +7,10 @@ import numpy as np
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.building import Builder
 from lidarslam.simulation.worlds.clearance import Clearance
+from lidarslam.simulation.worlds.office import shell
 from lidarslam.simulation.worlds.office.doors import draw_doors
-from lidarslam.simulation.worlds.office.furnisher import Furnisher
 from lidarslam.simulation.worlds.office.plan import draw_plan
-from lidarslam.simulation.worlds.office.rooms import KINDS, furnish_corridor, furnish_room
-from lidarslam.simulation.worlds.office.shell import (
-    draw_corridor_ceiling,
-    draw_room_ceiling,
-    draw_slabs,
-    draw_walls,
-)
+from lidarslam.simulation.worlds.office.rooms import KINDS, Furnisher, furnish_corridor, furnish_room
 
 
 def build(seed: int) -> World:
@@ -26,15 +20,15 @@ def build(seed: int) -> World:
     doors, route = draw_doors(plan, rng)
     height = rng.uniform(2.6, 3.2)
     builder, clearance = Builder(), Clearance(route)
-    draw_slabs(plan, height, builder)
-    draw_walls(plan, doors, height, builder, clearance)
+    shell.draw_slabs(plan, height, builder)
+    shell.draw_walls(plan, doors, height, builder, clearance)
     put = Furnisher(builder, clearance, rng)
     for one, other in combinations(plan.corridors, 2):  # where they cross, there is only floor
         low, high = np.maximum(one.low, other.low), np.minimum(one.high, other.high)
         if (low < high).all():
             clearance.take(np.append(low - 0.1, 0.0), np.append(high + 0.1, height))
     for corridor in plan.corridors:
-        draw_corridor_ceiling(corridor, height, builder, rng)
+        shell.draw_corridor_ceiling(corridor, height, builder, rng)
         furnish_corridor(corridor, height, put)
     kinds: list[str] = []
     for room in plan.rooms.values():
@@ -43,5 +37,5 @@ def build(seed: int) -> World:
         kind = kinds.pop()
         for _ in range(max(1, round(float((room.high - room.low).prod()) / 13.0))):
             furnish_room(room, kind, put)
-        draw_room_ceiling(room, height, builder, rng)
+        shell.draw_room_ceiling(room, height, builder, rng)
     return World("office", seed, route, *builder.solids)

@@ -6,18 +6,10 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
+from lidarslam.simulation.worlds import paths
 from lidarslam.simulation.worlds.building import UP, Builder, smooth_noise
 from lidarslam.simulation.worlds.furnishing import SUNK_M, upright
 from lidarslam.simulation.worlds.open_country import plants
-from lidarslam.simulation.worlds.paths import (
-    beside_loop,
-    distance_to_loop,
-    grid_nodes,
-    on_ground,
-    prune,
-    resample_loop,
-    round_corners,
-)
 
 _CELL_M = 0.75
 _MARGIN_M = 70.0
@@ -34,7 +26,7 @@ def build(seed: int) -> World:
     rng = np.random.default_rng(seed)
     road = _road(rng)
     low = np.floor(road.min(axis=0) - _MARGIN_M)
-    distance = distance_to_loop(grid_nodes(low, road.max(axis=0) + _MARGIN_M, _CELL_M), road, 12.0)
+    distance = paths.distance_to_loop(paths.grid_nodes(low, road.max(axis=0) + _MARGIN_M, _CELL_M), road, 12.0)
     ground = _ground(rng, low, distance)
     solid, green = Builder(), Builder()
     _poles(solid, rng, road, ground)
@@ -43,9 +35,11 @@ def build(seed: int) -> World:
     _bales(solid, rng, road, ground)
     _hedges(green, rng, road, ground)
     _trees(green, rng, road, ground)
-    waypoints = resample_loop(road, _WAYPOINT_SPACING_M)[1:]  # a leg of twice the length: a lap begins in its middle
-    route = Route(on_ground(waypoints, ground), 3.0, _FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
-    solid.place(prune(green, route), np.eye(4))
+    waypoints = paths.resample_loop(road, _WAYPOINT_SPACING_M)[
+        1:
+    ]  # a leg of twice the length: a lap begins in its middle
+    route = Route(paths.on_ground(waypoints, ground), 3.0, _FREE_SIDE_M, 4.0, _SPEED_LIMIT_MPS)
+    solid.place(paths.prune(green, route), np.eye(4))
     # Stubble, meadow or crops in parcels, a mown strip along the road.
     kind = np.digitize(smooth_noise(rng, distance.shape, 40.0 / _CELL_M), [-0.4, 0.5])
     tall = np.where(distance < _ROAD_HALF_M + 2.0, 0.12, np.array([0.06, 0.22, 0.4])[kind])
@@ -60,7 +54,7 @@ def _road(rng: np.random.Generator) -> FloatArray:
     """
     side, radius = rng.uniform(560.0, 640.0), rng.uniform(95.0, 115.0)
     corners = np.array([[-0.5, -1.0], [0.5, -1.0], [0.5, 1.0], [-0.5, 1.0]]) * [side + 2.0 * radius, radius]
-    loop = resample_loop(round_corners(corners, np.full(4, 0.999 * radius), 2.0), _POINT_M)
+    loop = paths.resample_loop(paths.round_corners(corners, np.full(4, 0.999 * radius), 2.0), _POINT_M)
     for amplitude, wave in ((rng.uniform(6.0, 10.0), 450.0), (rng.uniform(1.0, 2.5), 230.0)):
         phase = rng.uniform(0.0, 2.0 * np.pi)
         loop[:, 1] += amplitude * np.sin(2.0 * np.pi * loop[:, 0] / wave + phase)
@@ -83,7 +77,9 @@ def _beside(
     rng: np.random.Generator, road: FloatArray, nearest_m: float, farthest_m: float
 ) -> tuple[FloatArray, float]:
     """A random place (2,) on either side of the road, and the road's heading there."""
-    return beside_loop(road, int(rng.integers(len(road))), rng.choice([-1.0, 1.0]) * rng.uniform(nearest_m, farthest_m))
+    return paths.beside_loop(
+        road, int(rng.integers(len(road))), rng.choice([-1.0, 1.0]) * rng.uniform(nearest_m, farthest_m)
+    )
 
 
 def _poles(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
@@ -94,7 +90,7 @@ def _poles(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: H
     part.pole((0.0, 0.0), (-1.0, 7.2), 0.12)
     part.block((-0.05, -0.8, 6.7), (0.05, 0.8, 6.82))
     for at in np.arange(0.0, len(road) * _POINT_M / 3.0, spacing):
-        where, yaw = beside_loop(road, (first + round(at / _POINT_M)) % len(road), left)
+        where, yaw = paths.beside_loop(road, (first + round(at / _POINT_M)) % len(road), left)
         solid.place(part, upright(ground, where, yaw))
 
 
@@ -103,8 +99,8 @@ def _fences(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: 
     step = round(3.0 / _POINT_M)
     for at in rng.integers(0, len(road), 4):
         left, count = rng.choice([-1.0, 1.0]) * rng.uniform(5.0, 7.0), int(rng.integers(15, 30))
-        feet = np.stack([beside_loop(road, (at + k * step) % len(road), left)[0] for k in range(count)])
-        posts = on_ground(feet, ground)
+        feet = np.stack([paths.beside_loop(road, (at + k * step) % len(road), left)[0] for k in range(count)])
+        posts = paths.on_ground(feet, ground)
         for foot in posts:
             solid.pole(foot[:2], (foot[2] - SUNK_M, foot[2] + 1.25), 0.06)
         for a, b in pairwise(posts):
@@ -115,7 +111,7 @@ def _fences(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: 
 def _barn(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
     """One barn with a pitched roof, some way off the road."""
     where, yaw = road[0], 0.0
-    while distance_to_loop(where[None], road)[0] < 22.0:
+    while paths.distance_to_loop(where[None], road)[0] < 22.0:
         where, yaw = _beside(rng, road, 25.0, 40.0)
     part = Builder()
     long, wide, high = rng.uniform(7.0, 10.0), rng.uniform(4.5, 6.0), rng.uniform(3.8, 5.0)  # half, half, all
@@ -132,13 +128,13 @@ def _barn(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: He
 def _bales(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
     """Round bales, lying about two parcels."""
     for at in rng.integers(0, len(road), 2):
-        middle, _ = beside_loop(road, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(25.0, 35.0))
+        middle, _ = paths.beside_loop(road, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(25.0, 35.0))
         for where in middle + rng.uniform(-35.0, 35.0, (int(rng.integers(6, 11)), 2)):
-            if distance_to_loop(where[None], road)[0] < _KEEP_OFF_M + 1.0:
+            if paths.distance_to_loop(where[None], road)[0] < _KEEP_OFF_M + 1.0:
                 continue
             angle = rng.uniform(0.0, np.pi)
             axis = 0.6 * np.array([np.cos(angle), np.sin(angle), 0.0])
-            centre = on_ground(where[None], ground)[0] + 0.55 * UP
+            centre = paths.on_ground(where[None], ground)[0] + 0.55 * UP
             solid.cylinder(centre - axis, centre + axis, 0.65)
 
 
@@ -146,13 +142,13 @@ def _hedges(green: Builder, rng: np.random.Generator, road: FloatArray, ground: 
     """Hedges between parcels, from the verge away from the road."""
     for at in rng.integers(0, len(road), 6):
         side = rng.choice([-1.0, 1.0])
-        begin, yaw = beside_loop(road, int(at), side * rng.uniform(7.0, 10.0))
+        begin, yaw = paths.beside_loop(road, int(at), side * rng.uniform(7.0, 10.0))
         heading = yaw + side * 0.5 * np.pi + rng.normal(0.0, 0.15)
         away = np.array([np.cos(heading), np.sin(heading)])
         high, wide, length = rng.uniform(1.2, 1.9), rng.uniform(0.8, 1.3), 4.0
         for k in range(int(rng.integers(6, 12))):
             where = begin + k * length * away
-            if distance_to_loop(where[None] + np.array([[0.0], [length]]) * away, road).min() > _KEEP_OFF_M + 1.5:
+            if paths.distance_to_loop(where[None] + np.array([[0.0], [length]]) * away, road).min() > _KEEP_OFF_M + 1.5:
                 green.place(plants.hedge(rng, length, high, wide), upright(ground, where, heading))
 
 
@@ -161,7 +157,7 @@ def _trees(green: Builder, rng: np.random.Generator, road: FloatArray, ground: H
     low, high = road.min(axis=0) - 0.7 * _MARGIN_M, road.max(axis=0) + 0.7 * _MARGIN_M
     stands = np.empty((0, 2))
     darts = rng.uniform(low, high, (150, 2))
-    for where, distance in zip(darts, distance_to_loop(darts, road), strict=True):
+    for where, distance in zip(darts, paths.distance_to_loop(darts, road), strict=True):
         apart = np.linalg.norm(stands - where, axis=1).min(initial=np.inf)
         if not _KEEP_OFF_M + 2.0 < distance < 0.8 * _MARGIN_M or apart < 55.0:
             continue
@@ -169,6 +165,6 @@ def _trees(green: Builder, rng: np.random.Generator, road: FloatArray, ground: H
         green.place(tree, upright(ground, where, rng.uniform(0.0, 2.0 * np.pi)))
         stands = np.concatenate([stands, where[None]])
     for at in rng.integers(0, len(road), 14):
-        where, _ = beside_loop(road, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(6.5, 25.0))
-        if distance_to_loop(where[None], road)[0] > _KEEP_OFF_M + 1.5:
+        where, _ = paths.beside_loop(road, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(6.5, 25.0))
+        if paths.distance_to_loop(where[None], road)[0] > _KEEP_OFF_M + 1.5:
             green.place(plants.bush(rng, rng.uniform(0.5, 1.2), 24), upright(ground, where, 0.0))

@@ -6,20 +6,10 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
-from lidarslam.simulation.worlds import furnishing
+from lidarslam.simulation.worlds import furnishing, paths
 from lidarslam.simulation.worlds.building import Builder, heading, left_of, smooth_noise
 from lidarslam.simulation.worlds.furnishing import on_slope, upright
 from lidarslam.simulation.worlds.open_country import plants
-from lidarslam.simulation.worlds.paths import (
-    grid_nodes,
-    loop_length,
-    offset_loop,
-    on_ground,
-    prune,
-    round_corners,
-    subdivide_loop,
-    turns_left,
-)
 from lidarslam.simulation.worlds.street.houses import house
 from lidarslam.simulation.worlds.street.network import KERB_HEIGHT_M, KERB_WIDTH_M, RISE_M
 from lidarslam.simulation.worlds.street.plan import Lot, LotSurvey, StreetPlan, draw_plan
@@ -46,17 +36,17 @@ def build(seed: int) -> World:
         _garden(solid, green, rng, lot, ground)
     park_cars(solid, rng, plan, ground, (0.35, 0.85))
     _pavements(solid, green, rng, plan, ground)
-    route = Route(on_ground(lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, 11.0)
-    solid.place(prune(green, route), np.eye(4))
+    route = Route(paths.on_ground(lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, 11.0)
+    solid.place(paths.prune(green, route), np.eye(4))
     movers = (*traffic(rng, plan, ground), *people(rng, plan, ground))
     return World("street", seed, route, *solid.solids, (ground,), movers, map_spacing_m=0.1)
 
 
 def lane_of(tour: FloatArray, step_m: float) -> FloatArray:
     """The middle (N, 2) of the right lane along a tour (M, 2)."""
-    corners = offset_loop(tour, 0.5 * _LANE_M)
-    radii = np.where(turns_left(corners), _LEFT_RADIUS_M, _RIGHT_RADIUS_M)
-    return subdivide_loop(round_corners(corners, radii, step_m), 5.0)
+    corners = paths.offset_loop(tour, 0.5 * _LANE_M)
+    radii = np.where(paths.turns_left(corners), _LEFT_RADIUS_M, _RIGHT_RADIUS_M)
+    return paths.subdivide_loop(paths.round_corners(corners, radii, step_m), 5.0)
 
 
 def lay_ground(rng: np.random.Generator, plan: StreetPlan, hills_m: tuple[float, float]) -> HeightField:
@@ -64,7 +54,7 @@ def lay_ground(rng: np.random.Generator, plan: StreetPlan, hills_m: tuple[float,
     margin = plan.network.half_width_m + plan.pavement_m + 20.0
     # Nodes are at whole metres, so that a kerb is at grid points.
     low = np.floor(plan.network.nodes.min(axis=0) - margin)
-    nodes = grid_nodes(low, plan.network.nodes.max(axis=0) + margin, _CELL_M)
+    nodes = paths.grid_nodes(low, plan.network.nodes.max(axis=0) + margin, _CELL_M)
     kerb = plan.network.kerb_distance(nodes.reshape(-1, 2)).reshape(nodes.shape[:2])
     heights = rng.uniform(*hills_m) * smooth_noise(rng, kerb.shape, 40.0 / _CELL_M)
     return HeightField(low, _CELL_M, pave(rng, heights, kerb, _CELL_M, plan.network.half_width_m))
@@ -186,7 +176,7 @@ def furnish_pavement(
 
 def traffic(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> list[Mover]:
     """Cars on the other lane, all equally fast, so that none catches up with another."""
-    waypoints = on_ground(lane_of(plan.oncoming, 0.25), ground)
+    waypoints = paths.on_ground(lane_of(plan.oncoming, 0.25), ground)
     count, speed = int(rng.integers(3, 6)), rng.uniform(4.0, 8.0)
     starts = _starts(rng, count, waypoints)
     return [Mover(furnishing.car(rng, round_wheels=False).boxes, waypoints, speed, at) for at in starts]
@@ -199,7 +189,9 @@ def people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> l
     for low, high in plan.blocks:
         (x0, y0), (x1, y1) = low + inset, high - inset
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])[:: rng.choice([-1, 1])]
-        waypoints = on_ground(subdivide_loop(round_corners(corners, np.full(4, 1.5), 0.25), 5.0), ground)
+        waypoints = paths.on_ground(
+            paths.subdivide_loop(paths.round_corners(corners, np.full(4, 1.5), 0.25), 5.0), ground
+        )
         count, speed = int(rng.integers(2, 5)), rng.uniform(0.9, 1.5)
         starts = _starts(rng, count, waypoints)
         movers += [Mover(furnishing.pedestrian(rng).boxes, waypoints, speed, at) for at in starts]
@@ -208,5 +200,5 @@ def people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> l
 
 def _starts(rng: np.random.Generator, count: int, waypoints: FloatArray) -> list[float]:
     """Where along a closed polyline so many movers start, spread unevenly."""
-    at = loop_length(waypoints) * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
+    at = paths.loop_length(waypoints) * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     return [float(one) for one in at]

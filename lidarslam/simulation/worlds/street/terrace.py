@@ -8,17 +8,9 @@ from lidarslam.simulation.worlds.building import Builder, heading
 from lidarslam.simulation.worlds.furnishing import upright
 from lidarslam.simulation.worlds.open_country import plants
 from lidarslam.simulation.worlds.paths import grid_nodes, on_ground
+from lidarslam.simulation.worlds.street import street
 from lidarslam.simulation.worlds.street.houses import house
 from lidarslam.simulation.worlds.street.plan import LotSurvey, StreetPlan, draw_terrace_plan
-from lidarslam.simulation.worlds.street.street import (
-    house_pose,
-    lane_of,
-    lay_ground,
-    lay_kerbs,
-    park_cars,
-    people,
-    traffic,
-)
 
 _SPEED_LIMIT_MPS = 14.0  # 50 km/h
 # Hardly a slope: houses that step up with it would tell one from another.
@@ -35,19 +27,19 @@ def build(seed: int) -> World:
     """Two long terraces back to back, with the like across the street; lamp posts keep step with the houses."""
     rng = np.random.default_rng(seed)
     plan = draw_terrace_plan(rng)
-    ground = lay_ground(rng, plan, _HILLS_M)
+    ground = street.lay_ground(rng, plan, _HILLS_M)
     width, depth = rng.uniform(5.2, 6.8), rng.uniform(8.0, 9.5)
     survey = LotSurvey(plan)
     survey.repeat(width, depth)
     solid = Builder()
-    lay_kerbs(solid, plan.network.kerb_stones(), ground)
+    street.lay_kerbs(solid, plan.network.kerb_stones(), ground)
     alike = house(rng, width, depth, (False, False), _STOREYS)
     for lot in survey.lots:
-        solid.place(alike, house_pose(ground, lot.origin, lot.along, lot.width))
+        solid.place(alike, street.house_pose(ground, lot.origin, lot.along, lot.width))
     _lamps(solid, plan, ground, _HOUSES_PER_LAMP * width)
-    park_cars(solid, rng, plan, ground, _PARKED_SHARE)
-    route = Route(on_ground(lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, _SPEED_LIMIT_MPS)
-    movers = (*traffic(rng, plan, ground), *people(rng, plan, ground))
+    street.park_cars(solid, rng, plan, ground, _PARKED_SHARE)
+    route = Route(on_ground(street.lane_of(plan.tour, 1.0), ground), 2.0, 1.8, 3.5, _SPEED_LIMIT_MPS)
+    movers = (*street.traffic(rng, plan, ground), *street.people(rng, plan, ground))
     grass = _verges(rng, plan, ground)
     return World("terrace", seed, route, *solid.solids, (ground,), movers, map_spacing_m=0.1, grass=grass)
 
