@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.choices import choose
@@ -99,5 +98,7 @@ def find_carrier(name: str) -> Carrier:
 
 def mount_pose(name: str, height_m: float) -> FloatArray:
     """T_body_lidar (4, 4) of a LiDAR mounted so, that far above the body's origin."""
+    from scipy.spatial.transform import Rotation
+
     R = Rotation.from_rotvec(np.deg2rad(choose("mount", name, MOUNTS))).as_matrix()
     return make_transform(R, [0.0, 0.0, height_m])

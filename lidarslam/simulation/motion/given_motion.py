@@ -1,7 +1,7 @@
 """Following a trajectory that is given, such as KITTI's ground truth."""
 
 import numpy as np
-from scipy.interpolate import CubicSpline, make_smoothing_spline
+from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
@@ -14,11 +14,10 @@ from lidarslam.simulation.world import World
 
 _STEEPEST_DEG = 80.0
 _FEWEST_TO_SMOOTH = 5
-_PATH_STEP_S = 0.05
 
 
 def motion_along(
-    trajectory: Trajectory, world: World, on_ground: bool = True, carrier: str = "car", smoothing_s: float = 0.0
+    trajectory: Trajectory, world: World | None, on_ground: bool = True, carrier: str = "car", smoothing_s: float = 0.0
 ) -> Motion:
     """Follow a trajectory in its own time, on smooth splines; after the last pose the body stays where it is.
 
@@ -27,7 +26,7 @@ def motion_along(
 
     Args:
         trajectory: poses of a frame with x forwards and z up.
-        world: gives the ground.
+        world: gives the ground, if the motion is on it.
         on_ground: take position and heading from the trajectory, height, roll and pitch from the ground under the
             carrier; else take the poses as they are, for what flies or is carried.
         carrier: whose footprint and sensor height are meant when on the ground.
@@ -50,7 +49,7 @@ def motion_along(
     xyz = _smoothed(times, trajectory.positions, smoothing_s)
     yaw, pitch, roll = _smoothed(times, np.unwrap(angles, axis=0), smoothing_s).T
     height = 0.0
-    if on_ground:
+    if on_ground and world is not None:
         body = find_carrier(carrier)
         height = body.sensor_height_m
         ground = ground_under(world, xyz[:, :2], body.footprint_m)
@@ -58,14 +57,6 @@ def motion_along(
         xyz = np.column_stack([xyz[:, :2], ground.height])
     base = np.column_stack([xyz, roll, pitch, yaw, np.zeros(len(xyz))])
     return Motion("given", times, base, Sway(), height, repeats=False)
-
-
-def path_along(trajectory: Trajectory, smoothing_s: float = 0.0) -> FloatArray:
-    """Positions (N, 3) that `motion_along` passes, also between the poses, before they are put on the ground."""
-    times = trajectory.stamps - trajectory.stamps[0]
-    positions = _smoothed(times, trajectory.positions, smoothing_s)
-    moments = np.linspace(0.0, times[-1], max(2, int(np.ceil(times[-1] / _PATH_STEP_S)) + 1))
-    return np.asarray(CubicSpline(times, positions, bc_type="natural")(moments))
 
 
 def _smoothed(times: FloatArray, values: FloatArray, smoothing_s: float) -> FloatArray:

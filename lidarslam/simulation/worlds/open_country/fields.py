@@ -73,15 +73,6 @@ def _ground(rng: np.random.Generator, low: FloatArray, distance: FloatArray) -> 
     return HeightField(low, _CELL_M, heights)
 
 
-def _beside(
-    rng: np.random.Generator, road: FloatArray, nearest_m: float, farthest_m: float
-) -> tuple[FloatArray, float]:
-    """A random place (2,) on either side of the road, and the road's heading there."""
-    return paths.beside_loop(
-        road, int(rng.integers(len(road))), rng.choice([-1.0, 1.0]) * rng.uniform(nearest_m, farthest_m)
-    )
-
-
 def _poles(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: HeightField) -> None:
     """A line of telegraph poles with cross-arms along a third of the road."""
     left, spacing = rng.choice([-1.0, 1.0]) * rng.uniform(6.0, 9.0), rng.uniform(45.0, 60.0)
@@ -112,7 +103,8 @@ def _barn(solid: Builder, rng: np.random.Generator, road: FloatArray, ground: He
     """One barn with a pitched roof, some way off the road."""
     where, yaw = road[0], 0.0
     while paths.distance_to_loop(where[None], road)[0] < 22.0:
-        where, yaw = _beside(rng, road, 25.0, 40.0)
+        index, side = int(rng.integers(len(road))), rng.choice([-1.0, 1.0])
+        where, yaw = paths.beside_loop(road, index, side * rng.uniform(25.0, 40.0))
     part = Builder()
     long, wide, high = rng.uniform(7.0, 10.0), rng.uniform(4.5, 6.0), rng.uniform(3.8, 5.0)  # half, half, all
     part.block((-long, -wide, -2.0), (long, wide, high))

@@ -67,9 +67,8 @@ def _pavilion(solid: Builder, rng: np.random.Generator, path: FloatArray, ground
     size, high = rng.uniform(5.0, 8.0), rng.uniform(2.9, 3.4)
     where, yaw = path[0], 0.0
     while paths.distance_to_loop(where[None], path)[0] < 0.75 * size + 2.5:
-        where, yaw = paths.beside_loop(
-            path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0)
-        )
+        index, side = int(rng.integers(len(path))), rng.choice([-1.0, 1.0])
+        where, yaw = paths.beside_loop(path, index, side * (0.75 * size + 4.0))
     part, half = Builder(), 0.5 * size
     part.block((-half - 0.3, -half - 0.3, -1.2), (half + 0.3, half + 0.3, 0.18))
     for x in np.linspace(-half, half, 3):

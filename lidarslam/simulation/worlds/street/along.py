@@ -5,9 +5,12 @@ Everything keeps its distance from all of the path, so also from where it crosse
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
@@ -16,26 +19,26 @@ from lidarslam.simulation.worlds import furnishing
 from lidarslam.simulation.worlds.building import Builder, heading, left_of, smooth_noise
 from lidarslam.simulation.worlds.furnishing import on_slope, upright
 from lidarslam.simulation.worlds.open_country import plants
-from lidarslam.simulation.worlds.paths import grid_nodes, on_ground, prune
-from lidarslam.simulation.worlds.street.course import STEP_M, Course
+from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along, prune
 from lidarslam.simulation.worlds.street.houses import house
 from lidarslam.simulation.worlds.street.network import KERB_WIDTH_M, RISE_M, STONE_M
-from lidarslam.simulation.worlds.street.street import fence_in, furnish_pavement, house_pose, lay_kerbs, pave
+from lidarslam.simulation.worlds.street.street import furnish_pavement, house_pose, lay_kerbs, pave
 
+_STEP_M = 0.5
+# The road goes on straight for this long before the path and behind it.
+_BEYOND_M = 12.0
+# Directions are averaged over this length: a path has jitter, and a row of houses none.
+_SMOOTH_M = 3.0
 HALF_WIDTH_M = 5.0
 FREE_SIDE_M = 2.5
 _FRONT_M = HALF_WIDTH_M + 3.8
-# Houses' fronts are straight where the road bends, and may come this much closer.
-_CLOSER_M = 1.0
 _CAR_M = (5.4, 2.0)
 _MARGIN_M = 45.0
-_CELL_M = 0.5
 # Above this the ground's grid becomes wider, so that a path of kilometres takes no more memory than this.
 _MOST_GROUND_POINTS = 600_000
 _LONGEST_SIDE_M = 5_000.0
 # A longer street has plainer houses and fewer things, so that the number of primitives grows slowly.
 _FULL_M = 700.0
-_MOST_PEOPLE = 24
 
 
 def build_along(path: FloatArray, seed: int) -> World:
@@ -60,21 +63,69 @@ def build_along(path: FloatArray, seed: int) -> World:
     rng = np.random.default_rng(seed)
     course = Course.along(path)
     ground = _ground(rng, course)
-    there = course.points[:: round(2.0 / STEP_M), :2]
+    there = course.points[:: round(2.0 / _STEP_M), :2]
     route = Route(on_ground(np.concatenate([there, there[-2:0:-1]]), ground), 2.0, FREE_SIDE_M, 4.0, 11.0)
     rows = _Rows(rng, course, ground)
     rows.build(replace(route, free_height_m=1e3))
     return World("street", seed, route, *rows.solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
 
 
+@dataclass(frozen=True, eq=False)
+class Course:
+    """An open path, as points half a metre apart."""
+
+    points: FloatArray  # (N, 2) or (N, 3)
+
+    @classmethod
+    def along(cls, path: FloatArray) -> "Course":
+        """The course of a polyline (M, 2) or (M, 3), at least one metre long, longer than it at either end."""
+        at = lengths_along(path[:, :2])
+        points = points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / _STEP_M)) + 1)))
+        first, last = (np.append(-left_of(left), np.zeros(path.shape[1] - 2)) for left in cls(points).lefts[[0, -1]])
+        ahead = _STEP_M * np.arange(1, int(_BEYOND_M / _STEP_M) + 1)[:, None]
+        return cls(np.concatenate([points[0] - ahead[::-1] * first, points, points[-1] + ahead * last]))
+
+    @property
+    def length_m(self) -> float:
+        """About how long it is."""
+        return _STEP_M * (len(self.points) - 1)
+
+    @cached_property
+    def lefts(self) -> FloatArray:
+        """(N, 2) unit, to the left of the way."""
+        smooth = gaussian_filter1d(self.points[:, :2], _SMOOTH_M / _STEP_M, axis=0, mode="nearest")
+        ahead = np.gradient(smooth, axis=0)
+        return left_of(ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9))
+
+    @cached_property
+    def tree(self) -> "cKDTree[None]":
+        """Of the points' x and y."""
+        return cKDTree(self.points[:, :2])
+
+    def sides(self) -> Iterator["Course"]:
+        """The course and its reverse: what is placed along the left of each is placed on both sides."""
+        yield self
+        yield Course(self.points[::-1])
+
+    def beside(self, at_m: FloatArray | float, left_m: float) -> FloatArray:
+        """Places (..., 2) to the left of the course, at lengths (...) along it."""
+        place = np.clip(np.asarray(at_m) / _STEP_M, 0, len(self.points) - 1).round().astype(int)
+        return np.asarray(self.points[place, :2] + left_m * self.lefts[place])
+
+    def distance(self, xy: FloatArray) -> FloatArray:
+        """Distance (M,) of points (M, 2) from the nearest part of the course."""
+        nearest = self.tree.query(xy)[0]
+        return np.asarray(
+            np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0))
+        )  # between two points it is nearer
+
+
 def _ground(rng: np.random.Generator, course: Course) -> HeightField:
     low = np.floor(course.points[:, :2].min(axis=0) - _MARGIN_M)
     high = course.points[:, :2].max(axis=0) + _MARGIN_M
-    cell = max(_CELL_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
+    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
     distance, nearest = map(np.asarray, course.tree.query(grid_nodes(low, high, cell)))
     if course.points.shape[1] == 3:
-        from scipy.ndimage import gaussian_filter
-
         hills = gaussian_filter(course.points[nearest, 2], 6.0 / cell, mode="nearest")
     else:
         hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
@@ -124,7 +175,8 @@ class _Rows:
                 if at + width > side.length_m or not 5.0 < front < 20.0:
                     continue
                 along = (end - start) / front
-                if self._claim(_rectangle(start, along, front, depth), _FRONT_M - _CLOSER_M):
+                # Fronts are straight where the road bends, and may come a metre closer.
+                if self._claim(_rectangle(start, along, front, depth), _FRONT_M - 1.0):
                     self._house(start, along, front - 0.02, depth)
                     at += width
                     break
@@ -132,12 +184,10 @@ class _Rows:
                 at += 2.0
 
     def _house(self, origin: FloatArray, along: FloatArray, width: float, depth: float) -> None:
-        """A house, or a garden with a wall or a hedge before it."""
+        """A house, or one time in eight a gap with a tree."""
         if self.rng.random() < 0.12:
-            size = (width, self.rng.uniform(1.2, 2.2))
-            fence_in(self.solid, self._loose, self.rng, self.ground, origin, along, size)
-            where = origin + 0.5 * width * along + 4.0 * left_of(along)
             tree = plants.broadleaf(self.rng, self.rng.uniform(6.0, 9.0), 0.16, 24)
+            where = origin + 0.5 * width * along + 4.0 * left_of(along)
             self._loose.place(tree, upright(self.ground, where, 0.0))
             return
         is_plain = bool(self.rng.random() > self._fullness)
@@ -150,7 +200,7 @@ class _Rows:
             if self.rng.random() > taken:
                 continue
             where = side.beside(at, HALF_WIDTH_M - 1.15 + self.rng.uniform(-0.08, 0.08))
-            ahead = -left_of(side.lefts[min(round(at / STEP_M), len(side.points) - 1)])
+            ahead = -left_of(side.lefts[min(round(at / _STEP_M), len(side.points) - 1)])
             footprint = _rectangle(where - 0.5 * (_CAR_M[0] * ahead + _CAR_M[1] * left_of(ahead)), ahead, *_CAR_M)
             # Not on the pavement behind a bend, nor where another part of the path has its lane.
             on_road = self.course.distance(footprint).max() <= HALF_WIDTH_M + 0.3
@@ -185,7 +235,7 @@ class _Rows:
         """Pedestrians who walk up and down the pavement."""
         rng = self.rng
         for side in self.course.sides():
-            apart = max(40.0, 2.0 * side.length_m / _MOST_PEOPLE)
+            apart = max(40.0, side.length_m / 12.0)
             for start in np.arange(rng.uniform(5.0, 20.0), side.length_m - 40.0, apart):
                 at = np.arange(start, start + rng.uniform(20.0, 35.0), 1.0)
                 there = side.beside(at, HALF_WIDTH_M + rng.uniform(1.9, 2.4))

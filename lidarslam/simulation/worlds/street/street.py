@@ -95,30 +95,15 @@ def _is_open(survey: LotSurvey, lot: Lot, x: float) -> bool:
     return not any((low < beside).all() and (beside < high).all() for low, high in (one.bounds for one in survey.lots))
 
 
-def fence_in(
-    solid: Builder,
-    green: Builder,
-    rng: np.random.Generator,
-    ground: HeightField,
-    start: FloatArray,
-    along: FloatArray,
-    size: tuple[float, float],
-) -> None:
-    """A hedge or a wall of that length and height, from a start (2,) along a direction (2,)."""
-    pose = upright(ground, start, heading(along))
-    length, high = size
-    if rng.random() < 0.5:
-        green.place(plants.hedge(rng, length, high, 0.5), pose)
-    else:
-        level = float(pose[2, 3])
-        solid.wall(start, start + length * along, (level - 1.0, level + high), 0.3)
-
-
 def _garden(solid: Builder, green: Builder, rng: np.random.Generator, lot: Lot, ground: HeightField) -> None:
     """A wall or a hedge across a gap between houses or before a front garden, with a tree or a bush behind it."""
     start = lot.origin - (lot.setback_m - 0.25) * lot.inward
     length, high = (lot.width - 1.4, rng.uniform(0.9, 1.4)) if lot.setback_m else (lot.width, rng.uniform(1.6, 2.2))
-    fence_in(solid, green, rng, ground, start, lot.along, (length, high))
+    pose = upright(ground, start, heading(lot.along))
+    if rng.random() < 0.5:
+        green.place(plants.hedge(rng, length, high, 0.5), pose)
+    else:
+        solid.wall(start, start + length * lot.along, (pose[2, 3] - 1.0, pose[2, 3] + high), 0.3)
     where = start + rng.uniform(0.3, 0.7) * length * lot.along
     where = where + (1.5 if lot.setback_m else rng.uniform(3.0, 5.0)) * lot.inward
     if lot.setback_m:
@@ -189,9 +174,8 @@ def people(rng: np.random.Generator, plan: StreetPlan, ground: HeightField) -> l
     for low, high in plan.blocks:
         (x0, y0), (x1, y1) = low + inset, high - inset
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])[:: rng.choice([-1, 1])]
-        waypoints = paths.on_ground(
-            paths.subdivide_loop(paths.round_corners(corners, np.full(4, 1.5), 0.25), 5.0), ground
-        )
+        loop = paths.subdivide_loop(paths.round_corners(corners, np.full(4, 1.5), 0.25), 5.0)
+        waypoints = paths.on_ground(loop, ground)
         count, speed = int(rng.integers(2, 5)), rng.uniform(0.9, 1.5)
         starts = _starts(rng, count, waypoints)
         movers += [Mover(furnishing.pedestrian(rng).boxes, waypoints, speed, at) for at in starts]

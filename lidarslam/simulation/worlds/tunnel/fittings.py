@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from lidarslam.simulation.worlds.building import UP, Builder
-from lidarslam.simulation.worlds.tunnel.stations import Stations
+from lidarslam.simulation.worlds.tunnel.rock import Stations
 
 
 def fit_out(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:

@@ -6,8 +6,7 @@ from lidarslam.simulation.world import Route, World
 from lidarslam.simulation.worlds.building import Builder
 from lidarslam.simulation.worlds.tunnel.fittings import fit_out
 from lidarslam.simulation.worlds.tunnel.plan import SPACING_M, draw_mine
-from lidarslam.simulation.worlds.tunnel.rock import carve
-from lidarslam.simulation.worlds.tunnel.stations import place_stations
+from lidarslam.simulation.worlds.tunnel.rock import carve, place_stations
 
 _WAYPOINT_M = 1.5
 _FREE_SIDE_M, _FREE_HEIGHT_M = 0.8, 2.05
