@@ -29,7 +29,7 @@ def _motions() -> Iterable[str]:
 
 
 def _mounts() -> Iterable[str]:
-    from lidarslam.simulation.motion.mounts import MOUNTS
+    from lidarslam.simulation.motion.carriers import MOUNTS
 
     return MOUNTS
 
