@@ -44,7 +44,7 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
     table, and the exit status is 0 all the same; it is 1 when no method came to a result, or on Ctrl-C, which writes
     the report of what there is.
     """
-    from lidarslam.compare.command import CompareOptions, run_compare
+    from lidarslam.compare.command import run_compare
 
     if (benchmark is None) == (not sources):
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
@@ -56,5 +56,5 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
         if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT and len(sources) != 1:
             flag = f"--{name.replace('_', '-')}"
             raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
-    if not run_compare(CompareOptions(sources, benchmark, **options), say, tell):
+    if not run_compare(say, tell, sources=sources, benchmark=benchmark, **options):
         ctx.exit(EXIT_MENDABLE)
