@@ -33,11 +33,7 @@ class Saved:
         self.place = place
 
     def value(self, name: str) -> Any:
-        """The tree under a name.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The tree under a name; InputError where there is none."""
         if name not in self._values:
             raise self.refuse(f"{name} is missing")
         return self._values[name]
