@@ -103,7 +103,8 @@ def test_a_global_map_goes_on(
         part = GlobalMap(0.5)
         for cloud in clouds[:after]:
             part.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-        restored = GlobalMap.restored(through_disk(part.state()))
+        restored = GlobalMap(1.0)
+        restored.restore(through_disk(part.state()))
         for cloud in clouds[after:]:
             restored.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
         np.testing.assert_array_equal(restored.means(), whole.means())
