@@ -26,9 +26,8 @@ from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.scan_stream import in_order
-from odometry.config import OdometryConfig
+from odometry.config import LearnedConfig, OdometryConfig
 from odometry.interface import Motion
-from odometry.methods.learned_config import LearnedConfig
 
 LENGTHS_M = (20.0, 30.0, 40.0, 50.0, 60.0)
 _SCANS_OF_A_START = 50

@@ -30,12 +30,10 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angl
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.motion.mounts import MOUNTS, mount_pose
+from lidarslam.simulation.motion.carriers import CARRIERS, MOUNTS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.sensors.table import SENSORS
+from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from mapping.config import LoopConfig, PoseGraphConfig

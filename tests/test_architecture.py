@@ -47,14 +47,15 @@ CONFINED = {
     "click": ("lidarslam.cli", "lidarslam.commands.*"),
     "laspy": ("lidarslam.evaluate.reference_cloud",),
     "pye57": ("lidarslam.evaluate.reference_cloud",),
-    "lightning_fabric": ("lidarslam.train.devices",),
+    "jinja2": ("evaluation.report.report",),
+    "plotly": ("evaluation.report.*",),
     "safetensors": ("odometry.network.tensor_file",),
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("odometry.network.export",),
     "onnxscript": ("odometry.network.export",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
 }
-HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "lightning_fabric", "numba"}
+HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "common", "base", "helpers", "helper", "misc", "tools"}
 
 

@@ -19,9 +19,8 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.merge.merge import MergeOutcome
 from lidarslam.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary import WrittenMap
-from odometry.images.image_config import ImageConfig
+from odometry.config import ImageConfig, NetworkConfig
 from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.network_config import CorrelationConfig, NetworkConfig
 from odometry.network.networks import make_network
 
 
@@ -75,7 +74,7 @@ def test_run_exits_with_3_when_tracking_was_lost(recording: Path, tmp_path: Path
     np.save(recording / "000003.npy", np.full((100, 3), np.nan))
     result = lidarslam("run", recording, "--out", tmp_path / "run")
     assert result.exit_code == 3
-    assert "LOST on scan 3: there is no point within range" in result.output
+    assert "LOST on scan 3: no points within range" in result.output
     assert (tmp_path / "run" / "map.ply").exists()
 
 
@@ -90,7 +89,7 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
 
 
 def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Path) -> None:
-    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), bird_width=4))
+    network = NetworkConfig()
     weights = tmp_path / "weights of mine: 1.safetensors"
     images = ImageConfig(columns=180)
     save_checkpoint(weights, checkpoint_of(make_network(network), network, images))
@@ -102,7 +101,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
     for other in (("--odometry", "kiss-icp"), ("--odometry", "constant-velocity"), ("--prior", prior)):
         refused = lidarslam("run", recording, "--out", tmp_path / "other", "--weights", weights, *other)
         assert refused.exit_code == 2
-        assert "--weights are those of the learned odometry" in refused.stderr
+        assert "--weights belongs to --odometry learned" in refused.stderr
         assert not (tmp_path / "other").exists()
 
 
@@ -124,7 +123,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         (
             ["run", "{recording}", "--out", "{out}", "--weights", "{recording}/timestamps.txt"],
             1,
-            "timestamps.txt: is no safetensors file; expected weights",
+            "timestamps.txt: is not weights that lidarslam wrote",
         ),
         (["run", "{recording}", "--out", "{out}", "--start", "9"], 1, "none of its 5 scans is left"),
         (["run", "{recording}", "--out", "{out}", "--set", "odometry.kiss=1"], 1, "did you mean kiss_icp?"),

@@ -64,7 +64,7 @@ def read_tensor_file(path: Path, kind: Kind) -> TensorFile:
     except (SafetensorError, OSError, ValueError) as error:
         raise InputError(f"{path}: is not {kind.name} that {_PROGRAM} wrote, or damaged ({error})") from error
     if header.get("program") != _PROGRAM or header.get("kind") != kind.name:
-        found = f"{header.get('kind')} of {header.get('program')}" if header else "tensors"
+        found = header.get("kind") if header.get("program") == _PROGRAM else "tensors of another program"
         raise InputError(f"{path}: holds {found}, not {kind.name} that {_PROGRAM} wrote; name another file")
     try:
         version, content = int(header["version"]), json.loads(header["content"])

@@ -25,7 +25,6 @@ from lidarslam.resume.unfinished import About, Unfinished, require_whole
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.scan_log import ScanLog
 from mapping.config import GlobalMapConfig
-from odometry.config import ConsistencyConfig
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.constant_velocity import ConstantVelocity
 from odometry.methods.external import ExternalOdometry
@@ -125,7 +124,7 @@ class Counting:
 
 def make_pipeline(truth: Trajectory, keeper: Counting | None = None) -> tuple[Pipeline, ExternalOdometry]:
     odometry = ExternalOdometry(truth)
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    localiser = OdometryAlone(ConsistencyCheck())
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), checkpointer=keeper), odometry
 
 

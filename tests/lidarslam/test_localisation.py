@@ -16,7 +16,7 @@ from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig, MappingConfig
 from mapping.mapper import Mapper
 from odometry.interface import Motion, Odometry
-from odometry.methods.consistency import ConsistencyCheck, ConsistencyConfig
+from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.constant_velocity import ConstantVelocity
 from odometry.methods.external import ExternalOdometry
 
@@ -51,7 +51,7 @@ def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> N
     """Standing still in a corner, of which the odometry says that it leaves nothing open, and that it leaves x open."""
     rng = np.random.default_rng(0)
     corner = np.concatenate([np.insert(rng.uniform(1.0, 6.0, (800, 2)), axis, 1.0, axis=1) for axis in range(3)])
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    localiser = OdometryAlone(ConsistencyCheck())
     told = [
         localiser.localise(Estimated(Scan(corner, 0.1 * number), Motion(np.eye(4), 100, degenerate=names), 0.1), None)
         for number, names in enumerate([(), (), ("x", "yaw")])

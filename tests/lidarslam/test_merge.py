@@ -27,11 +27,11 @@ from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.run.directory import FILES
 from lidarslam.run.finished_run import load_map, load_run
 from lidarslam.run.tracking import Progress
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion
-from lidarslam.simulation.motion.mounts import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]

@@ -16,7 +16,6 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig
-from odometry.config import ConsistencyConfig
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.external import ExternalOdometry
 
@@ -130,7 +129,7 @@ def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
     given = [Scan(points, float(stamp)) for points, stamp in zip(scans, stamps, strict=True)]
     for number in range(20, 25):
         given[number] = given[number].select(np.arange(0))
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    localiser = OdometryAlone(ConsistencyCheck())
     pipeline = Pipeline(ExternalOdometry(truth()), localiser, GlobalMapConfig(voxel_size_m=0.1))
     results = list(pipeline.run(given))
     poses = np.array([result.T_world_lidar for result in results])

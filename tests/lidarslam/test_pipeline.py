@@ -17,16 +17,13 @@ from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig
 from mapping.pose_graph.graph_scan import GraphScan
-from odometry.config import ConsistencyConfig
 from odometry.interface import Motion
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.external import ExternalOdometry
 
 
 def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:
-    return Pipeline(
-        odometry, OdometryAlone(ConsistencyCheck(ConsistencyConfig())), GlobalMapConfig(voxel_size_m=voxel_size_m)
-    )
+    return Pipeline(odometry, OdometryAlone(ConsistencyCheck()), GlobalMapConfig(voxel_size_m=voxel_size_m))
 
 
 @pytest.fixture
@@ -145,7 +142,7 @@ class _Notes:
 
 
 def followed(odometry: Any, follower: _Notes) -> Pipeline:
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    localiser = OdometryAlone(ConsistencyCheck())
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), follower)
 
 
@@ -214,7 +211,7 @@ def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: 
 def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive: Callable[..., FloatArray]) -> None:
     scans = [room.sweep(drive, float(stamp)) for stamp in (0.1, 0.2)]
     config = GlobalMapConfig(voxel_size_m=0.1, min_range_m=2.0, max_range_m=4.0)
-    pipeline = Pipeline(true_odometry, OdometryAlone(ConsistencyCheck(ConsistencyConfig())), config)
+    pipeline = Pipeline(true_odometry, OdometryAlone(ConsistencyCheck()), config)
     for result in pipeline.run(scans):
         ranges = np.linalg.norm(result.points, axis=1)
         assert ranges.min() > 1.9  # compensation moves points by centimetres after the crop
