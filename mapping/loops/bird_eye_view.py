@@ -32,18 +32,16 @@ class BirdEyeView:
     R_level_lidar: FloatArray
 
     @classmethod
-    def of(cls, submap: SparseSubmap, upside_down: bool = False) -> "BirdEyeView":
-        """View a submap; upside down when its sensor hangs the other way than that of the others."""
+    def of(cls, submap: SparseSubmap) -> "BirdEyeView":
+        """View a submap."""
         R = submap.R_level_lidar
-        if upside_down:
-            R = np.diag([1.0, -1.0, -1.0]) @ R
         level = submap.points.astype(np.float64) @ R.T
         upright = np.abs(submap.axes.astype(np.float64) @ R[2])
         structure = np.where(submap.kinds == PLANE, upright < _UPRIGHT, True)
         return cls(level[structure, :2], level[:, 2], R)
 
     def descriptor(self, radius_m: float) -> NDArray[np.complex64]:
-        """(DIRECTIONS / 2 + 1, FREQUENCIES), of unit length: what correlates by directions."""
+        """(DIRECTIONS / 2 + 1, FREQUENCIES), of unit length, by directions."""
         xy = self.structure
         weights = np.clip(1.0 - np.einsum("ij,ij->i", xy, xy) / radius_m**2, 0.0, None)
         xy, weights = xy[weights > 0.0], weights[weights > 0.0]

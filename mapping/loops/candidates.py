@@ -73,15 +73,14 @@ class KeyframeDatabase(Stateful):
         self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
         self.submaps: list[SparseSubmap] = []
         self._descriptors: list[NDArray[np.complex64]] = []
-        self._radius_m: float | None = None
 
     def __len__(self) -> int:
         return len(self.submaps)
 
     @property
     def radius_m(self) -> float:
-        """How far descriptors reach; known with the first keyframe that has points."""
-        return self._radius_m or 1.0
+        """How far descriptors reach; follows the first keyframe that has points."""
+        return next((_RADIUS_PER_RANGE * submap.range_m for submap in self.submaps if len(submap)), 1.0)
 
     def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> None:
         """Take the next keyframe: its submap (N, 3), way and segment, and the present estimates (K, 4, 4) of all."""
@@ -102,11 +101,8 @@ class KeyframeDatabase(Stateful):
             raise ValueError(f"{len(self.track.way_m)} keyframes have {len(self)} submaps")
 
     def _keep(self, points: FloatArray) -> None:
-        submap = SparseSubmap.of(points, self._config.max_range_m)
-        if self._radius_m is None and len(submap):
-            self._radius_m = _RADIUS_PER_RANGE * submap.range_m
-        self._descriptors.append(BirdEyeView.of(submap).descriptor(self.radius_m))
-        self.submaps.append(submap)
+        self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))
+        self._descriptors.append(BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m))
 
     def cloud(self, index: int) -> SubmapCloud:
         """A keyframe with those before and after it in its segment."""
@@ -161,21 +157,16 @@ class KeyframeDatabase(Stateful):
             yield Candidate(int(others[k]), False, guess)
 
     def _alike(self, index: int, others: NDArray[np.intp]) -> list[Candidate]:
-        """Earlier keyframes with similar descriptors; those of other segments may hang upside down."""
-        submap, segment = self.submaps[index], self.track.segment
+        """Earlier keyframes with similar descriptors."""
+        source = BirdEyeView.of(self.submaps[index])
+        similarity, turn = self._compare(source, others)
         found: list[tuple[float, Candidate]] = []
-        for upside_down in (False, True):
-            chosen = others[segment[others] != segment[index]] if upside_down else others
-            if not len(chosen):
-                continue
-            source = BirdEyeView.of(submap, upside_down)
-            similarity, turn = self._compare(source, chosen)
-            for k in _spread(chosen, -similarity, 2 * _APPEARANCE_CANDIDATES):
-                if similarity[k] < _MIN_SIMILARITY:
-                    break
-                target = BirdEyeView.of(self.submaps[chosen[k]])
-                guess, score = align(target, source, turn[k] + np.array([0.0, np.pi]), self.radius_m)
-                found.append((score, Candidate(int(chosen[k]), True, guess)))
+        for k in _spread(others, -similarity, 2 * _APPEARANCE_CANDIDATES):
+            if similarity[k] < _MIN_SIMILARITY:
+                break
+            target = BirdEyeView.of(self.submaps[others[k]])
+            guess, score = align(target, source, turn[k] + np.array([0.0, np.pi]), self.radius_m)
+            found.append((score, Candidate(int(others[k]), True, guess)))
         found.sort(key=lambda pair: -pair[0])
         plausible = [(score, candidate) for score, candidate in found if self._explained_by_drift(candidate, index)]
         if self._is_ambiguous(plausible, index):

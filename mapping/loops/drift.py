@@ -58,8 +58,8 @@ class Track:
     def drift(self, first: NDArray[np.intp], second: int) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (N,) of the second keyframe's attitude and position relative to others (N,).
 
-        An error of heading grows along with the way, and swings the way that lies between: on average about half of
-        it, over as far as the keyframe lies from that way.
+        A heading error grows along the way; its lever arm is about half the distance from the way between to the
+        keyframe.
         """
         way = np.abs(self.way_m[first] - self.way_m[second])
         sums, squares = self._sums

@@ -1,6 +1,6 @@
-"""Point-to-plane and point-to-line registration of sparse submaps, and the Gauss-Newton solver of refinement too."""
+"""Point-to-plane and point-to-line registration of sparse submaps, coarse to fine."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
+from lidarslam.core.geometry import FloatArray, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
+from mapping.loops.gauss_newton import NormalEquations, gauss_newton, geman_mcclure
 from mapping.loops.sparse_submap import LINE, SparseSubmap
 
 # Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.
@@ -24,53 +25,6 @@ CORRELATION = 25.0
 MIN_POINTS = 12
 # Standard deviations of a candidate's guess, radians and metres.
 GUESS_SIGMAS = np.array([0.2] * 3 + [2.0] * 3)
-
-
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """Hessian (6, 6) and gradient (6,) of half the squared residuals, for a motion from the right, rotation first."""
-
-    hessian: FloatArray
-    gradient: FloatArray
-
-    @classmethod
-    def of(cls, jacobian: FloatArray, residuals: FloatArray, information: FloatArray) -> "NormalEquations":
-        """Of residuals (M,) with their Jacobian (M, 6) and information (M,)."""
-        JW = jacobian * information[:, None]
-        return cls(JW.T @ jacobian, JW.T @ residuals)
-
-
-def geman_mcclure(residuals: FloatArray, scale: float) -> FloatArray:
-    """Weights of the robust kernel of Geman and McClure."""
-    return np.asarray((1.0 + (residuals / scale) ** 2) ** -2, dtype=np.float64)
-
-
-def gauss_newton(
-    linearise: Callable[[FloatArray], NormalEquations | None],
-    T: FloatArray,
-    prior: FloatArray,
-    prior_information: FloatArray,
-    most_steps: int,
-    lever_m: float,
-    settled_m: float,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Minimise from T (4, 4), with a prior (4, 4) of the given information (6, 6).
-
-    Returns:
-        The pose, and the Hessian (6, 6) with the prior; None where the correspondences are too few.
-    """
-    hessian = prior_information
-    for _ in range(most_steps):
-        system = linearise(T)
-        if system is None:
-            return None
-        hessian = system.hessian + prior_information
-        away = log(inverse(prior) @ T)
-        xi = np.asarray(np.linalg.solve(hessian, -system.gradient - prior_information @ away), dtype=np.float64)
-        T = T @ exp(xi)
-        if displacement_m(xi, lever_m) < settled_m:
-            break
-    return T, hessian
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ _LARGEST_TILT = np.cos(np.deg2rad(45.0))
 
 @dataclass(frozen=True, eq=False)
 class SparseSubmap:
-    """What is kept of a keyframe's submap, about 55 kB, all in its LiDAR frame.
+    """A thinned submap, about 55 kB, in its keyframe's LiDAR frame.
 
     Attributes:
         points: (N, 3) float32, thinned.
@@ -56,7 +56,7 @@ class SparseSubmap:
 
     @classmethod
     def of(cls, points: FloatArray, max_range_m: float) -> "SparseSubmap":
-        """Thin a submap (N, 3), and estimate what its points lie on."""
+        """Thin a submap (N, 3), and classify its points by principal components."""
         ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
         kept = (ranges >= _MIN_RANGE_M) & (ranges <= max_range_m)
         points, ranges = points[kept], ranges[kept]

@@ -75,7 +75,7 @@ def corrected(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyfr
 def _shares(
     positions: FloatArray, scans: NDArray[np.intp], left: NDArray[np.intp], right: NDArray[np.intp]
 ) -> FloatArray:
-    """How much (M,) of the way from its keyframe on the left to that on the right lies behind each scan."""
+    """(M,) the part of the way between the keyframes on its left and right that each scan has gone."""
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     still = path[right] - path[left] < _STILL_M
     behind = np.where(still, scans - left, path - path[left])

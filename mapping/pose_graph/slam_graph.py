@@ -83,7 +83,7 @@ class SlamGraph(Stateful):
     def _after_restore(self) -> None:
         if len(self._keyframes) != len(self._poses) or len(self._keyframes) - len(self._store) not in (0, 1):
             raise ValueError(f"{len(self._keyframes)} keyframes have {len(self._store)} submaps")
-        self._detector.rebuild(means_points(means) for means in self._store)
+        self._detector.rebuild(means_points(self._store[key]) for key in range(len(self._store)))
 
     def begin_recording(self) -> None:
         """The next scan is the first of another recording, whose world is unrelated."""

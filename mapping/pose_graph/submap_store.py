@@ -3,7 +3,6 @@
 import os
 import tempfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -77,9 +76,6 @@ class SubmapStore(Stateful):
 
     def __getitem__(self, index: int) -> VoxelMeans:
         return np.frombuffer(self._read(index), dtype="<f4").reshape(-1, COLUMNS)
-
-    def __iter__(self) -> Iterator[VoxelMeans]:
-        return (self[index] for index in range(len(self)))
 
     def _read(self, index: int) -> bytes:
         self._file.seek(self._ends[index])
