@@ -58,12 +58,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         InputError: there is no such file, it is none of ours, or its weights do not fit or are not finite.
     """
-    file = read_tensor_file(path, WEIGHTS)
+    weights, content = read_tensor_file(path, WEIGHTS)
     try:
-        network, images = read_description(file.content)
-        checkpoint = Checkpoint(network, images, file.tensors, file.content.get("about") or {})
+        checkpoint = Checkpoint(*read_description(content), weights, content.get("about") or {})
         network_of(checkpoint)
-        for name, value in file.tensors.items():
+        for name, value in weights.items():
             if not bool(value.isfinite().all()):
                 raise ValueError(f"{name} is not finite")
     except (ValueError, RuntimeError) as error:

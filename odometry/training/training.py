@@ -94,7 +94,7 @@ def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
 def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tuple[Tensor, Tensor]:
     """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where labels are valid."""
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
-    points, normals = recording.images.points.numpy(), recording.images.normals.float().numpy()
+    points, normals = recording.points.numpy(), recording.normals.float().numpy()
     before = None
     for number in chosen:
         if before is None:

@@ -164,6 +164,6 @@ def test_missing_default_weights_say_what_to_do(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_the_shipped_weights_load_with_keys_that_were_settings_once() -> None:
-    content = module.read_tensor_file(default_weights(), module.WEIGHTS).content
+    _, content = module.read_tensor_file(default_weights(), module.WEIGHTS)
     assert "normals" in content["images"]
     assert load_checkpoint(default_weights()).images == ImageConfig()
