@@ -9,8 +9,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
@@ -211,8 +209,3 @@ def digest(stretches: Sequence[Stretch]) -> str:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def valid_share(recordings: Sequence[PreparedRecording]) -> float:
-    """Share of the consecutive scans with a valid pseudo-label."""
-    return float(torch.cat([recording.valid for recording in recordings]).float().mean())

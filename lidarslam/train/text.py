@@ -41,7 +41,7 @@ def format_errors(result: Validation) -> str:
 
 
 def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None, is_interrupted: bool) -> str:
-    """Where the weights lie, their errors, and how they are used."""
+    """The path of the weights, their errors, and the commands that use them."""
     errors = "" if best is None else f", on held-out scans {format_errors(best)}"
     lines = [
         f"{steps:,} steps done; weights written to {weights}{errors}",

@@ -17,7 +17,7 @@ from lidarslam.core.files import make_directory, only_writer
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.progress import show_count
 from lidarslam.train import directory as files
-from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated, valid_share
+from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated
 from lidarslam.train.devices import DeviceName, Devices
 from lidarslam.train.loop import Recordings, TrainingLoop
 from lidarslam.train.settings import TrainConfig, dump_train_yaml
@@ -182,10 +182,11 @@ def _summary(recordings: Recordings, stretches: Sequence[Stretch], devices: Devi
     held = sum(len(recording) for recording in recordings.held_out)
     held_out = f"{held:,} more are held out for validation" if held else "none is held out for validation"
     scans = sum(len(recording) for recording in recordings.learned)
+    valid = torch.cat([recording.valid for recording in recordings.learned])
     processes = f" in {devices.processes} processes" if devices.processes > 1 else ""
     return (
         f"training on {len(stretches):,} recording{'s' if len(stretches) > 1 else ''}{of_them}: {scans:,} scans to"
-        f" learn from, {held_out}; {100.0 * valid_share(recordings.learned):.0f} % of consecutive scans could be"
+        f" learn from, {held_out}; {100.0 * float(valid.float().mean()):.0f} % of consecutive scans could be"
         f" aligned. Computing on {devices.device}{processes}"
     )
 

@@ -180,7 +180,7 @@ def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: Flo
         information=_marginal(fit.H),
         prior_information=prior,
         inlier_share=fit.inlier_share,
-        # What leaves the other image's view on the way does not count against it, unless it is most of the scan.
+        # Points that leave the other image's view do not count, unless they are most of the scan.
         explained=explained * min(fit.share_in_view / _MOSTLY_IN_VIEW, 1.0),
         weakest=weakest,
         residual_m=float(np.sqrt(fit.squared_residuals / max(fit.inliers, 1))),

@@ -1,4 +1,4 @@
-"""Point-to-plane normal equations of a pair of sweeps, and how well the two lie on one another."""
+"""Point-to-plane normal equations of a pair of sweeps, and the quality of their alignment."""
 
 from dataclasses import dataclass
 
@@ -63,7 +63,7 @@ class PointToPlane:
         return total[:12, :12], total[:12, 12]
 
     def fit(self, motion: Motion) -> Fit:
-        """How the sweeps lie on one another."""
+        """The inliers of a motion."""
         total, in_view, inlier = np.zeros((13, 13)), np.zeros((3, 3)), np.zeros((3, 3))
         seen, count = accumulate(self._points, self._planes, motion, FINE_M, False, total, in_view, inlier)
         points = max(len(self._points), 1)

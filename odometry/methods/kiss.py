@@ -90,7 +90,7 @@ class KissOdometry:
         self._velocity = np.zeros(6)
 
     def estimate(self, scan: Scan) -> Motion:
-        """Register one scan. One that KISS-ICP cannot take gives the last velocity again, and says why."""
+        """Register one scan; one that KISS-ICP cannot take gives a prediction by the last velocity, and the reason."""
         if len(scan) < _MIN_POINTS:
             return self._predict(scan.stamp, f"{len(scan)} points are too few to register")
         offsets = self._usable_offsets(scan)
@@ -170,7 +170,7 @@ class KissOdometry:
         return Motion(inverse(previous.T_map_lidar) @ self._previous.T_map_lidar, 0, failure)
 
     def _bury_worker(self) -> str:
-        """After the child died: say so; the next scan begins an empty map."""
+        """After the child died; the next scan begins an empty map. Returns the message."""
         status = self._worker.close() if self._worker is not None else 0
         self._worker, self._last, self._registered = None, None, 0
         message = f"KISS-ICP's process ended (status {status}); it starts again with an empty map"

@@ -27,8 +27,8 @@ from odometry.network.candidates import Candidate, Described, Search
 _LEAST_EXPLAINED, _LEAST_INLIERS = 0.3, 60
 # Where neither the images nor the network constrain the motion its information still has an inverse.
 _LEAST_INFORMATION = 1e-6
-# What comes on top of the covariance by the residuals, radians and metres, and as a part of the way, by which rings of
-# points on the ground, which go along with the sensor, bias alignment. Chosen on the drive with an independent truth,
+# Added to the covariance by the residuals: radians and metres; and a part of the translation, by which rings of points
+# on the ground, which move with the sensor, bias alignment. Chosen on the drive with an independent truth,
 # KITTI odometry's 04: 74, 96 and 98 % of its errors lie within one, two and three standard deviations.
 _LEAST_SIGMA = np.array([np.deg2rad(0.02)] * 3 + [0.002] * 3)
 _HELD_BACK = 0.004

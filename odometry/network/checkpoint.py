@@ -61,10 +61,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
     weights, content = read_tensor_file(path, WEIGHTS)
     try:
         checkpoint = Checkpoint(*read_description(content), weights, content.get("about") or {})
-        network_of(checkpoint)
+        expected = network_of(checkpoint).state_dict()
         for name, value in weights.items():
-            if not bool(value.isfinite().all()):
-                raise ValueError(f"{name} is not finite")
+            if value.dtype != expected[name].dtype or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} is {value.dtype}, or not finite")
     except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: does not fit this program ({reason}); use other weights") from error

@@ -54,7 +54,9 @@ def read_tensor_file(path: Path, kind: Kind) -> tuple[dict[str, Tensor], dict[st
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected {kind.name} that {_PROGRAM} wrote") from None
     except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path}: is not {kind.name} that {_PROGRAM} wrote, or damaged ({error})") from error
+        raise InputError(
+            f"{path}: is no safetensors file; expected {kind.name} that {_PROGRAM} wrote, it may be damaged ({error})"
+        ) from error
     if header.get("program") != _PROGRAM or header.get("kind") != kind.name:
         found = header.get("kind") if header.get("program") == _PROGRAM else "tensors of another program"
         raise InputError(f"{path}: holds {found}, not {kind.name} that {_PROGRAM} wrote; name another file")

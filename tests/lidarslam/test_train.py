@@ -269,7 +269,7 @@ def test_other_recordings_or_files_are_not_gone_on_with(room_folder: Path, tmp_p
     with pytest.raises(ConfigError, match="not those that this training was begun with"):
         execute(request(room_folder, out, ready, "reader.rate_hz=5", resume=True), Console())
     (out / "state.safetensors").write_bytes(pickle.dumps({"a": 1}))
-    with pytest.raises(InputError, match="is not the state of a training"):
+    with pytest.raises(InputError, match="is no safetensors file"):
         execute(request(room_folder, out, ready, resume=True), Console())
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "weights.safetensors").write_text("mine")
