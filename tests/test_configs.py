@@ -1,8 +1,12 @@
 """The configuration: closed, typed, and clear about what is wrong."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
 from lidarslam.core.errors import ConfigError
@@ -51,7 +55,10 @@ def test_the_readers_options_stay_text(text: str) -> None:
     [
         (["odometry.kiss_icp.voxelsize=1"], r"no odometry\.kiss_icp\.voxelsize; did you mean voxel_size_m\?"),
         (["odometry.colour=1"], r"no odometry\.colour; there are: method"),
-        (["global_map.voxel_size_m=-1"], r"global_map\.voxel_size_m=-1: input should be greater than 0"),
+        (
+            ["global_map.voxel_size_m=-1"],
+            r"global_map\.voxel_size_m=-1: input should be greater than or equal",
+        ),
         (["odometry.method=loam"], r"odometry\.method='loam': input should be 'learned'"),
         (["global_map"], r"expected key\.path=value"),
         (["global_map.voxel_size_m=2", "global_map.voxel_size_m.x=1"], "voxel_size_m is a value, not a section"),
@@ -137,3 +144,21 @@ def test_the_printed_configuration_has_a_comment_for_every_setting_and_loads_aga
     assert load_config(file) == Config()
     printed = file.read_text()
     assert "\n# Saving for --resume\ncheckpoints:\n  interval_s: 10.0   # least time between" in printed
+
+
+def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    for name, field in model.model_fields.items():
+        section = next((one for one in (field.annotation, *get_args(field.annotation)) if is_model(one)), None)
+        if section is None:
+            yield f"{prefix}{name}", field
+        else:
+            yield from leaves(section, f"{prefix}{name}.")
+
+
+def is_model(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def test_there_are_few_settings_and_each_is_described() -> None:
+    assert len(list(leaves(Config))) <= 50
+    assert [name for name, field in leaves(Config) if not field.description] == []

@@ -405,4 +405,4 @@ def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
     env = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
     ended = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert ended.stderr == "lidarslam: the folder you stand in is gone; change to another\n"
+    assert ended.stderr == "lidarslam: the current folder was removed; change to another\n"
