@@ -1,4 +1,4 @@
-"""`lidarslam evaluate`: how good a trajectory and its map are."""
+"""`lidarslam evaluate`: errors of a trajectory and its map."""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from lidarslam.commands.terminal import say
     metavar="TRAJ",
     help="TUM or KITTI file, run directory, or recording with ground truth.  [default: what came with the source]",
 )
-@click.option("--no-reference", is_flag=True, help="Do without; of the map, tell its entropy only.")
+@click.option("--no-reference", is_flag=True, help="Without any reference: the entropy of the map only.")
 @click.option(
     "--alignment",
     type=click.Choice(["se3", "first_pose", "none"]),
@@ -77,7 +77,7 @@ from lidarslam.commands.terminal import say
 )
 @click.option("--out", type=PATH, metavar="FILE", help="Write the figures there.  [default: metrics.json of the run]")
 def evaluate(run: Path, **options: Any) -> None:
-    """Say how good a trajectory and its map are.
+    """Errors of a trajectory and its map.
 
     RUN is a run directory, or a trajectory in TUM or KITTI text.
     """

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 from plotly.io.json import to_json_plotly
 
-from evaluation.report.plain_text import printable
+from evaluation.comparison.table import printable
 from lidarslam.core.geometry import FloatArray
 
 # After Okabe and Ito (blue, vermilion, green, purple), then four more; contrast of 3 or more on white and on dark.
@@ -72,7 +72,7 @@ class Panel:
     Attributes:
         title: quantity and unit.
         traces: plotly's.
-        layout: what differs from the page's.
+        layout: differences from the page's layout.
         height: in pixels; the width is the page's.
         log: whether the vertical axis starts logarithmic; None where it cannot be.
     """
@@ -98,7 +98,7 @@ class Figure:
 
     Attributes:
         title: a few words, the beginning of the caption.
-        caption: what is shown, in which units and frames.
+        caption: content, units and frames.
         panels: of the same methods.
         methods: entries of the legend.
         reference: name of the reference in the legend; empty where it is not drawn.
