@@ -8,8 +8,8 @@ import numpy as np
 from evaluation.map.metrics import MapComparison
 from evaluation.report.error_colours import error_colours
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import replacing
 from lidarslam.core.geometry import FloatArray
-from lidarslam.run.directory import RunDirectory
 from lidarslam.simulation.writers.ply import write_ply
 
 _SUFFIXES = (".ply", ".rrd")
@@ -42,9 +42,9 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, c
     Raises:
         OutputError: it cannot be written.
     """
-    with RunDirectory(path.parent).replacing(path.name) as partial:
+    with replacing(path) as partial:
         if path.suffix.lower() == ".rrd":
-            from lidarslam.viewer.rerun_viewer import save_errors
+            from lidarslam.viewer.rerun_runs import save_errors
 
             save_errors(partial, comparison, positions, clip_m)
             return

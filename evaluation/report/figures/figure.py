@@ -128,10 +128,10 @@ def plot_text(text: str) -> str:
 
 
 def line_trace(name: str, style: Style, x: ArrayLike, y: ArrayLike, **more: Any) -> Any:
-    """A method's curve, or markers; NaN interrupts it."""
+    """A method's curve or markers; NaN interrupts it, a list holds categories."""
     given = {"mode": "lines", "line": style.line, "legendgroup": style.key, **more}
-    y = y if isinstance(y, list) else np.asarray(y, np.float32)
-    return go.Scatter(x=np.asarray(x, np.float32), y=y, name=plot_text(name), **given)
+    x, y = (values if isinstance(values, list) else np.asarray(values, np.float32) for values in (x, y))
+    return go.Scatter(x=x, y=y, name=plot_text(name), **given)
 
 
 def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles, **more: Any) -> Panel:
