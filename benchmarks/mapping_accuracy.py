@@ -31,9 +31,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation

@@ -42,8 +42,9 @@ from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.recording.recorder import Simulation
@@ -162,11 +163,11 @@ def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:
         results = list(pipeline.run(case.recorded.scans))
     finally:
         odometry.close()
-    if pipeline.global_map is None:
+    if pipeline.map.global_map is None:
         return results, np.empty((0, 3))
-    points = pipeline.global_map.points()
-    views = pipeline.views.placed(np.array([result.T_world_lidar for result in results]))
-    return results, points[~seen_through(points, views, pipeline.global_map.voxel_size_m)]
+    points = pipeline.map.global_map.points()
+    views = pipeline.map.views.placed(np.array([result.T_world_lidar for result in results]))
+    return results, points[~seen_through(points, views, pipeline.map.global_map.voxel_size_m)]
 
 
 def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) -> list[str]:

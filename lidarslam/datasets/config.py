@@ -1,4 +1,4 @@
-"""How a recording is to be read, where the reader cannot or should not decide by itself."""
+"""Settings of the readers."""
 
 from typing import Literal
 
@@ -9,22 +9,17 @@ TimeReference = Literal["auto", "relative", "absolute", "none"]
 
 
 class ReaderConfig(BaseModel):
-    """Options of the readers; every reader takes the ones that concern it and leaves the others alone."""
+    """Settings of the readers; every reader takes the ones that concern it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    name: str | None = Field(None, description="reader to use; null: the one that recognises the source")
+    name: str | None = Field(None, description="name of the reader; null: the one that recognises the source")
     topic: str | None = Field(None, description="point cloud topic of a bag; null: the only one there is")
-    frame_id: str | None = Field(
-        None, description="sensor of a bag's topic, where several send to it; null: the one of the first scans"
-    )
+    frame_id: str | None = Field(None, description="sensor's frame in a bag's topic; null: that of the first scans")
     sequence: str | None = Field(None, description="sequence of a KITTI odometry root, such as 04")
     rate_hz: float = Field(10.0, gt=0.0, description="scans a second, for recordings without stamps")
     time_field: str | None = Field(None, description="point field with the per-point time; null: found by its name")
     time_unit: TimeUnit = Field("auto", description="unit of the per-point time; auto: inferred from the values")
     time_reference: TimeReference = Field(
-        "auto", description="per-point time counts from the scan's stamp (relative) or is a clock reading (absolute)"
-    )
-    kitti_elevation_correction_deg: float = Field(
-        0.205, description="rotates every point of a KITTI scan upwards, before every method alike; 0 switches it off"
+        "auto", description="per-point time: relative to the scan's stamp, an absolute clock reading, or none"
     )

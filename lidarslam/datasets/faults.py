@@ -1,5 +1,6 @@
-"""What is wrong with the scans of a recording, counted while they are read."""
+"""Faults of a recording's scans, counted while they are read."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,44 +16,38 @@ _UNREADABLE = "scans were left out: they could not be read"
 
 
 @dataclass
-class _Kind:
-    """How often something was met, and how it was when it was met first."""
-
-    first: str
-    count: int = 0
-
-
-@dataclass
 class Faults:
     """The faults of one pass through a recording, counted by kind; of each kind the first is remembered.
 
     Attributes:
-        left_out: how many scans were left out.
+        left_out: number of scans that were left out.
     """
 
     left_out: int = 0
-    _kinds: dict[str, _Kind] = field(default_factory=dict)
+    _counts: Counter[str] = field(default_factory=Counter)
+    _first: dict[str, str] = field(default_factory=dict)
 
     def leave_out(self, kind: str, example: str, count: int = 1) -> None:
-        """So many scans less; the kind completes a sentence that begins with how many there are."""
+        """Count scans that are left out; the kind completes a sentence that begins with their number."""
         self.left_out += count
         self.note(kind, example, count)
 
     def unreadable(self, error: InputError) -> None:
-        """One scan less, because it cannot be read."""
+        """Count one scan that is left out because it cannot be read."""
         self.leave_out(_UNREADABLE, str(error))
 
     def note(self, kind: str, example: str, count: int = 1) -> None:
-        """So many scans that are taken in spite of something."""
-        self._kinds.setdefault(kind, _Kind(example)).count += count
+        """Count scans that are used in spite of a fault."""
+        self._counts[kind] += count
+        self._first.setdefault(kind, example)
 
     def warnings(self) -> tuple[str, ...]:
         """A line for each kind, with its count, in the order they were met."""
-        return tuple(f"{kind.count} {name}; the first: {kind.first}" for name, kind in self._kinds.items())
+        return tuple(f"{count} {kind}; the first: {self._first[kind]}" for kind, count in self._counts.items())
 
 
 def readable_scans(items: Iterable[T], read: Callable[[T], Scan], faults: Faults | None) -> Iterator[Scan]:
-    """The scans read of these items; one that cannot be read is counted and left out, or raised where nobody counts.
+    """The scans of these items; an unreadable one is counted and left out, or raised where `faults` is None.
 
     Raises:
         InputError: a scan cannot be read and `faults` is None.
@@ -69,7 +64,7 @@ def readable_scans(items: Iterable[T], read: Callable[[T], Scan], faults: Faults
 
 
 def first_readable(source: Path, items: Iterable[T], read: Callable[[T], Scan]) -> tuple[T, Scan, Faults]:
-    """The first item that a scan can be read of, that scan, and what is wrong with those before it.
+    """The first item with a readable scan, that scan, and the faults of those before it.
 
     Raises:
         InputError: none can be read; the first one's error.

@@ -1,7 +1,7 @@
-"""What the readers hand out: a sequence of scans that can also describe itself."""
+"""A recording on disk: a sequence of scans with a description; the interface of the readers."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -9,24 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.faults import Faults
-
-
-@dataclass(frozen=True)
-class PointTime:
-    """What was inferred about the time of single points.
-
-    Attributes:
-        source: where the time comes from: the name of the point field, or words such as "azimuth".
-        unit: "s", "ms", "us" or "ns".
-        reference: "relative" (to the scan's stamp) or "absolute" (a clock reading).
-        first_s, last_s: smallest and largest offset from the stamp in the scan that was looked at, seconds.
-    """
-
-    source: str
-    unit: str
-    reference: str
-    first_s: float
-    last_s: float
+from lidarslam.datasets.point_time import PointTimeModel
 
 
 @dataclass(frozen=True)
@@ -55,39 +38,47 @@ class PointField:
     type_name: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordingInfo:
     """What `lidarslam info` prints.
 
     Attributes:
         reader: name of the reader in the registry.
         scans: number of scans.
-        first_stamp, duration_s: seconds; the duration is from the first stamp to the last.
-        rate_hz: scans a second, None for fewer than two scans.
-        points_per_scan: valid points in the first scan.
-        dropped_points: invalid points left out of the first scan.
-        has_rings: whether points carry the number of their laser.
+        first: the first scan that can be read.
+        last_stamp: stamp of the last scan, seconds.
         ground_truth: where the true trajectory was found, if it was.
-        point_time: None when the recording has no per-point time.
+        point_time: what was inferred about the time of single points; None without.
         topics: of a bag, all of them; `topic` is the one that is read.
-        fields: as stored in the file or the message.
-        notes: whatever else the user should know, one sentence each.
+        fields: of the points as stored.
+        notes: further facts for the user, one sentence each.
     """
 
     reader: str
     scans: int
-    first_stamp: float
-    duration_s: float
-    rate_hz: float | None
-    points_per_scan: int
-    dropped_points: int
-    has_rings: bool
+    first: Scan
+    last_stamp: float
     ground_truth: Path | None
-    point_time: PointTime | None
+    point_time: PointTimeModel | None
     topic: str | None = None
     topics: tuple[Topic, ...] = ()
     fields: tuple[PointField, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+
+    @property
+    def first_stamp(self) -> float:
+        """Stamp of the first scan that can be read, seconds."""
+        return self.first.stamp
+
+    @property
+    def duration_s(self) -> float:
+        """From the first stamp to the last, seconds."""
+        return max(0.0, self.last_stamp - self.first.stamp)
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean scans a second; None where the duration is zero."""
+        return (self.scans - 1) / self.duration_s if self.duration_s > 0.0 else None
 
 
 class Recording(ScanSequence, Protocol):
@@ -99,7 +90,7 @@ class Recording(ScanSequence, Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with the recording as a whole, and what was mended; one sentence each, with counts."""
+        """Faults of the recording as a whole, and repairs; one sentence each, with counts."""
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -113,4 +104,8 @@ class Recording(ScanSequence, Protocol):
         """
 
     def describe(self) -> RecordingInfo:
-        """Look at the recording, its first scan included, and say what it holds."""
+        """The contents of the recording, by its first scan too.
+
+        Raises:
+            InputError: no scan can be read, or a file that belongs to the recording is damaged.
+        """

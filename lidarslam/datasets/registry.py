@@ -1,10 +1,9 @@
-"""Which readers there are, and which one reads a given source; a reader's module is imported when it is used."""
+"""The readers and the choice among them; a reader's module is imported on use."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
@@ -15,27 +14,18 @@ _BAG_SUFFIXES = (".db3", ".mcap")
 SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 
 
-@dataclass(frozen=True)
-class Reader:
+class Reader(NamedTuple):
     """One row of the table.
 
     Attributes:
         module: has `open_recording(source: Path, config: ReaderConfig) -> Recording`.
         reads: the layout, in words.
-        recognises: a look at names only, no file is opened.
+        recognises: whether names alone fit; no file is opened.
     """
 
     module: str
     reads: str
     recognises: Callable[[Path], bool]
-
-
-def _is_kitti_odometry(source: Path) -> bool:
-    return (source / "sequences").is_dir() or (source / "velodyne").is_dir()
-
-
-def _is_kitti_raw(source: Path) -> bool:
-    return (source / "velodyne_points" / "data").is_dir()
 
 
 def _is_rosbag(source: Path) -> bool:
@@ -50,22 +40,22 @@ def _bag_of_folder(folder: Path) -> Path:
     return folder / f"{folder.resolve().name}.bag"
 
 
-def _is_scan_folder(source: Path) -> bool:
-    return source.is_dir() and any(entry.suffix.lower() in SCAN_SUFFIXES for entry in source.iterdir())
-
-
 READERS: dict[str, Reader] = {
     "kitti-odometry": Reader(
         "lidarslam.datasets.kitti.odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
-        _is_kitti_odometry,
+        lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
     ),
     "kitti-raw": Reader(
-        "lidarslam.datasets.kitti.raw", "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder", _is_kitti_raw
+        "lidarslam.datasets.kitti.raw",
+        "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
+        lambda source: (source / "velodyne_points" / "data").is_dir(),
     ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "scan-folder": Reader(
-        "lidarslam.datasets.folders.scan_folder", "a folder of .bin, .pcd, .ply or .npy scans", _is_scan_folder
+        "lidarslam.datasets.folders.scan_folder",
+        "a folder of .bin, .pcd, .ply or .npy scans",
+        lambda source: source.is_dir() and any(entry.suffix.lower() in SCAN_SUFFIXES for entry in source.iterdir()),
     ),
 }
 

@@ -317,6 +317,6 @@ def test_pickled_objects_are_never_unpickled(tmp_path):
             return (Path(tmp_path / "sprung").touch, ())
 
     np.save(tmp_path / "0.npy", np.array([Trap()], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="it holds pickled objects, which could run any program"):
+    with pytest.raises(InputError, match="allow_pickle=False"):
         next(open_recording(tmp_path).scans())
     assert not (tmp_path / "sprung").exists()

@@ -9,12 +9,18 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.trajectory_io import format_kitti
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.registry import choose_reader, open_recording
 
-UNCORRECTED = ReaderConfig(kitti_elevation_correction_deg=0.0)
 # The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.
 AXES = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 T_CAM_LIDAR = AXES @ exp([0.01, -0.02, 0.015, 0.1, -0.05, -0.3])
+
+
+@pytest.fixture
+def uncorrected(monkeypatch):
+    """Scans as they lie on disk."""
+    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
 
 
 def _truth(count: int) -> np.ndarray:
@@ -41,10 +47,10 @@ def _write_sequence(
     return clouds
 
 
-def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng):
+def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng, uncorrected):
     clouds = _write_sequence(tmp_path, rng)
     assert choose_reader(tmp_path) == "kitti-odometry"
-    recording = open_recording(tmp_path, UNCORRECTED)
+    recording = open_recording(tmp_path)
     scans = list(recording.scans())
     assert recording.name == "kitti_04"
     assert len(recording) == len(scans) == 6
@@ -58,28 +64,28 @@ def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng):
     assert recording.ground_truth is recording.ground_truth
 
 
-def test_a_single_sequence_folder_reads_the_same(tmp_path, rng, monkeypatch):
+def test_a_single_sequence_folder_reads_the_same(tmp_path, rng, monkeypatch, uncorrected):
     clouds = _write_sequence(tmp_path, rng)
     monkeypatch.chdir(tmp_path / "sequences" / "04")
     for source in (tmp_path / "sequences" / "04", Path()):
-        recording = open_recording(source, UNCORRECTED)
+        recording = open_recording(source)
         np.testing.assert_array_equal(next(recording.scans(2)).points, clouds[2][:, :3])
         np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
         assert recording.name == "kitti_04"
 
 
-def test_poses_beside_the_scans_are_found(tmp_path, rng):
+def test_poses_beside_the_scans_are_found(tmp_path, rng, uncorrected):
     _write_sequence(tmp_path, rng)
     folder = tmp_path / "sequences" / "04"
     (tmp_path / "poses" / "04.txt").rename(folder / "poses.txt")
-    recording = open_recording(folder, UNCORRECTED)
+    recording = open_recording(folder)
     np.testing.assert_allclose(recording.ground_truth.T_world_lidar, _truth(6), atol=1e-8)
     assert recording.describe().ground_truth.name == "poses.txt"
 
 
-def test_gaps_in_the_numbers_keep_stamps_and_truth_in_step(tmp_path, rng):
+def test_gaps_in_the_numbers_keep_stamps_and_truth_in_step(tmp_path, rng, uncorrected):
     clouds = _write_sequence(tmp_path, rng, numbers=(1, 2, 4), rows=9, poses=7)
-    recording = open_recording(tmp_path, UNCORRECTED)
+    recording = open_recording(tmp_path)
     scans = list(recording.scans())
     np.testing.assert_allclose([scan.stamp for scan in scans], [0.1037, 0.2074, 0.4148], atol=1e-6)
     np.testing.assert_array_equal(scans[2].points, clouds[2][:, :3])
@@ -93,13 +99,15 @@ def test_more_poses_than_stamps_are_cut_off(tmp_path, rng):
     assert len(open_recording(tmp_path).ground_truth) == 6
 
 
-def test_the_correction_is_applied_unless_switched_off(tmp_path, rng):
+def test_the_correction_raises_every_point(tmp_path, rng, monkeypatch):
     _write_sequence(tmp_path, rng)
-    raised, plain = (next(open_recording(tmp_path, c).scans()).points for c in (ReaderConfig(), UNCORRECTED))
+    recording = open_recording(tmp_path)
+    raised = next(recording.scans()).points
+    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
+    plain = next(recording.scans()).points
     elevation = [np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) for p in (plain, raised)]
     np.testing.assert_allclose(np.rad2deg(elevation[1] - elevation[0]), 0.205, atol=1e-9)
-    assert any("0.205" in note for note in open_recording(tmp_path).describe().notes)
-    assert not any("elevation" in note for note in open_recording(tmp_path, UNCORRECTED).describe().notes)
+    assert any("0.205" in note for note in recording.describe().notes)
 
 
 def test_scans_follow_range(tmp_path, rng):
@@ -162,7 +170,7 @@ def test_describe(tmp_path, rng):
     cloud[5, 1] = np.nan
     cloud.tofile(scan)
     info = open_recording(tmp_path).describe()
-    assert (info.reader, info.scans, info.points_per_scan, info.dropped_points) == ("kitti-odometry", 6, 48, 2)
+    assert (info.reader, info.scans, len(info.first), info.first.dropped) == ("kitti-odometry", 6, 48, 2)
     assert info.duration_s == pytest.approx(5 * 0.1037, abs=1e-6)
     assert info.rate_hz == pytest.approx(1 / 0.1037, rel=1e-4)
     assert info.ground_truth == tmp_path / "poses" / "04.txt"
@@ -215,7 +223,7 @@ def test_sequence_04(real_data):
     info = recording.describe()
     assert info.reader == "kitti-odometry"
     assert info.scans == 51
-    assert 110_000 < info.points_per_scan < 130_000
+    assert 110_000 < len(info.first) < 130_000
     truth = recording.ground_truth
     assert len(truth) == 271
     assert is_rigid(truth.T_world_lidar, tolerance=1e-9)

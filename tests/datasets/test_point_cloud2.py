@@ -5,7 +5,8 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.point_time import PointTimeModel, infer_point_time
+from lidarslam.datasets.point_time import PointTimeModel
+from lidarslam.datasets.point_time_inference import infer_point_time
 from lidarslam.datasets.recording import PointField
 from lidarslam.datasets.ros.livox import decode_custom_message
 from lidarslam.datasets.ros.point_cloud2 import decode_point_cloud2

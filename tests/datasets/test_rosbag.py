@@ -16,7 +16,8 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.info_text import describe_source
-from lidarslam.datasets.recording import PointField, PointTime, Topic
+from lidarslam.datasets.point_time import PointTimeModel
+from lidarslam.datasets.recording import PointField, Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.truth_files import find_truth_file
@@ -88,7 +89,7 @@ def test_livox_custom_message(bag_kit, rng, package, clock_ns):
         base_s = float(Fraction(stamp_ns + clock_ns, 10**9) - Fraction(scan.stamp)) if abs(clock_ns) < 10**9 else 0.0
         np.testing.assert_allclose(scan.time_offsets, base_s + offset_ns / 1e9, rtol=0.0, atol=1e-9)
     info = recording.describe()
-    assert info.point_time.source == "offset_time"
+    assert info.point_time.field == "offset_time"
     assert info.point_time.unit == "ns"
     assert any("another clock" in note for note in info.notes) == (abs(clock_ns) > 10**9)
 
@@ -203,12 +204,11 @@ def test_description(drive):
     assert info.first_stamp == STAMP_NS / 10**9
     assert info.duration_s == pytest.approx(0.5, abs=1e-6)
     assert info.rate_hz == pytest.approx(10.0, abs=1e-4)
-    assert info.points_per_scan == np.count_nonzero(sweeps[0].returns)
-    assert info.dropped_points == np.count_nonzero(~sweeps[0].returns)
-    assert info.has_rings
+    assert len(info.first) == np.count_nonzero(sweeps[0].returns)
+    assert info.first.dropped == np.count_nonzero(~sweeps[0].returns)
+    assert info.first.rings is not None
     assert info.ground_truth is None
-    returned = sweeps[0].offsets[sweeps[0].returns]
-    assert info.point_time == PointTime("time", "s", "relative", returned.min(), returned.max())
+    assert info.point_time == PointTimeModel("time", "s", "relative")
     assert info.topic == "/points"
     assert info.topics == (
         Topic("/imu", "sensor_msgs/msg/Imu", 0),

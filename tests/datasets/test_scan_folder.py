@@ -11,7 +11,6 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.folders.lzf import decompress_lzf
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.registry import choose_reader, open_recording
@@ -123,7 +122,9 @@ def test_pcd_with_padding_and_vector_fields(tmp_path, rng):
     table["x"], table["normal"] = np.arange(5) + 1.0, rng.uniform(size=(5, 3))
     for data in ("binary", "binary_compressed"):
         (tmp_path / "a.pcd").write_bytes(_pcd_bytes(table, data))
-        np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["normal"], table["normal"])
+        read = read_pcd(tmp_path / "a.pcd")
+        assert read.dtype.names == ("x", "y", "z")
+        np.testing.assert_array_equal(read["x"], table["x"])
     twice = _pcd_bytes(table, "binary").replace(b"FIELDS x y z _ normal", b"FIELDS x y z _ _")
     (tmp_path / "a.pcd").write_bytes(twice)
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["x"], table["x"])
@@ -156,18 +157,6 @@ def test_open3d_agrees_on_pcd(tmp_path, rng):
             np.testing.assert_array_equal(read[name], table[name])
 
 
-def test_lzf_copies():
-    assert decompress_lzf(bytes([2]) + b"abc" + bytes([0b001_00000, 2]), 6) == b"abcabc"
-    # Seven in the upper bits: a further byte adds to the length; the copy overlaps what it writes.
-    assert decompress_lzf(bytes([1]) + b"xy" + bytes([0b111_00000, 4, 1]), 15) == b"xyxyxyxyxyxyxyx"
-    far = bytes(range(32)) * 10
-    stream = _lzf_literals(far) + bytes([0b001_00001, 319 - 256])
-    assert decompress_lzf(stream, 323) == far + far[:3]
-    for stream in (bytes([0b001_00000, 0]), bytes([1]) + b"xy" + bytes([0b111_00000]), bytes([5]) + b"ab"):
-        with pytest.raises(ValueError):
-            decompress_lzf(stream, 6)
-
-
 @pytest.mark.parametrize("suffix", ["bin", "pcd", "ply", "npy"])
 def test_reads_every_format_with_times_and_rings(tmp_path, rng, suffix):
     folder = tmp_path / "scans"
@@ -188,13 +177,13 @@ def test_reads_every_format_with_times_and_rings(tmp_path, rng, suffix):
             np.testing.assert_allclose(scan.time_offsets, table["t"] * 1e-9, atol=1e-12)
             np.testing.assert_array_equal(scan.rings, table["ring"])
     info = recording.describe()
-    assert (info.reader, info.scans, info.points_per_scan) == ("scan-folder", 3, 150)
+    assert (info.reader, info.scans, len(info.first)) == ("scan-folder", 3, 150)
     assert info.rate_hz == pytest.approx(10.0)
     if suffix != "bin":
-        assert (info.point_time.source, info.point_time.unit, info.point_time.reference) == ("t", "ns", "relative")
-        assert info.point_time.last_s == pytest.approx(0.099)
+        assert (info.point_time.field, info.point_time.unit, info.point_time.reference) == ("t", "ns", "relative")
+        assert info.first.time_offsets.max() == pytest.approx(0.099)
         assert [(f.name, f.type_name) for f in info.fields][4:6] == [("t", "uint32"), ("ring", "uint16")]
-        assert info.has_rings
+        assert info.first.rings is not None
 
 
 def test_invalid_points_go_with_their_times_and_rings(tmp_path, rng):
@@ -398,7 +387,7 @@ def test_bin_with_other_numbers_of_columns(tmp_path, rng):
         open_recording(tmp_path / "six")
     five[0, 4] = 0.5
     five[:31].tofile(tmp_path / "five" / "0.bin")
-    with pytest.raises(InputError, match="is no ring"):
+    with pytest.raises(InputError, match="20 bytes with a ring"):
         open_recording(tmp_path / "five")
 
 
@@ -441,7 +430,7 @@ def test_damaged_files_are_named(tmp_path, rng, name, how):
     (tmp_path / name).write_bytes(data)
     assert len(next(open_recording(tmp_path).scans())) == 200
     (tmp_path / name).write_bytes(_damage(data, how))
-    with pytest.raises(InputError, match=rf"{kind}\.{suffix}: .*expected|{kind}\.{suffix}: .*invalid"):
+    with pytest.raises(InputError, match=rf"{kind}\.{suffix}: .*(expected|invalid|truncated or damaged)"):
         next(open_recording(tmp_path).scans())
 
 
@@ -481,5 +470,9 @@ def test_scans_follow_range_and_a_file_is_no_folder(tmp_path, rng):
 def test_a_real_folder_of_bin(real_data):
     recording = open_recording(real_data / "kitti_raw_stop/2011_09_26/2011_09_26_drive_stop_sync/velodyne_points/data")
     info = recording.describe()
-    assert (info.scans, info.has_rings, [field.name for field in info.fields][-1]) == (78, False, "intensity")
-    assert 100_000 < info.points_per_scan < 130_000
+    assert (info.scans, info.first.rings is not None, [field.name for field in info.fields][-1]) == (
+        78,
+        False,
+        "intensity",
+    )
+    assert 100_000 < len(info.first) < 130_000

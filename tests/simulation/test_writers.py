@@ -10,7 +10,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.recording.recorder import SimulatedScan
@@ -65,7 +65,7 @@ def test_every_driver_in_every_kind_of_bag(name, driver, tmp_path, sweeps, drive
     info = recording.describe()
     assert info.topic == DRIVERS[driver].topic
     assert info.point_time.reference == ("absolute" if driver in ("hesai", "livox") else "relative")
-    assert not info.dropped_points
+    assert not info.first.dropped
     assert not info.notes
 
 
@@ -207,10 +207,10 @@ def test_compensation_moves_each_point_by_the_motion_since_the_stamp(sweeps, rig
     assert compensate(still, rig) is still.points
 
 
-def test_kitti_scans_lie_too_low_like_kittis_own(tmp_path, sweeps, rig):
+def test_kitti_scans_lie_too_low_like_kittis_own(tmp_path, sweeps, rig, monkeypatch):
     write("kitti", tmp_path / "drive", sweeps, rig)
-    config = ReaderConfig(kitti_elevation_correction_deg=0.0)
-    points = next(open_recording(tmp_path / "drive", config).scans()).points
+    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
+    points = next(open_recording(tmp_path / "drive").scans()).points
     true_points = compensate(sweeps[0].scan, rig)
     raised_deg = np.rad2deg(elevation(true_points) - elevation(points))
     np.testing.assert_allclose(raised_deg, 0.205, atol=1e-3)

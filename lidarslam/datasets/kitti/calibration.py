@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
 
 
 def read_calibration(path: Path) -> dict[str, FloatArray]:
-    """The arrays of a calibration file by name; lines that hold no numbers, such as the date, are left out.
+    """The arrays of a calibration file by name; lines without numbers, such as the date, are left out.
 
     Raises:
         InputError: the file cannot be read.
@@ -37,14 +37,14 @@ def _entry(path: Path, arrays: dict[str, FloatArray], name: str, count: int) -> 
 
 
 def _rigid(path: Path, R: FloatArray, t: FloatArray) -> FloatArray:
-    # The files round to seven digits or fewer; what is farther from a rotation than that is no rotation.
+    """The transform (4, 4), re-orthonormalised: the files round to seven digits or fewer."""
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0.0:
         raise InputError(f"{path}: holds a rotation matrix that is none; expected orthonormal rows, right-handed")
     return orthonormalize(make_transform(R, t))
 
 
 def read_tr(path: Path) -> FloatArray:
-    """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr`, re-orthonormalised.
+    """T_cam_lidar (4, 4) of the odometry benchmark's calib.txt, its line `Tr` or `Tr_velo_to_cam`.
 
     Raises:
         InputError: the file cannot be read or has no such line.
@@ -55,23 +55,13 @@ def read_tr(path: Path) -> FloatArray:
     return _rigid(path, rows[:, :3], rows[:, 3])
 
 
-def read_rotation_translation(path: Path) -> FloatArray:
-    """The transform (4, 4) of a raw calibration file with the lines `R` and `T`, re-orthonormalised.
-
-    calib_A_to_B.txt holds T_B_A.
+def read_raw_calibration(path: Path) -> FloatArray:
+    """The transform (4, 4) of a raw calibration file: T_B_A of calib_A_to_B.txt, T_rect_cam of calib_cam_to_cam.txt.
 
     Raises:
-        InputError: the file cannot be read or has no such lines.
+        InputError: the file cannot be read or lacks a line.
     """
     arrays = read_calibration(path)
+    if path.name == "calib_cam_to_cam.txt":
+        return _rigid(path, _entry(path, arrays, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
     return _rigid(path, _entry(path, arrays, "R", 9).reshape(3, 3), _entry(path, arrays, "T", 3))
-
-
-def read_rectification(path: Path) -> FloatArray:
-    """T_rect_cam (4, 4), the rectifying rotation R_rect_00 of calib_cam_to_cam.txt.
-
-    Raises:
-        InputError: the file cannot be read or has no such line.
-    """
-    R = _entry(path, read_calibration(path), "R_rect_00", 9).reshape(3, 3)
-    return _rigid(path, R, np.zeros(3))

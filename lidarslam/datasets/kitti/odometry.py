@@ -5,6 +5,7 @@ LiDAR's frame here, once, and nowhere else.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
@@ -17,12 +18,13 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults, first_readable, readable_scans
-from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, numbered_scans, read_bin, scan_indices
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.file_recording import FileRecording
+from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
-from lidarslam.datasets.kitti.correction import correct_elevation
-from lidarslam.datasets.recording import PointField, Recording, RecordingInfo
-from lidarslam.datasets.stamps import increasing_rows, read_stamps, scan_rate
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stamps import increasing_rows, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -54,13 +56,14 @@ def _find_sequence(source: Path, wanted: str | None) -> Path:
     raise InputError(f"{source}: has no sequence {wanted!r} with scans; there are: {available}")
 
 
-class KittiOdometryRecording:
-    """One sequence; implements `Recording`."""
+class KittiOdometryRecording(FileRecording):
+    """One sequence."""
+
+    reader = "kitti-odometry"
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
-        self._folder = folder
-        self._config = config
-        self._files, self._numbers = numbered_scans(folder / "velodyne")
+        files, self._numbers = numbered_scans(folder / "velodyne")
+        super().__init__(folder, config, files)
         self._times = self._read_times()
         last = int(self._numbers[-1])
         if self._times is not None and last >= len(self._times):
@@ -68,7 +71,7 @@ class KittiOdometryRecording:
                 f"{folder / 'times.txt'}: expected a stamp for every scan up to {self._files[-1].name},"
                 f" {last + 1} lines, got {len(self._times)}; complete it, or remove it to use the rate"
             )
-        self._stamps = self._stamps_of(self._numbers)
+        self.stamps = self._stamps_of(self._numbers)
 
     def _read_times(self) -> FloatArray | None:
         path = self._folder / "times.txt"
@@ -99,11 +102,7 @@ class KittiOdometryRecording:
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """T_world_lidar of every pose that has a stamp, those of absent scans included.
-
-        Raises:
-            InputError: the pose file is damaged.
-        """
+        """T_world_lidar of every pose that has a stamp, those of absent scans included."""
         path, T_cam_lidar = self._pose_file, self.T_cam_lidar
         if path is None or T_cam_lidar is None:
             return None
@@ -115,59 +114,21 @@ class KittiOdometryRecording:
         return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)
 
     @property
-    def _has_calibration(self) -> bool:
-        return (self._folder / "calib.txt").is_file()
-
-    @property
     def _pose_file(self) -> Path | None:
         folder = self._folder.resolve()
         candidates = (folder.parent.parent / "poses" / f"{folder.name}.txt", folder / "poses.txt")
         return next((path for path in candidates if path.is_file()), None)
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def scans(
-        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
-    ) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)`, without times: they are motion compensated.
-
-        Raises:
-            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
-        """
-        return readable_scans(scan_indices(len(self), start, stop, step), self._read, faults)
-
-    def _read(self, index: int) -> Scan:
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         points = read_bin(self._files[index])[:, :3]
-        angle_deg = self._config.kitti_elevation_correction_deg
-        return Scan.from_raw(correct_elevation(points, angle_deg) if angle_deg else points, self._stamps[index])
+        return Scan.from_raw(correction.correct_elevation(points, correction.ELEVATION_DEG), self.stamps[index])
 
-    def describe(self) -> RecordingInfo:
-        """What `lidarslam info` prints.
-
-        Raises:
-            InputError: no scan can be read.
-        """
-        _, first, unreadable = first_readable(self._folder, range(len(self)), self._read)
-        return RecordingInfo(
-            reader="kitti-odometry",
-            scans=len(self),
-            first_stamp=float(self._stamps[0]),
-            duration_s=float(self._stamps[-1] - self._stamps[0]),
-            rate_hz=scan_rate(self._stamps),
-            points_per_scan=len(first),
-            dropped_points=first.dropped,
-            has_rings=False,
-            ground_truth=self._pose_file if self._has_calibration else None,
-            point_time=None,
-            fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
-            notes=(*self._notes(), *self.warnings, *unreadable.warnings()),
-        )
+    def _truth_path(self) -> Path | None:
+        return self._pose_file if (self._folder / "calib.txt").is_file() else None
 
     def _notes(self) -> Iterator[str]:
         yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
-        if angle_deg := self._config.kitti_elevation_correction_deg:
-            yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
+        yield correction.NOTE
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -182,14 +143,9 @@ class KittiOdometryRecording:
             yield f"times.txt has {len(self._times)} lines for the scans up to number {last}."
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
-        if self._pose_file is not None and not self._has_calibration:
+        if self._pose_file is not None and self._truth_path() is None:
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
-        elif self._pose_file is not None and (poses := self._count_poses(self._pose_file)) not in (0, last + 1):
-            yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
-
-    def _count_poses(self, path: Path) -> int:
-        """Zero where the file is damaged, which the truth tells when it is asked for."""
-        try:
-            return len(read_kitti_poses(path))
-        except InputError:
-            return 0
+        elif self._pose_file is not None:
+            with suppress(InputError):  # damaged, an error of `ground_truth`
+                if (poses := len(read_kitti_poses(self._pose_file))) != last + 1:
+                    yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."

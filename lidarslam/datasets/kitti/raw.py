@@ -14,14 +14,16 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import Faults, first_readable, readable_scans
-from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, numbered_scans, read_bin, scan_indices
-from lidarslam.datasets.kitti.calibration import read_rectification, read_rotation_translation
-from lidarslam.datasets.kitti.correction import correct_elevation
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.file_recording import FileRecording
+from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.kitti import correction
+from lidarslam.datasets.kitti.calibration import read_raw_calibration
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
 from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth, read_sweep_timing
-from lidarslam.datasets.recording import PointField, PointTime, Recording, RecordingInfo
-from lidarslam.datasets.stamps import increasing_rows, read_stamps, scan_rate
+from lidarslam.datasets.point_time import PointTimeModel
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.stamps import increasing_rows, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -41,48 +43,39 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
     return KittiRawRecording(source.resolve(), config)
 
 
-class KittiRawRecording:
-    """One drive; implements `Recording`."""
+class KittiRawRecording(FileRecording):
+    """One drive."""
+
+    reader = "kitti-raw"
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
-        self._drive = drive
-        self._config = config
-        self._files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
+        files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
+        super().__init__(drive, config, files)
         self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config.rate_hz)
-
-    @property
-    def name(self) -> str:
-        """The drive's name."""
-        return self._drive.name
+        self.stamps = self._timing.stamps
 
     @cached_property
     def T_cam_lidar(self) -> FloatArray | None:
         """LiDAR to the rectified left grey camera, (4, 4); None without both camera calibration files."""
-        lidar_to_cam, rectification = (self._calibration(f"calib_{n}_to_cam.txt") for n in ("velo", "cam"))
-        if lidar_to_cam is None or rectification is None:
-            return None
-        return read_rectification(rectification) @ read_rotation_translation(lidar_to_cam)
+        T_cam_lidar, T_rect_cam = (self._calibration(f"calib_{name}_to_cam.txt") for name in ("velo", "cam"))
+        return None if T_cam_lidar is None or T_rect_cam is None else T_rect_cam @ T_cam_lidar
 
-    def _calibration(self, name: str) -> Path | None:
-        path = self._drive.parent / name
-        return path if path.is_file() else None
+    def _calibration(self, name: str) -> FloatArray | None:
+        path = self._folder.parent / name
+        return read_raw_calibration(path) if path.is_file() else None
 
     @cached_property
     def _oxts(self) -> OxtsPoses | None:
-        folder = self._drive / "oxts" / "data"
+        folder = self._folder / "oxts" / "data"
         return read_oxts(folder) if folder.is_dir() else None
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """T_world_lidar of the GPS/IMU unit; the world is the LiDAR's frame at the first of these poses.
-
-        Raises:
-            InputError: an OXTS, stamp or calibration file is damaged.
-        """
-        oxts, calibration = self._oxts, self._calibration("calib_imu_to_velo.txt")
-        if oxts is None or calibration is None:
+        """T_world_lidar of the GPS/IMU unit; the world is the LiDAR's frame at the first of these poses."""
+        oxts, T_lidar_imu = self._oxts, self._calibration("calib_imu_to_velo.txt")
+        if oxts is None or T_lidar_imu is None:
             return None
-        T_enu_lidar = oxts.T_enu_imu @ inverse(read_rotation_translation(calibration))
+        T_enu_lidar = oxts.T_enu_imu @ inverse(T_lidar_imu)
         stamps = self._oxts_stamps(oxts)
         kept = increasing_rows(stamps)
         if not kept.any():
@@ -101,66 +94,25 @@ class KittiRawRecording:
         """
         if not self._timing.from_clock:
             return oxts.numbers / self._config.rate_hz
-        path = self._drive / "oxts" / "timestamps.txt"
-        if path.is_file():
-            rows, table = oxts.numbers, read_stamps(path)
-        else:
-            # The scan with the row's number stands in.
-            rows = np.searchsorted(self._numbers, oxts.numbers)
-            scans = np.append(self._numbers, -1)
-            rows, table = np.where(scans[rows] == oxts.numbers, rows, len(self)), self._timing.stamps
-        return np.append(table, np.nan)[np.minimum(rows, len(table))]
+        path = self._folder / "oxts" / "timestamps.txt"
+        table = read_stamps(path) if path.is_file() else np.empty(0)
+        return np.append(table, np.nan)[np.minimum(oxts.numbers, len(table))]
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def scans(
-        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
-    ) -> Iterator[Scan]:
-        """The scans with the indices of `range(start, stop, step)`; per-point times come from the azimuth.
-
-        Raises:
-            InputError: the range makes no sense, or a scan file is damaged and `faults` is None.
-        """
-        return readable_scans(scan_indices(len(self), start, stop, step), self._read, faults)
-
-    def _read(self, index: int) -> Scan:
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         points = read_bin(self._files[index])[:, :3]
-        timing = self._timing
         offsets = None
         if self._config.time_reference != "none":
             # The elevation correction turns points in their vertical plane, so azimuths are the same before it.
-            offsets = offsets_from_azimuth(points, float(timing.before_s[index]), float(timing.after_s[index]))
-        angle_deg = self._config.kitti_elevation_correction_deg
-        corrected = correct_elevation(points, angle_deg) if angle_deg else points
-        return Scan.from_raw(corrected, timing.stamps[index], offsets)
+            before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
+            offsets = offsets_from_azimuth(points, float(before_s), float(after_s))
+        corrected = correction.correct_elevation(points, correction.ELEVATION_DEG)
+        return Scan.from_raw(corrected, self.stamps[index], offsets)
 
-    def describe(self) -> RecordingInfo:
-        """What `lidarslam info` prints.
+    def _truth_path(self) -> Path | None:
+        return None if self.ground_truth is None else self._folder / "oxts"
 
-        Raises:
-            InputError: no scan can be read, or an OXTS or calibration file is damaged.
-        """
-        _, first, unreadable = first_readable(self._drive, range(len(self)), self._read)
-        stamps = self._timing.stamps
-        point_time = None
-        if first.time_offsets is not None and len(first):
-            extent = float(first.time_offsets.min()), float(first.time_offsets.max())
-            point_time = PointTime("azimuth", "s", "relative", *extent)
-        return RecordingInfo(
-            reader="kitti-raw",
-            scans=len(self),
-            first_stamp=float(stamps[0]),
-            duration_s=float(stamps[-1] - stamps[0]),
-            rate_hz=scan_rate(stamps),
-            points_per_scan=len(first),
-            dropped_points=first.dropped,
-            has_rings=False,
-            ground_truth=None if self.ground_truth is None else self._drive / "oxts",
-            point_time=point_time,
-            fields=tuple(PointField(name, "float32") for name in KITTI_FIELDS),
-            notes=(*self._notes(), *unreadable.warnings()),
-        )
+    def _point_time_model(self) -> PointTimeModel | None:
+        return None if self._config.time_reference == "none" else PointTimeModel("azimuth", "s", "relative")
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -170,15 +122,16 @@ class KittiRawRecording:
         return (*self._timing.notes, *gaps)
 
     def _notes(self) -> Iterator[str]:
-        if angle_deg := self._config.kitti_elevation_correction_deg:
-            yield f"Every point is raised by {angle_deg:g} degrees of elevation, before every method alike."
-        yield from self.warnings
+        yield correction.NOTE
         if self._oxts is None:
             yield "There is no oxts folder, so there is no ground truth."
             return
         truth = self.ground_truth
         if truth is None:
-            yield "There is no calib_imu_to_velo.txt above the drive, so its oxts poses cannot be used as ground truth."
+            yield (
+                "There is no calib_imu_to_velo.txt above the drive or no oxts/timestamps.txt, so its oxts poses cannot"
+                " be used as ground truth."
+            )
             return
         if len(truth) < len(self._oxts.numbers):
             yield f"{len(self._oxts.numbers) - len(truth)} oxts rows without a stamp that increases were left out."

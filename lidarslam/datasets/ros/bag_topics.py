@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import SeveralTopicsError, Topic
-from lidarslam.datasets.ros.bag_file import CLOUD_TYPES
+from lidarslam.datasets.ros.bag_message import CLOUD_TYPES
 
 _PACKET_WORDS = ("packet", "velodynescan", "pandarscan", "rslidarscan")
 _TOPICS_LISTED = 20
@@ -32,9 +32,11 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
         raise SeveralTopicsError(message, clouds, topics)
     if not any(topic.messages for topic in topics):
         raise InputError(f"{source}: the bag is empty, expected messages of a point cloud topic; record it again")
+    packets = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
+    hint = " {} holds raw packets: play it through the sensor's driver and record the point clouds."
     raise InputError(
         f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages."
-        f"{_packets_hint(topics)} Its topics: {_listing(topics)}"
+        f"{hint.format(packets[0].name) if packets else ''} Its topics: {_listing(topics)}"
     )
 
 
@@ -43,10 +45,3 @@ def _listing(topics: Sequence[Topic]) -> str:
     if len(topics) > _TOPICS_LISTED:
         words.append(f"and {len(topics) - _TOPICS_LISTED} more")
     return ", ".join(words) or "none"
-
-
-def _packets_hint(topics: Sequence[Topic]) -> str:
-    packets = [topic for topic in topics if any(word in topic.message_type.lower() for word in _PACKET_WORDS)]
-    if not packets:
-        return ""
-    return f" {packets[0].name} holds raw packets: play it through the sensor's driver and record the point clouds."

@@ -1,7 +1,7 @@
 """Livox's own point cloud message, CustomMsg of livox_ros_driver, livox_ros_driver2 and livox_interfaces.
 
-Its points are records of fixed size, so they are read where they lie: unpacking 20 000 of them one by one would take
-longer than the odometry.
+Its points are records of fixed size and are read where they lie: decoding 20 000 of them one by one would take longer
+than the odometry.
 """
 
 import struct
@@ -23,16 +23,9 @@ TIME_FIELD = "offset_time"
 TIME_UNIT: TimeUnit = "ns"
 
 # livox_ros_driver2/msg/CustomPoint.msg, in its order; 19 bytes.
-_POINT = (
-    ("offset_time", "uint32"),
-    ("x", "float32"),
-    ("y", "float32"),
-    ("z", "float32"),
-    ("reflectivity", "uint8"),
-    ("tag", "uint8"),
-    ("line", "uint8"),
-)
-_FIELDS = tuple(PointField(name, type_name) for name, type_name in _POINT)
+_NAMES = ("offset_time", "x", "y", "z", "reflectivity", "tag", "line")
+_POINT = np.dtype({"names": _NAMES, "formats": ("u4", "f4", "f4", "f4", "u1", "u1", "u1")})
+_FIELDS = tuple(PointField(name, str(_POINT[name])) for name in _NAMES)
 _CDR_ALIGNED_POINT = 20
 ByteOrder = Literal["<", ">"]
 
@@ -70,7 +63,7 @@ def _decode_cdr(raw: bytes) -> DecodedCloud:
 
 
 def _points(raw: bytes, start: int, count: int, timebase: int, order: ByteOrder, packed: bool) -> DecodedCloud:
-    record = np.dtype([(name, np.dtype(type_name).newbyteorder(order)) for name, type_name in _POINT])
+    record = _POINT.newbyteorder(order)
     step = record.itemsize if packed else _CDR_ALIGNED_POINT
     # The last point of an aligned message may or may not be followed by its byte of padding.
     needed = (count - 1) * step + record.itemsize if count else 0

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
+from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointField as PointFieldMessage
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
@@ -14,27 +15,6 @@ from lidarslam.datasets.recording import PointField
 
 # sensor_msgs/PointField, constants INT8 to FLOAT64.
 _TYPES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32", 7: "float32", 8: "float64"}
-
-
-class PointFieldMessage(Protocol):
-    """sensor_msgs/PointField."""
-
-    name: str
-    offset: int
-    datatype: int
-    count: int
-
-
-class PointCloud2Message(Protocol):
-    """sensor_msgs/PointCloud2, of ROS 1 or ROS 2; `data` is one-dimensional and of bytes."""
-
-    height: int
-    width: int
-    fields: Sequence[PointFieldMessage]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +36,11 @@ class DecodedCloud:
     fields: tuple[PointField, ...]
 
 
-def decode_point_cloud2(message: PointCloud2Message, time_field: str | None = None) -> DecodedCloud:
-    """Copy coordinates, times and rings out of a message; other fields are not touched.
+def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> DecodedCloud:
+    """Copy coordinates, times and rings out of a message, organised or not, of either byte order, with any padding.
 
     Args:
-        message: organised or not, of either byte order, with any padding of points and rows.
+        message: of ROS 1 or ROS 2.
         time_field: field with the per-point time; None: found by its name.
 
     Raises:
@@ -91,7 +71,7 @@ def coordinates(cloud: NDArray[np.void]) -> FloatArray:
     return points.reshape(-1, 3)
 
 
-def _view(message: PointCloud2Message, wanted: Sequence[PointFieldMessage]) -> NDArray[np.void]:
+def _view(message: PointCloud2, wanted: Sequence[PointFieldMessage]) -> NDArray[np.void]:
     """The message's bytes as an array (height, width) of records with the wanted fields."""
     height, width, point_step = message.height, message.width, message.point_step
     row_step = max(message.row_step, width * point_step)  # some drivers leave it zero
@@ -101,23 +81,19 @@ def _view(message: PointCloud2Message, wanted: Sequence[PointFieldMessage]) -> N
             f"a point cloud of {height} x {width} points of {point_step} bytes needs {needed} bytes,"
             f" the message holds {len(message.data)}"
         )
-    order: Literal["<", ">"] = ">" if message.is_bigendian else "<"
-    formats = []
     for field in wanted:
         if field.datatype not in _TYPES:
             raise InputError(f"point field {field.name!r} has the unknown datatype {field.datatype}; known are 1 to 8")
-        scalar = np.dtype(_TYPES[field.datatype]).newbyteorder(order)
-        if field.offset + scalar.itemsize > point_step:
+        if field.offset + np.dtype(_TYPES[field.datatype]).itemsize > point_step:
             raise InputError(f"point field {field.name!r} reaches beyond the {point_step} bytes of a point")
-        formats.append(scalar)  # of a field with several values the first is read
     record = np.dtype(
         {
             "names": [field.name for field in wanted],
-            "formats": formats,
+            "formats": [_TYPES[field.datatype] for field in wanted],  # of several values the first is read
             "offsets": [field.offset for field in wanted],
             "itemsize": point_step,
         }
-    )
+    ).newbyteorder(">" if message.is_bigendian else "<")
     return np.ndarray((height, width), record, np.ascontiguousarray(message.data), strides=(row_step, point_step))
 
 

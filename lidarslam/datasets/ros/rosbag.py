@@ -7,9 +7,6 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
@@ -18,11 +15,12 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
-from lidarslam.datasets.point_time import CLOCK_LIMIT_S, PointTimeModel, infer_point_time
-from lidarslam.datasets.recording import PointTime, Recording, RecordingInfo
+from lidarslam.datasets.point_time import PointTimeModel, is_return
+from lidarslam.datasets.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.recording import Recording, RecordingInfo
 from lidarslam.datasets.ros import livox
-from lidarslam.datasets.ros.bag_file import BagFile, BagMessage
-from lidarslam.datasets.ros.bag_stamps import StampSource, find_stamp_source
+from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
 from lidarslam.datasets.ros.bag_topics import choose_topic
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.stamp_order import in_stamp_order
@@ -30,13 +28,11 @@ from lidarslam.datasets.truth_files import find_truth_file
 
 logger = logging.getLogger(__name__)
 
-# How many messages are looked at to learn what the points' times mean, and how many of them may not tell.
-_CLOUDS_LOOKED_AT = 30
-_CLOUDS_WITHOUT_TIME = 3
 _FRAMES_LOOKED_AT = 10
 
 _DAMAGED = "damaged places in the bag were passed over"
 _MISSING = "scans are missing that the index lists"
+_NO_HEADER_STAMPS = "The message headers have no stamps, so the times of recording are used."
 _NEVER_SET = "scans were left out: their stamps were never set"
 
 
@@ -55,32 +51,24 @@ class BagRecording:
     Stamps are those of the message headers, or, where no header has one, the times of recording.
     """
 
+    T_cam_lidar: FloatArray | None = None  # no camera
+
     def __init__(self, source: Path, config: ReaderConfig) -> None:
         self._source = source
         self._config = config
         self._bag = BagFile(source)
         self._topic = choose_topic(source, self._bag.topics, config.topic)
-        self._is_livox = self._topic.message_type in livox.CUSTOM_MESSAGE_TYPES
         folders = [source, source.resolve().parent] if source.is_dir() else [source.parent]
         self._truth_file = find_truth_file(folders, self.name)
 
     @property
     def name(self) -> str:
-        """The name of the folder, or of the file without its suffix."""
+        """The folder's name, or the file's without its suffix."""
         return self._source.resolve().name if self._source.is_dir() else self._source.stem
-
-    @property
-    def T_cam_lidar(self) -> FloatArray | None:
-        """A bag is read in the LiDAR frame alone."""
-        return None
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """The TUM file beside the bag, or inside its folder, named like the bag or ground_truth.tum.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """The TUM file beside the bag, or inside its folder, named like the bag or ground_truth.tum."""
         return None if self._truth_file is None else read_tum(self._truth_file)
 
     def __len__(self) -> int:
@@ -88,11 +76,9 @@ class BagRecording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """That its index is gone, or its headers have no stamps."""
-        damage = () if self._bag.damage is None else (self._bag.damage,)
-        if self._stamps.from_header:
-            return damage
-        return (*damage, "The message headers have no stamps, so the times of recording are used.")
+        """A lost index, and headers without stamps."""
+        unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
+        return tuple(warning for warning in (self._bag.damage, unset) if warning is not None)
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -101,9 +87,6 @@ class BagRecording:
 
         A message of another sensor, or one whose stamp is not after those before it, keeps its index but makes no
         scan; such messages are counted, in a warning where nobody counts.
-
-        Raises:
-            InputError: the range makes no sense, or the bag is damaged.
         """
         return self._scans(scan_indices(len(self), start, stop, step), faults)
 
@@ -118,6 +101,10 @@ class BagRecording:
                     logger.warning("%s: %s", self._source, warning)
 
     def _wanted(self, wanted: range, faults: Faults, strict: bool = False) -> Iterator[BagMessage]:
+        other_sensor = (
+            f"scans were left out: they come from another sensor than {self._frame_id!r}; for that one set"
+            " reader.frame_id"
+        )
         for index, message in enumerate(islice(self._messages(faults), max(0, wanted.stop))):
             if index not in wanted:
                 continue
@@ -126,49 +113,46 @@ class BagRecording:
                     raise InputError(message.damage)
                 faults.unreadable(InputError(message.damage))
             elif message.frame_id != self._frame_id:
-                kind = (
-                    f"scans were left out: they come from another sensor than {self._frame_id!r};"
-                    " for that one set reader.frame_id"
-                )
-                faults.leave_out(kind, repr(message.frame_id))
+                faults.leave_out(other_sensor, repr(message.frame_id))
             elif (stamp := self._stamps.stamp(message)) <= self._stamps.before_first:
                 faults.leave_out(_NEVER_SET, f"{stamp:.9f}")
             else:
                 yield message
 
     def _messages(self, faults: Faults) -> Iterator[BagMessage]:
-        count = 0
-        for message in self._bag.messages(self._topic, lambda damage: faults.note(_DAMAGED, damage)):
+        count, damages = 0, list[str]()
+
+        def note(damage: str) -> None:
+            damages.append(damage)
+            faults.note(_DAMAGED, damage)
+
+        for message in self._bag.messages(self._topic, note):
             count += 1
             yield message
         if not count:
-            raise InputError(
-                f"{self._source}: its index lists {len(self)} messages of {self._topic.name}, it holds none;"
-                " reindex it, or give one of its .db3 or .mcap files instead of the folder"
-            )
+            lists = f"{self._source}: its index lists {len(self)} messages of {self._topic.name}, it holds none;"
+            remedy = " reindex it, or give one of its .db3 or .mcap files instead of the folder"
+            raise InputError(damages[0] if damages else lists + remedy)
         if count < len(self):
             faults.leave_out(_MISSING, f"its index lists {len(self)} scans, it holds {count}", len(self) - count)
 
     def _sound(self) -> Iterator[BagMessage]:
-        """The messages that have a header, for what is learnt of them; the others are counted when it is their turn."""
+        """The messages that have a header, to infer from; the others are counted when it is their turn."""
         return (message for message in self._bag.messages(self._topic) if message.damage is None)
 
     @cached_property
     def _frame_id(self) -> str:
         """The sensor that most of the first messages come from, unless another is asked for."""
         frames = Counter(m.frame_id for m in islice(self._sound(), _FRAMES_LOOKED_AT))
-        if self._config.frame_id is None:
-            return frames.most_common(1)[0][0] if frames else ""
-        if self._config.frame_id not in frames:
+        wanted = self._config.frame_id
+        if wanted is None:
+            return max(frames, key=lambda frame: frames[frame], default="")
+        if wanted not in frames:
             found = ", ".join(repr(frame) for frame in frames)
             raise InputError(
-                f"{self._source}: reader.frame_id is {self._config.frame_id!r}, but {self._topic.name} begins with"
-                f" {found}"
+                f"{self._source}: reader.frame_id is {wanted!r}, but {self._topic.name} begins with {found}"
             )
-        return self._config.frame_id
-
-    def _decode(self, message: BagMessage) -> DecodedCloud:
-        return self._bag.decode(message, self._config.time_field)
+        return wanted
 
     def _scan(self, message: BagMessage, faults: Faults) -> Scan:
         cloud, model, stamp = self._decode(message), self._point_time, self._stamps.stamp(message)
@@ -179,6 +163,9 @@ class BagRecording:
         if model is not None and scan.time_offsets is None and len(scan):
             faults.note(NO_POINT_TIME, f"{stamp:.9f}")
         return scan
+
+    def _decode(self, message: BagMessage) -> DecodedCloud:
+        return self._bag.decode(message, self._config.time_field)
 
     @cached_property
     def _stamps(self) -> StampSource:
@@ -191,43 +178,29 @@ class BagRecording:
 
     @cached_property
     def _point_time(self) -> PointTimeModel | None:
-        """Inferred once, so that all scans are read alike, from the first scan that leaves no doubt.
-
-        Stamps close to zero leave doubt: times from 0 to 0.1 s are then relative as well as absolute.
-        """
-        if self._config.time_reference == "none":
+        """Inferred once, so that all scans are read alike."""
+        unit, reference = self._config.time_unit, self._config.time_reference
+        if reference == "none":
             return None
-        model, failures, period_s = None, 0, None
-        for message in islice(self._sound(), _CLOUDS_LOOKED_AT):
-            stamp = self._stamps.stamp(message)
-            if period_s is None and self._last_stamp is not None and len(self) > 1:
-                period_s = (self._last_stamp - stamp) / (len(self) - 1)
+        if self._topic.message_type in livox.CUSTOM_MESSAGE_TYPES:
+            unit, reference = livox.TIME_UNIT, "absolute"  # as the message type defines
+        first = next(self._sound(), None)
+        period_s = None
+        if first is not None and self._last_stamp is not None and len(self) > 1:
+            period_s = (self._last_stamp - self._stamps.stamp(first)) / (len(self) - 1)
+        return learn_point_time(self._timed_clouds(), unit, reference, period_s)
+
+    def _timed_clouds(self) -> Iterator[TimedCloud]:
+        for message in self._sound():
             try:
                 cloud = self._decode(message)
             except InputError:
                 continue  # counted when it is its turn
-            found = self._infer(cloud, stamp, period_s)
-            model = found or model
-            failures += found is None
-            if (found is not None and stamp > 2 * CLOCK_LIMIT_S) or failures == _CLOUDS_WITHOUT_TIME:
-                break
-        return model
-
-    def _infer(self, cloud: DecodedCloud, stamp: float, period_s: float | None) -> PointTimeModel | None:
-        if cloud.time_field is None or cloud.times is None:
-            return None
-        times = cloud.times[_returns(cloud)]
-        if self._is_livox:  # the message type says what its times are
-            return infer_point_time(cloud.time_field, times, stamp, livox.TIME_UNIT, "absolute")
-        config = self._config
-        return infer_point_time(cloud.time_field, times, stamp, config.time_unit, config.time_reference, period_s)
+            times = None if cloud.times is None else cloud.times[is_return(cloud.points)]
+            yield TimedCloud(cloud.time_field, times, self._stamps.stamp(message))
 
     def describe(self) -> RecordingInfo:
-        """What `lidarslam info` prints.
-
-        Raises:
-            InputError: the bag is damaged, or none of its messages makes a scan.
-        """
+        """Of the first readable scan; see `Recording`."""
         faults = Faults()
         messages = in_stamp_order(self._wanted(range(len(self)), faults), self._stamps.stamp, faults)
         try:
@@ -237,29 +210,18 @@ class BagRecording:
                 raise
             raise InputError(f"{error}; {'; '.join(faults.warnings())}") from error
         cloud = self._decode(message)
-        duration_s = max(0.0, (self._last_stamp or first.stamp) - first.stamp)
         return RecordingInfo(
             reader="rosbag",
             scans=len(self),
-            first_stamp=first.stamp,
-            duration_s=duration_s,
-            rate_hz=(len(self) - 1) / duration_s if duration_s > 0.0 else None,
-            points_per_scan=len(first),
-            dropped_points=first.dropped,
-            has_rings=first.rings is not None,
+            first=first,
+            last_stamp=self._last_stamp or first.stamp,
             ground_truth=self._truth_file,
-            point_time=self._describe_point_time(first),
+            point_time=self._point_time,
             topic=self._topic.name,
             topics=self._bag.topics,
             fields=cloud.fields,
             notes=(*self.warnings, *faults.warnings(), *unreadable.warnings(), *self._notes(cloud, first.stamp)),
         )
-
-    def _describe_point_time(self, scan: Scan) -> PointTime | None:
-        model, offsets = self._point_time, scan.time_offsets
-        if model is None or offsets is None or not len(offsets):
-            return None
-        return PointTime(model.field, model.unit, model.reference, float(offsets.min()), float(offsets.max()))
 
     def _notes(self, cloud: DecodedCloud, stamp: float) -> Iterator[str]:
         if cloud.time_field is None or cloud.times is None:
@@ -272,8 +234,3 @@ class BagRecording:
                 f"The point field {cloud.time_field} reads another clock than the stamps,"
                 " so the earliest point of each scan gets the scan's stamp."
             )
-
-
-def _returns(cloud: DecodedCloud) -> NDArray[np.bool_]:
-    """Mask of the points that are returns of the laser; drivers leave any time they like in the others."""
-    return np.asarray(np.isfinite(cloud.points).all(axis=1) & cloud.points.any(axis=1))

@@ -8,8 +8,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory_io import format_kitti
-from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti.correction import correct_elevation
+from lidarslam.datasets.kitti.correction import ELEVATION_DEG, correct_elevation
 from lidarslam.simulation.recording.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig
 
@@ -66,9 +65,8 @@ def compensate(scan: Scan, rig: Rig) -> FloatArray:
 
 def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
     # KITTI's own scans lie too low, and everybody who reads them raises them; exact points would come out too high.
-    too_low_deg = ReaderConfig().kitti_elevation_correction_deg
     intensities = simulated.intensities / _FULL_INTENSITY
-    return np.column_stack([correct_elevation(points, -too_low_deg), intensities]).astype("<f4")
+    return np.column_stack([correct_elevation(points, -ELEVATION_DEG), intensities]).astype("<f4")
 
 
 def _format_calibration() -> str:

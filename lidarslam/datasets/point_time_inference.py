@@ -1,0 +1,160 @@
+"""Unit and reference of per-point time, inferred from the values of a scan.
+
+Drivers agree on nothing here, so both are inferred once and then applied to all scans of a recording alike.
+"""
+
+import logging
+from collections.abc import Iterable, Sequence
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.datasets.config import TimeReference, TimeUnit
+from lidarslam.datasets.point_time import CLOCK_LIMIT_S, UNITS_PER_SECOND, PointTimeModel
+
+logger = logging.getLogger(__name__)
+
+# How many clouds are looked at, and how many of them may lack usable times.
+_CLOUDS_LOOKED_AT, _CLOUDS_WITHOUT_TIME = 30, 3
+# Sweeps last 0.02 to 0.3 s. The limits leave room for partial ones and are less than one unit (1000) apart.
+_SWEEP_S, _SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 0.1, 0.005, 1.0
+# The same relative to the time between scans, where that is known and itself plausible.
+_SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
+_PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
+# Times coarser than this part of the sweep do not separate its points.
+_COARSEST_OF_SWEEP = 0.1
+# Instead of the extremes, so that a few stray values do not matter.
+_QUANTILES = (0.005, 0.5, 0.995)
+
+
+class TimedCloud(NamedTuple):
+    """The raw times (N,) of a cloud's returns, with the field's name, and the scan's stamp in seconds if known."""
+
+    field: str | None
+    values: NDArray[np.generic] | None
+    stamp: float | None
+
+
+def learn_point_time(
+    clouds: Iterable[TimedCloud],
+    unit: TimeUnit = "auto",
+    reference: TimeReference = "auto",
+    period_s: float | None = None,
+) -> PointTimeModel | None:
+    """The model of the first cloud whose times are unambiguous, else of the last with any; None without.
+
+    Stamps close to zero are ambiguous: times from 0 to 0.1 s are then relative as well as absolute.
+    """
+    model, failures = None, 0
+    for cloud in islice(clouds, _CLOUDS_LOOKED_AT):
+        found = None
+        if cloud.field is not None and cloud.values is not None:
+            found = infer_point_time(cloud.field, cloud.values, cloud.stamp, unit, reference, period_s)
+        model = found or model
+        failures += found is None
+        is_clear = cloud.stamp is None or abs(cloud.stamp) > 2 * CLOCK_LIMIT_S
+        if (found is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
+            break
+    return model
+
+
+def infer_point_time(
+    field: str,
+    values: NDArray[np.generic],
+    stamp: float | None,
+    unit: TimeUnit = "auto",
+    reference: TimeReference = "auto",
+    period_s: float | None = None,
+) -> PointTimeModel | None:
+    """Infer unit and reference of a time field from the raw values (N,) of one scan with a stamp in seconds.
+
+    Values that read the same as the stamp in some unit are absolute in that unit. Otherwise the unit is the one in
+    which they span a sweep (about `period_s`, where known), and they are relative if none exceeds a second, else
+    readings of a clock of their own. A given unit or reference is not questioned.
+
+    Returns:
+        None when the values are no per-point time: `reference` is "none", all values are equal, too coarse (an epoch
+        in float32), or span a sweep in no unit; the last two are logged as a warning.
+    """
+    spread = None if reference == "none" else value_spread(values)
+    if spread is None:
+        return None
+    if spread.resolution > _COARSEST_OF_SWEEP * spread.span:
+        logger.warning("time field %r is too coarse (steps of %g): ignored", field, spread.resolution)
+        return None
+    units = tuple(UNITS_PER_SECOND) if unit == "auto" else (unit,)
+    if reference != "relative" and (by_clock := _unit_by_clock(spread, stamp, units)) is not None:
+        return PointTimeModel(field, by_clock, "absolute")
+    by_span = _unit_by_span(spread, period_s) if unit == "auto" else unit
+    if by_span is None:
+        said = "time field %r (%.9g to %.9g) spans a sweep in no unit: ignored; set time_unit if it is a time"
+        logger.warning(said, field, spread.first, spread.last)
+        return None
+    if reference == "auto":
+        largest_s = max(abs(spread.first), abs(spread.last)) / UNITS_PER_SECOND[by_span]
+        reference = "relative" if largest_s <= CLOCK_LIMIT_S else "absolute"
+    model = PointTimeModel(field, by_span, reference)
+    if reference == "absolute" and stamp is not None and not model.shares_clock(values, stamp):
+        said = "time field %r reads another clock than the scans' stamps: the earliest point of a scan gets its stamp"
+        logger.warning(said, field)
+    return model
+
+
+class ValueSpread(NamedTuple):
+    """The values of one scan, in their own unit.
+
+    Attributes:
+        first, middle, last: near the smallest, the median and near the largest, a few stray values left out.
+        span: last minus first, without the rounding of large values.
+        resolution: the step between neighbouring values at this size.
+    """
+
+    first: float
+    middle: float
+    last: float
+    span: float
+    resolution: float
+
+
+def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
+    """The spread of integer or float values (N,), NaN left out; None when all, or all but a few, are alike."""
+    whole = values.dtype.kind in "iu"
+    with np.errstate(invalid="ignore"):  # damaged bytes may be a NaN of the signalling kind
+        numbers = values.reshape(-1).astype(np.int64 if whole else np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    set_times = numbers[numbers != 0]
+    # Among clock readings a zero is a missing return; among relative times it is a time.
+    if len(set_times) and np.abs(set_times).min() > 10 * float(np.ptp(set_times)):
+        numbers = set_times
+    if len(numbers) < 2:
+        return None
+    base = numbers.min()
+    first, middle, last = np.quantile((numbers - base).astype(np.float64), _QUANTILES)
+    if last <= first:
+        return None
+    resolution = 1.0 if whole else float(np.spacing(values.dtype.type(np.abs(numbers).max())))
+    return ValueSpread(float(base + first), float(base + middle), float(base + last), float(last - first), resolution)
+
+
+def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str]) -> str | None:
+    """The unit in which the values read the same as the stamp."""
+    if stamp is None or abs(stamp) <= 2 * CLOCK_LIMIT_S:  # ambiguous: relative times read about the same
+        return None
+    for unit in units:
+        per_second = UNITS_PER_SECOND[unit]
+        if abs(spread.middle / per_second - stamp) <= CLOCK_LIMIT_S and spread.span / per_second <= _LONGEST_SWEEP_S:
+            return unit
+    return None
+
+
+def _unit_by_span(spread: ValueSpread, period_s: float | None) -> str | None:
+    """The unit in which the values span a sweep."""
+    spans = {unit: spread.span / per_second for unit, per_second in UNITS_PER_SECOND.items()}
+    if period_s is not None and _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]:
+        for unit, span in spans.items():
+            if _SHORTEST_OF_PERIOD * period_s <= span <= _LONGEST_OF_PERIOD * period_s:
+                return unit
+    fitting = [unit for unit, span in spans.items() if _SHORTEST_SWEEP_S <= span <= _LONGEST_SWEEP_S]
+    return min(fitting, key=lambda unit: abs(np.log(spans[unit] / _SWEEP_S)), default=None)

@@ -1,0 +1,113 @@
+"""One message of a bag: its header's stamp and frame, which of its two times is the scan's stamp, and its points."""
+
+import math
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
+from typing import cast
+
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
+
+from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_TYPES, decode_custom_message
+from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, decode_point_cloud2
+
+POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
+CLOUD_TYPES = (POINT_CLOUD2_TYPE, *CUSTOM_MESSAGE_TYPES)
+
+_LONGEST_FRAME_ID = 256
+# Up to the end of a header's frame; a shorter message is none.
+_SHORTEST_MESSAGE = 16
+# More equal stamps than this among the first messages of a topic were never measured.
+_MESSAGES_LOOKED_AT, _FEW = 10, 3
+# Stamps beyond this (1973) read a clock, and a zero among them was never set; simulated time starts at zero.
+_CLOCK_NS = 10**17
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One message, not decoded.
+
+    Attributes:
+        record_ns: time of recording, nanoseconds.
+        header_ns: time stamp of its header, nanoseconds.
+        frame_id: of its header, the sensor's frame.
+        damage: why it is no message; it has neither stamp nor frame then.
+    """
+
+    record_ns: int
+    header_ns: int
+    frame_id: str
+    message_type: str
+    raw: bytes
+    damage: str | None = None
+
+
+def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
+    """Time stamp in nanoseconds and frame of a serialised message that begins with a std_msgs/Header.
+
+    They stand at fixed places, so that the message need not be decoded.
+
+    Raises:
+        ValueError: it is no such message.
+    """
+    if not isinstance(raw, bytes):  # a database holds whatever stands in its rows
+        raise ValueError("a message that is no bytes")
+    if len(raw) < _SHORTEST_MESSAGE:
+        raise ValueError(f"a message of {len(raw)} bytes, too few for its header")
+    if ros2 and raw[0] != 0:
+        raise ValueError(
+            "it is not plain CDR; if the bag's messages are compressed, give the rosbag2 folder with its metadata.yaml"
+            " instead of the file"
+        )
+    order = ">" if ros2 and raw[1] != 1 else "<"
+    seconds, nanoseconds, characters = struct.unpack_from(f"{order}{'i' if ros2 else 'I'}II", raw, 4)
+    frame_id = raw[16 : 16 + min(characters, _LONGEST_FRAME_ID)].rstrip(b"\0").decode(errors="replace")
+    return int(seconds) * 10**9 + int(nanoseconds), frame_id
+
+
+def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCloud:
+    """Decode a message of one of the `CLOUD_TYPES`, by fixed definitions.
+
+    Those in the bag are not used: the definition of PointCloud2 has not changed, bags may lack definitions, and a
+    damaged definition of some other topic must not matter.
+    """
+    if message.message_type in CUSTOM_MESSAGE_TYPES:
+        return decode_custom_message(message.raw, ros2)
+    store = _typestore(ros2)
+    deserialize = store.deserialize_cdr if ros2 else store.deserialize_ros1
+    return decode_point_cloud2(cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE)), time_field)
+
+
+@cache
+def _typestore(ros2: bool) -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+
+
+@dataclass(frozen=True)
+class StampSource:
+    """How the messages of one topic are stamped.
+
+    Attributes:
+        from_header: the stamps are those of the headers, else the times of recording.
+        before_first: stamps up to this one, seconds, were never set.
+    """
+
+    from_header: bool
+    before_first: float
+
+    def stamp(self, message: BagMessage) -> float:
+        """The scan's stamp in seconds."""
+        return (message.header_ns if self.from_header else message.record_ns) / 10**9
+
+
+def find_stamp_source(messages: Iterable[BagMessage]) -> StampSource:
+    """By the first few messages of a topic: those of the headers, unless the driver never sets them anew."""
+    stamps_ns = [message.header_ns for message in islice(messages, _MESSAGES_LOOKED_AT)]
+    first_ns = next((stamp_ns for stamp_ns in stamps_ns if stamp_ns), None)
+    if first_ns is None or (len(stamps_ns) > _FEW and len(set(stamps_ns)) == 1):
+        return StampSource(from_header=False, before_first=-math.inf)
+    return StampSource(from_header=True, before_first=0.0 if first_ns > _CLOCK_NS else -math.inf)

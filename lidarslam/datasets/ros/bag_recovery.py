@@ -1,0 +1,195 @@
+"""The messages of a bag without its index, record after record as they lie in the file.
+
+A recorder that was killed, or a copy that was cut short, leaves no index and half a chunk at the end. Layouts: ROS bag
+format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the tables of rosbag2's SQLite plugin. Written here
+because rosbags needs an index, and `StreamReader` of mcap 1.6 loses all of a chunk that is cut off and accepts records
+that are too short.
+"""
+
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+from urllib.parse import quote
+
+from rosbags.rosbag1.reader import Header, RecordType, decompressors, normalize, read_uint32
+from rosbags.rosbag2.storage_mcap import decompress, read_exact, read_string
+from rosbags.typesys.msg import normalize_msgtype
+
+Report = Callable[[str], None]
+Connections = Mapping[int, tuple[str, str]]
+"""Topic and type, by the number in each message."""
+
+# Records are read whole; a longer one is a damaged length.
+_LONGEST_RECORD = 1 << 30
+# Opcodes of MCAP.
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+# By the table itself, because the pages of its index lie at the end.
+_ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id > ? ORDER BY id"
+
+
+class RecoveredMessage(NamedTuple):
+    """One message; the type is named as in ROS 2, the time is that of recording in nanoseconds."""
+
+    topic: str
+    message_type: str
+    record_ns: int
+    raw: bytes
+
+
+def recover(path: Path, suffix: str, report: Report, known: Connections | None = None) -> Iterator[RecoveredMessage]:
+    """The messages of a `.bag`, `.mcap` or `.db3` file, as far as it is readable; damage is reported.
+
+    A damaged chunk costs its own messages alone, and so does a damaged page of a database.
+
+    Args:
+        path: the file.
+        suffix: which kind it is.
+        report: called with one line for each damaged place.
+        known: the connections that an index lists; the records about them may be damaged.
+
+    Raises:
+        ValueError, OSError, sqlite3.Error: it is no such file at all.
+    """
+    if suffix == ".db3":
+        yield from _database(path, report)
+        return
+    records = (_Rosbag1Records if suffix == ".bag" else _McapRecords)(report, known or {})
+    with path.open("rb") as file:
+        if file.read(len(records.magic)) != records.magic:
+            raise ValueError(f"it does not begin as a {suffix} file")
+        size = path.stat().st_size
+        while (at := file.tell()) < size:
+            try:
+                yield from records.read(file)
+            except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
+                report(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})")
+                return
+
+
+class _Records:
+    """Reads one record after another, those inside chunks too."""
+
+    magic: bytes
+
+    def __init__(self, report: Report, known: Connections) -> None:
+        self._report = report
+        self._connections = dict(known)
+        self._schemas: dict[int, str] = {}
+
+    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+        """The messages of the record that begins here."""
+        raise NotImplementedError
+
+    def _chunk(self, decompressed: Callable[[], bytes], is_whole: bool) -> Iterator[RecoveredMessage]:
+        try:
+            content = decompressed()
+            stream = BytesIO(content)
+            while stream.tell() < len(content):
+                yield from self.read(stream)
+        except Exception as error:
+            if is_whole:
+                self._report(f"a chunk in it is damaged ({_reason(error)})")
+
+
+class _Rosbag1Records(_Records):
+    """Records of a header, fields `name=value`, and data; chunks hold connections and messages."""
+
+    magic = b"#ROSBAG V2.0\n"
+
+    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+        header, size = Header.read(file), read_uint32(file)
+        kind, data = header.get_uint8("op"), file.read(min(size, _LONGEST_RECORD))
+        if kind == RecordType.CHUNK:
+            yield from self._chunk(lambda: decompressors[header.get_string("compression")](data), len(data) == size)
+        _require_whole(data, size)
+        if kind == RecordType.CONNECTION:
+            fields = Header.read(BytesIO(struct.pack("<I", size) + data))
+            named = normalize(header.get_string("topic")), normalize_msgtype(fields.get_string("type"))
+            self._connections.setdefault(header.get_uint32("conn"), named)
+        elif kind == RecordType.MSGDATA:
+            named = self._connections[header.get_uint32("conn")]
+            yield RecoveredMessage(*named, header.get_time("time"), data)
+
+
+class _McapRecords(_Records):
+    """Records of an opcode, a length and their content; chunks hold schemas, channels and messages."""
+
+    magic = b"\x89MCAP0\r\n"
+
+    def read(self, file: BinaryIO) -> Iterator[RecoveredMessage]:
+        opcode, size = struct.unpack("<BQ", read_exact(file, 9))
+        if opcode in (_FOOTER, _DATA_END):  # the summary behind it repeats schemas and channels
+            file.seek(0, 2)
+            return
+        data = file.read(min(size, _LONGEST_RECORD))
+        body = BytesIO(data)
+        if opcode == _CHUNK:
+            yield from self._read_chunk(body, len(data) == size)
+        _require_whole(data, size)
+        if opcode == _SCHEMA:
+            (schema,) = struct.unpack("<H", read_exact(body, 2))
+            self._schemas[schema] = read_string(body)
+        elif opcode == _CHANNEL:
+            channel, schema = struct.unpack("<HH", read_exact(body, 4))
+            if channel not in self._connections:
+                self._connections[channel] = (read_string(body), self._schemas[schema])
+        elif opcode == _MESSAGE:
+            channel, _, record_ns, _ = struct.unpack("<HIQQ", read_exact(body, 22))
+            yield RecoveredMessage(*self._connections[channel], record_ns, body.read())
+
+    def _read_chunk(self, body: BytesIO, is_whole: bool) -> Iterator[RecoveredMessage]:
+        _, _, size, checksum = struct.unpack("<QQQI", read_exact(body, 28))
+        compression = read_string(body)
+        body.read(8)
+        data = body.read()
+        is_text = not is_whole and not compression  # a part of it can be read as it stands
+        yield from self._chunk(lambda: data if is_text else decompress(data, compression, size, checksum), is_whole)
+
+
+def _require_whole(data: bytes, size: int) -> None:
+    if len(data) < size:
+        raise ValueError(f"expected a record of {size:,} bytes, got {len(data):,}")
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
+    uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+    with closing(sqlite3.connect(uri, uri=True)) as database:
+        # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
+        database.execute("PRAGMA writable_schema=ON")
+        topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
+        for topic, record_ns, raw in _rows(database, report):
+            if topic in topics and isinstance(record_ns, int) and isinstance(raw, bytes):
+                yield RecoveredMessage(*topics[topic], record_ns, raw)
+            else:
+                report(f"a row of it is no message (its data are of type {type(raw).__name__})")
+
+
+def _rows(database: sqlite3.Connection, report: Report) -> Iterator[tuple[object, ...]]:
+    """The rows of the table of messages; those on damaged pages are passed over one by one."""
+    done, lost, first = -1, 0, ""
+    while True:
+        try:
+            for number, *row in database.execute(_ROWS, (done,)):
+                yield tuple(row)
+                done = number
+            break
+        except sqlite3.Error as error:
+            first = first or f"after row {done:,} ({_reason(error)})"
+        try:
+            (last,) = database.execute("SELECT max(id) FROM messages").fetchone()
+        except sqlite3.Error:  # its end is gone too
+            report(f"it breaks off {first}")
+            return
+        done, lost = done + 1, lost + 1
+        if done >= last:
+            break
+    if lost:
+        report(f"{lost:,} rows of it cannot be read, the first {first}")

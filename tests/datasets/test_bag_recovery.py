@@ -1,0 +1,407 @@
+"""Bags without an index, cut short or damaged in the middle: what there is is read, and the rest is told."""
+
+import shutil
+import sqlite3
+import zlib
+from contextlib import closing
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2.reader import zstd
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_recovery import recover
+
+STAMP_NS = 1_700_000_000_250_000_000
+PERIOD_NS = 100_000_000
+
+
+def stamp_ns(index):
+    return STAMP_NS + index * PERIOD_NS
+
+
+@pytest.fixture
+def write_drive(make_bag_kit, make_sweep):
+    """Write a bag of velodyne scans of 2 000 points; gives the storage file, the folder or file, and the points."""
+
+    def write(kind, count=6, width=125, kit=None, order=None, recorded_ns=stamp_ns, first=0, **options):
+        kit = kit or make_bag_kit(kind)
+        numbers = range(first, first + count)
+        sweeps = {i: make_sweep("velodyne", stamp_ns(i), height=16, width=width) for i in numbers}
+        clouds = [(recorded_ns(i), kit.cloud(sweeps[i].records, stamp_ns(i))) for i in order or numbers]
+        path = kit.write({"/points": clouds, "/imu": "sensor_msgs/msg/Imu"}, in_order=order is None, **options)
+        return kit.storage_file(path), path, [sweep.points for sweep in sweeps.values()]
+
+    return write
+
+
+def assert_first_scans(recording, points, count):
+    faults = Faults()
+    scans = list(recording.scans(faults=faults))
+    assert len(scans) == len(recording) == count
+    assert faults.warnings() == ()
+    for i, (scan, expected) in enumerate(zip(scans, points, strict=False)):
+        assert scan.stamp == (STAMP_NS + i * PERIOD_NS) / 10**9
+        np.testing.assert_array_equal(scan.points, expected)
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_bag_that_was_cut_short_is_read_up_to_there(write_drive, kind, part):
+    file, _, points = write_drive(kind)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(part * len(whole))])
+    recording = open_recording(file)
+    # The writers put all into one chunk; what a chunk without compression holds can be read up to its end.
+    assert_first_scans(recording, points, int(6 * part - 0.05))
+    (warning,) = recording.warnings
+    assert f"{file}: has no index that can be read, so its {len(recording)} messages" in warning
+    assert "breaks off at byte" in warning
+    assert "\n" not in warning
+    assert warning in recording.describe().notes
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_bag_of_which_only_the_end_is_missing_is_read_whole(write_drive, kind):
+    file, _, points = write_drive(kind)
+    file.write_bytes(file.read_bytes()[:-9])
+    assert_first_scans(open_recording(file), points, 6)
+
+
+def test_a_bag_that_was_never_indexed_is_read_whole(write_drive):
+    file, _, points = write_drive("bag")
+    data = bytearray(file.read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    data[place : place + 8] = bytes(8)
+    active = file.with_name("drive.bag.active")
+    active.write_bytes(data)
+    for path in (active, file):
+        path.write_bytes(data)
+        recording = open_recording(path)
+        assert_first_scans(recording, points, 6)
+        assert f"rosbag reindex {path}" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("compression", [Rosbag1Writer.CompressionFormat.BZ2, Rosbag1Writer.CompressionFormat.LZ4])
+def test_compressed_chunks_without_an_index(write_drive, compression):
+    file, _, points = write_drive("bag", compression=(compression,))
+    data = bytearray(file.read_bytes())
+    place = data.index(b"index_pos=") + len(b"index_pos=")
+    data[place : place + 8] = bytes(8)
+    file.write_bytes(data)
+    assert_first_scans(open_recording(file), points, 6)
+
+
+def test_a_cut_database_is_read_as_far_as_its_pages_go(write_drive):
+    file, _, points = write_drive("db3", count=40)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(0.9 * len(whole))])
+    recording = open_recording(file)
+    assert 7 <= len(recording) < 40
+    assert_first_scans(recording, points, len(recording))
+    assert "breaks off" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
+def test_a_bag_of_which_nothing_is_left_says_how_to_mend_it(write_drive, kind):
+    file, _, _ = write_drive(kind)
+    for size in (0, 5, 60):
+        file.write_bytes(file.read_bytes()[:size])
+        with pytest.raises(InputError, match=r"try `|copy the bag again") as caught:
+            open_recording(file)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"]]: : [\n", bytes(range(256)), b"rosbag2_bagfile_information: 5\n"])
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_a_folder_without_usable_metadata_is_its_file(write_drive, kind, content):
+    file, folder, points = write_drive(kind)
+    (folder / "metadata.yaml").unlink()
+    if content is not None:
+        (folder / "metadata.yaml").write_bytes(content)
+    recording = open_recording(folder)
+    assert_first_scans(recording, points, 6)
+    assert "metadata.yaml is missing or damaged, so drive" in recording.warnings[0]
+    # Of several files only the metadata knows the order.
+    shutil.copy(file, folder / f"another.{kind}")
+    with pytest.raises(InputError, match=r"ros2 bag reindex.*or give one of its"):
+        open_recording(folder)
+
+
+def test_metadata_that_names_a_file_outside_reads_none_there(write_drive):
+    file, folder, _ = write_drive("db3")
+    file.rename(folder.parent / "elsewhere.db3")
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(file.name, "../elsewhere.db3"))
+    with pytest.raises(InputError, match=r"missing.*ros2 bag reindex"):
+        open_recording(folder)
+
+
+def test_a_damaged_chunk_costs_no_other(write_drive):
+    file, _, _ = write_drive("mcap", count=2)
+    data = file.read_bytes()
+    header, chunk = _mcap_chunk(data)
+    broken = chunk[:49] + b"\xff" * 9 + chunk[58:]  # the length of its first record
+    file.write_bytes(header + chunk + broken + chunk[:-100])
+    bag = BagFile(file)
+    (topic,) = (topic for topic in bag.topics if topic.messages)
+    assert topic.messages == 3  # two of the first chunk, and one of the last, which breaks off
+    assert "a chunk in it is damaged" in bag.damage
+    assert len(list(bag.messages(topic))) == 3
+
+
+def _mcap_chunk(data):
+    """An MCAP file up to its first chunk, and that chunk."""
+    at = 8
+    while data[at] != 0x06:
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    return data[:at], data[at : at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")]
+
+
+def test_a_record_that_claims_to_be_endless_is_not_read(write_drive):
+    file, _, points = write_drive("mcap")
+    header, chunk = _mcap_chunk(file.read_bytes())
+    file.write_bytes(header + chunk + b"\x05" + (10**12).to_bytes(8, "little") + bytes(5000))
+    recording = open_recording(file)
+    assert_first_scans(recording, points, 6)
+    assert "expected a record of 1,000,000,000,000 bytes" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("data", ["text", 100, 4 * 10**12, 0.5])
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_database_whose_rows_are_no_messages(write_drive, data, indexed):
+    """A number must not become as many zero bytes."""
+    file, _, points = write_drive("db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("UPDATE messages SET data = ? WHERE id = 4", (data,))
+    if indexed:
+        told = f"1 scans were left out: they could not be read; the first: {file}: a message that is no bytes"
+        assert_all_but(open_recording(file), points, [3], told)
+        return
+    reports = []
+    assert len(list(recover(file, ".db3", reports.append))) == 5
+    assert reports == [f"a row of it is no message (its data are of type {type(data).__name__})"]
+
+
+def assert_all_but(recording, points, missing, *warnings):
+    """See that all scans are read but some, and that this is what is said of them."""
+    faults = Faults()
+    scans = list(recording.scans(faults=faults))
+    left = [i for i in range(len(points)) if i not in missing]
+    assert [scan.stamp for scan in scans] == [(STAMP_NS + i * PERIOD_NS) / 10**9 for i in left]
+    for scan, i in zip(scans, left, strict=True):
+        np.testing.assert_array_equal(scan.points, points[i])
+    assert len(faults.warnings()) == len(warnings)
+    for said, expected in zip(faults.warnings(), warnings, strict=True):
+        assert said.startswith(expected)
+        assert "\n" not in said
+    assert faults.left_out == len(missing)
+
+
+@pytest.mark.parametrize("length", [0, 3, 15])
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
+@pytest.mark.parametrize("places", [[2], [0, 5]])
+def test_a_message_that_is_too_short_costs_no_other(make_bag_kit, write_drive, kind, length, places):
+    """Shorter than a header; the first and the last are those that most is learnt from."""
+    kit = make_bag_kit(kind)
+    serialize = kit.serialize
+    count = 0
+
+    def cut(message):
+        nonlocal count
+        count += 1
+        return serialize(message)[:length] if count - 1 in places else serialize(message)
+
+    kit.serialize = cut
+    file, _, points = write_drive(kind, kit=kit)
+    recording = open_recording(file)
+    told = f"{len(places)} scans were left out: they could not be read; the first: {file}: a message of {length} bytes"
+    assert_all_but(recording, points, places, told)
+    assert recording.describe().first_stamp == (STAMP_NS + (0 in places) * PERIOD_NS) / 10**9
+    with pytest.raises(InputError, match=f"a message of {length} bytes"):
+        list(recording.scans())
+
+
+def chunks_of(file):
+    """Where the chunks of a bag begin, behind their headers, and how long they are, by its index."""
+    if file.suffix == ".bag":
+        with Rosbag1Reader(file) as reader:
+            return [(chunk.datapos, chunk.datasize) for chunk in reader.chunks.values()]
+    with Rosbag2Reader(file) as reader:
+        return [
+            (chunk.chunk_start_offset + 49 + len(chunk.compression), chunk.compressed_size)
+            for chunk in reader.storage.chunks
+        ]
+
+
+def overwrite(file, begin, content):
+    data = bytearray(file.read_bytes())
+    data[begin : begin + len(content)] = content
+    file.write_bytes(data)
+
+
+def write_checksums(file):
+    """As recorders do: of every chunk of an MCAP file."""
+    for begin, length in chunks_of(file):
+        content = file.read_bytes()[begin : begin + length]
+        overwrite(file, begin - 49 + 9 + 24, zlib.crc32(content).to_bytes(4, "little"))
+
+
+BIG = {"count": 8, "width": 1500}  # two of these scans fill a chunk
+KINDS = [("bag", None), ("bag", Rosbag1Writer.CompressionFormat.LZ4), ("mcap", None)]
+
+
+@pytest.mark.parametrize("damaged", [[0], [1], [3], [0, 2], [1, 2, 3]])
+@pytest.mark.parametrize(("kind", "compression"), KINDS)
+def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive, kind, compression, damaged):
+    file, _, points = write_drive(kind, **BIG, **({} if compression is None else {"compression": (compression,)}))
+    chunks = chunks_of(file)
+    assert len(chunks) == 4
+    if kind == "mcap":
+        write_checksums(file)
+    for chunk in damaged:
+        begin, length = chunks[chunk]
+        overwrite(file, begin, np.random.default_rng(chunk).bytes(length))
+    recording = open_recording(file)
+    assert len(recording) == 8
+    lost = [2 * chunk + i for chunk in damaged for i in (0, 1)]
+    told = (
+        f"{len(damaged)} damaged places in the bag were passed over; the first: {file}: reading stopped after"
+        f" {2 * damaged[0]} messages of /points",
+        f"{len(lost)} scans are missing that the index lists; the first: its index lists 8 scans, it holds",
+    )
+    assert_all_but(recording, points, lost, *told)
+    assert recording.describe().duration_s > 0.0
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
+    """Around a damaged chunk, too: the first half before it, and the second behind it."""
+    file, _, points = write_drive(kind, **BIG, recorded_ns=lambda i: STAMP_NS + PERIOD_NS * (i > 1))
+    begin, length = chunks_of(file)[2]
+    overwrite(file, begin, bytes(length))
+    assert_all_but(open_recording(file), points, [4, 5], "1 damaged places", "2 scans are missing")
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_damaged_chunk_is_counted_once_for_each_topic(make_bag_kit, make_sweep, kind):
+    """Whichever chunk it is that each topic is gone on with."""
+    kit = make_bag_kit(kind)
+    clouds = [(stamp_ns(i), kit.cloud(make_sweep("velodyne", stamp_ns(i), 16, 1500).records, stamp_ns(i)))
+              for i in range(8)]  # fmt: skip
+    front, rear = clouds[0:3] + clouds[4:7:2], clouds[3:8:2]
+    file = kit.storage_file(kit.write({"/front": front, "/rear": rear}))
+    begin, length = chunks_of(file)[2]  # scans 4 and 5
+    overwrite(file, begin, bytes(length))
+    for topic, times in (("/front", [0, 1, 2, 6]), ("/rear", [3, 7])):
+        faults = Faults()
+        scans = list(open_recording(file, ReaderConfig(topic=topic)).scans(faults=faults))
+        assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in times]
+        assert [warning.split(";")[0] for warning in faults.warnings()] == [
+            "1 damaged places in the bag were passed over",
+            "1 scans are missing that the index lists",
+        ]
+
+
+def join(folder, file, later):
+    """Put another storage file of as many scans, 8, behind that of a folder."""
+    shutil.copy(later, folder / f"later{file.suffix}")
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text()
+    text = text.replace(f"- {file.name}\n", f"- {file.name}\n  - later{file.suffix}\n", 1)
+    metadata.write_text(text.replace("message_count: 8\n", "message_count: 16\n"))
+
+
+def test_every_damaged_chunk_in_a_folder_of_several_files_is_counted(write_drive):
+    file, folder, _ = write_drive("mcap", **BIG)
+    later, _, _ = write_drive("mcap", **BIG, name="later", first=8)
+    for storage, chunk in ((file, 1), (later, 0)):
+        begin, length = chunks_of(storage)[chunk]
+        overwrite(storage, begin, bytes(length))
+    join(folder, file, later)
+    faults = Faults()
+    scans = list(open_recording(folder).scans(faults=faults))
+    assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in (0, 1, *range(4, 8), *range(10, 16))]
+    told = f"2 damaged places in the bag were passed over; the first: {folder}: reading stopped after 2 messages"
+    assert any(warning.startswith(told) for warning in faults.warnings())
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_file_that_went_bad_since_its_index_was_read_is_an_error(write_drive, kind):
+    file, _, _ = write_drive(kind)
+    recording = open_recording(file)
+    assert len(recording.warnings) == 0
+    file.write_bytes(bytes(5000))
+    with pytest.raises(InputError, match=r"cannot be opened|index cannot be read|reading stopped after 0"):
+        list(recording.scans(faults=Faults()))
+
+
+@pytest.mark.parametrize("damaged", [0, 2, 5])
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_damaged_message_that_was_compressed_by_itself_costs_no_other(write_drive, kind, damaged):
+    """The first ones are those that what is learnt of the recording is learnt from."""
+    _, folder, points = write_drive(kind, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
+    file = folder / f"drive.{kind}"
+    if kind == "db3":
+        with closing(sqlite3.connect(file)) as database, database:
+            (data,) = database.execute("SELECT data FROM messages WHERE id = ?", (damaged + 1,)).fetchone()
+            data = data[:4] + b"\xff" * 40 + data[44:]
+            database.execute("UPDATE messages SET data = ? WHERE id = ?", (data, damaged + 1))
+    else:
+        data, magic = file.read_bytes(), b"\x28\xb5\x2f\xfd"
+        places = [at for at in range(len(data)) if data.startswith(magic, at)]
+        assert len(places) == 6
+        overwrite(file, places[damaged] + 4, b"\xff" * 40)
+    recording = open_recording(folder)
+    told = f"1 scans were left out: they could not be read; the first: {folder}: a compressed message is damaged ("
+    assert_all_but(recording, points, [damaged], told)
+    assert recording.describe().first_stamp == stamp_ns(damaged == 0) / 10**9
+
+
+def test_a_damaged_chunk_of_compressed_messages_costs_no_other(write_drive):
+    file, folder, points = write_drive("mcap", **BIG, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
+    begin, length = chunks_of(file)[1]
+    overwrite(file, begin, bytes(length))
+    assert_all_but(open_recording(folder), points, [3, 4, 5], "1 damaged places", "3 scans are missing")
+
+
+def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):
+    """And how to get at what lies before the damage."""
+    _, folder, points = write_drive("mcap", compression=(CompressionMode.FILE, CompressionFormat.ZSTD))
+    (file,) = folder.glob("*.zstd")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(InputError, match=r"cannot be opened .*`zstd -dc \S+\.zstd > \S+\.mcap` and give") as caught:
+        open_recording(folder)
+    assert "\n" not in str(caught.value)
+    half = file.with_suffix("")
+    half.write_bytes(zstd.ZstdDecompressor().decompress(file.read_bytes()))  # as zstd -d does
+    recording = open_recording(half)
+    assert len(recording) in (2, 3)
+    assert_first_scans(recording, points, len(recording))
+
+
+def test_a_damaged_page_of_a_database_costs_its_rows(write_drive):
+    file, folder, points = write_drive("db3", count=60)
+    with closing(sqlite3.connect(file)) as database:
+        (size,) = database.execute("PRAGMA page_size").fetchone()
+    data = file.read_bytes()
+    pages = [data[at : at + size] for at in range(0, len(data), size)]
+    leaves = [number for number, page in enumerate(pages) if page[0] == 0x0D and b"lidar" in page[100:]]
+    assert len(leaves) > 3
+    overwrite(file, leaves[len(leaves) // 2] * size, bytes(size))
+    for source in (folder, file):
+        recording = open_recording(source)
+        scans = list(recording.scans(faults=Faults()))
+        assert 40 < len(scans) < 60
+        for scan in scans:
+            np.testing.assert_array_equal(scan.points, points[round((scan.stamp * 10**9 - STAMP_NS) / PERIOD_NS)])
+        assert scans[-1].stamp == (STAMP_NS + 59 * PERIOD_NS) / 10**9
+        assert any(f"{60 - len(scans)} rows of it cannot be read, the first after row" in w for w in recording.warnings)
