@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +16,6 @@ class Rays(NamedTuple):
     directions: FloatArray  # (N, 3) unit, in the LiDAR frame (x forward, z up)
     fractions: FloatArray  # (N,) of the sweep when each is fired, in [0, 1), never decreasing
     rings: NDArray[np.int32]  # (N,) the laser
-
-
-class ScanPattern(Protocol):
-    """A LiDAR's optics; N = columns * lasers."""
-
-    @property
-    def columns(self) -> int:
-        """Shots a sweep."""
-
-    @property
-    def lasers(self) -> int:
-        """Rays a shot."""
-
-    @property
-    def column_angle(self) -> float:
-        """Angle between two shots of the same laser, radians."""
-
-    def rays(self, scan_index: int) -> Rays:
-        """The rays of one sweep."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +94,10 @@ class Rosette:
         azimuth = np.broadcast_to(np.pi - 2.0 * np.pi * np.mod(self.turns_per_sweep * sweeps, 1.0), elevation.shape)
         rings = np.tile(np.arange(self.lasers, dtype=np.int32), self.columns)
         return Rays(directions(azimuth.ravel(), elevation.ravel()), np.repeat(fractions, self.lasers), rings)
+
+
+ScanPattern = Spinning | Rosette
+"""A LiDAR's optics: `columns` shots a sweep of `lasers` rays each, `column_angle` between two shots of a laser."""
 
 
 def directions(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:

@@ -61,11 +61,6 @@ def _velodyne_64(columns: int, elevation_offsets_deg: FloatArray | float = 0.0) 
     return Spinning(elevations[::-1], offsets[::-1], firing[::-1], columns)
 
 
-def _calibration_offsets_deg() -> FloatArray:
-    """Made-up offsets (64,) of a device's elevations, of the size that calibration files of real HDL-64E have."""
-    return np.asarray(np.clip(0.06 * np.random.default_rng(64).standard_normal(64), -0.12, 0.12))
-
-
 def _ouster(altitudes_deg: FloatArray, azimuths_deg: list[float], columns: int) -> Spinning:
     """Ouster: all lasers of a column fire together; azimuth angles repeat and count clockwise, as in its metadata."""
     offsets = -np.resize(azimuths_deg, len(altitudes_deg))
@@ -99,13 +94,15 @@ _OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055
 # after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
 _ROSETTE = Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5)
 
+# The HDL-64E with uneven rings, as every real one has: made-up offsets of the size that calibration files have.
+_UNEVEN_DEG = np.clip(0.06 * np.random.default_rng(64).standard_normal(64), -0.12, 0.12)
+
 _TABLE = (
     Sensor("vlp-16", "velodyne", 10.0, _VLP_16, _VELODYNE_SMALL),
     Sensor("hdl-32e", "velodyne", 10.0, _HDL_32, replace(_VELODYNE_SMALL, min_range_m=0.5)),
     # 48 us a column; KITTI's starts each turn at the rear
     Sensor("hdl-64e", "velodyne", 10.0, _velodyne_64(2083), _VELODYNE_64),
-    # the same with uneven rings, as every real one has
-    Sensor("hdl-64e-calibrated", "velodyne", 10.0, _velodyne_64(2083, _calibration_offsets_deg()), _VELODYNE_64),
+    Sensor("hdl-64e-calibrated", "velodyne", 10.0, _velodyne_64(2083, _UNEVEN_DEG), _VELODYNE_64),
     Sensor("os0-64", "ouster", 10.0, _ouster(_OS0_64_DEG, [9.2, -3.0], 1024), _OS0),
     Sensor("os1-64", "ouster", 10.0, _OS1_64_COLUMN, _OS1_64),
     Sensor("os1-128", "ouster", 10.0, _ouster(_OS1_128_DEG, [4.21, 1.41, -1.40, -4.21], 1024), _OS1_128),

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.recording.recorder import SimulatedScan
@@ -32,8 +31,5 @@ class Rig:
     T_world_lidar_at: Callable[[FloatArray], FloatArray]  # true poses (N, 4, 4) at times (N,), simulated seconds
 
 
-class Writer(Protocol):
-    """Writes the scans of a recording in one format."""
-
-    def __call__(self, folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
-        """Make the folder, which does not exist yet, and write the scans, holding one of them at a time."""
+Writer = Callable[[Path, Iterable[SimulatedScan], Rig], None]
+"""Makes the folder, which does not exist yet, and writes the scans, holding one of them at a time."""
