@@ -1,9 +1,7 @@
-"""The messages of a bag without its index, record after record as they lie in the file.
+"""The messages of a bag without its index, in the order of the file, as after a crash of the recorder.
 
-A recorder that was killed, or a copy that was cut short, leaves no index and half a chunk at the end. Layouts: ROS bag
-format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the tables of rosbag2's SQLite plugin. Written here
-because rosbags needs an index, and `StreamReader` of mcap 1.6 loses all of a chunk that is cut off and accepts records
-that are too short.
+Layouts: ROS bag format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), rosbag2's SQLite tables. Written here
+because rosbags needs an index, and `StreamReader` of mcap 1.6 loses a chunk that is cut off and accepts cut records.
 """
 
 import sqlite3
