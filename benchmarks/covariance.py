@@ -37,7 +37,7 @@ from odometry_accuracy import SIGMAS, estimated_motions, shares_within_sigmas, s
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.tracking import Status
-from lidarslam.pipeline.pipeline import ScanResult
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.simulation.worlds.registry import WORLDS
 from odometry.config import OdometryConfig
 

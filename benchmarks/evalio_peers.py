@@ -256,7 +256,7 @@ def _print(source: Path, peer: str, count: int | None, step: int) -> None:
     """One row of the table."""
     from evaluation.trajectory.metrics import evaluate_trajectory
     from lidarslam.datasets.registry import open_recording
-    from lidarslam.pipeline.scan_order import in_order
+    from lidarslam.pipeline.scan_stream import in_order
 
     recording = open_recording(source)
     stop = None if count is None else count * step

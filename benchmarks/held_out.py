@@ -25,10 +25,9 @@ from evaluation.trajectory.drift import segment_errors
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
-from odometry.config import OdometryConfig
+from lidarslam.pipeline.scan_stream import in_order
+from odometry.config import LearnedConfig, OdometryConfig
 from odometry.interface import Motion
-from odometry.methods.learned_config import LearnedConfig
 
 LENGTHS_M = (20.0, 30.0, 40.0, 50.0, 60.0)
 _SCANS_OF_A_START = 50

@@ -21,16 +21,14 @@ import numpy as np
 from mapping_accuracy import print_row
 from mapping_memory import resident_mb
 
-from lidarslam.config.settings import Config, load_config
+from lidarslam.config.settings import CheckpointConfig, Config, load_config
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.loop_closing import begin_graph
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.prefetch import prefetch
+from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.resume.checkpoints import Checkpoints
-from lidarslam.resume.config import CheckpointConfig
 from lidarslam.resume.unfinished import Unfinished
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.scan_log import ScanLog
@@ -55,16 +53,12 @@ def watch(config: Config, scans: int, every: int) -> list[tuple[int, float, floa
     samples: list[tuple[int, float, float]] = []
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
-        unfinished = stack.enter_context(Unfinished.claim(directory.path, {}, resume=False))
-        log = stack.enter_context(ScanLog.open(directory, unfinished.rows))
+        unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
+        log = ScanLog()
         graph = begin_graph(config, file=unfinished.submaps)
-
-        def rest() -> State:
-            return {"log": log.state(), "graph": None if graph is None else graph.state()}
-
-        keeper = Checkpoints(unfinished, CheckpointConfig(every_scans=every // 2), rest, log.warn)
         ends = Trajectory(np.array([0.0, 0.1 * scans]), np.tile(np.eye(4), (2, 1, 1)))
         odometry = ExternalOdometry(ends, largest_interval_s=np.inf)
+        keeper = Checkpoints(unfinished, CheckpointConfig(every_scans=every // 2), odometry, log, graph)
         pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, keeper)
         started = time.perf_counter()
         for number, result in enumerate(pipeline.run(prefetch(still(scans))), 1):

@@ -25,9 +25,10 @@ from mapping_accuracy import make_simulation, print_row, without_odometry
 
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import ScanToMap
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
-from lidarslam.pipeline.prefetch import prefetch
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.resume.checkpoints import Checkpoints
 from lidarslam.resume.unfinished import Unfinished
 from lidarslam.run.directory import RunDirectory
@@ -60,10 +61,11 @@ def watch(simulation: Simulation, every: int) -> list[Sample]:
     samples: list[Sample] = []
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
-        unfinished = stack.enter_context(Unfinished.claim(directory.path, {}, resume=False))
-        log = stack.enter_context(ScanLog.open(directory, unfinished.rows))
-        keeper = Checkpoints(unfinished, config.checkpoints, lambda: {"log": log.state()}, log.warn)
-        pipeline = Pipeline(make_odometry(config.odometry), ScanToMap(mapper), config.global_map, keeper=keeper)
+        unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
+        log = ScanLog()
+        odometry = make_odometry(config.odometry)
+        checkpoints = Checkpoints(unfinished, config.checkpoints, odometry, log, None)
+        pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, checkpointer=checkpoints)
         _follow(simulation, every, pipeline, mapper, log, unfinished, samples)
     return samples
 
@@ -86,7 +88,7 @@ def _follow(
             continue
         rss_mb = resident_mb()
         cells = 0 if mapper.local_map is None else len(mapper.local_map)
-        points = 0 if pipeline.global_map is None else len(pipeline.global_map.points())
+        points = 0 if pipeline.map.global_map is None else len(pipeline.map.global_map.points())
         state_mb = unfinished.state.stat().st_size / 2**20 if unfinished.state.exists() else 0.0
         sample = Sample(number, rss_mb, state_mb, cells, points)
         samples.append(sample)

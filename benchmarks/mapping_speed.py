@@ -4,8 +4,8 @@
     python benchmarks/mapping_speed.py --simulate hdl-64e:street:car os1-128:street:car --scans 60
 
 Everything runs in one process, one scan after the other, without reading and without the pipeline's two threads: ours
-(without odometry, from `Mapper.process` to the pose and the updated map) with planes alone, KISS-ICP with its defaults,
-ours with edges too, KISS-ICP again; and so on for `--rounds` rounds, each from an empty map, so that whatever else
+(without odometry, from `Mapper.process` to the pose and the updated map) then KISS-ICP with its defaults,
+for `--rounds` rounds, each from an empty map, so that whatever else
 the machine does meets all of them. The first `--warm-up` scans of every pass do not count. Wall time and CPU time
 (of all threads) of every scan; median and 95th percentile over all passes; the ratio is that of the medians of
 passes next to each other, its median, smallest and largest.
@@ -13,7 +13,6 @@ passes next to each other, its median, smallest and largest.
 Ours runs with BLAS on one thread, as `lidarslam run` has it; KISS-ICP uses as many threads as it likes. A stage's time
 is without the stages inside it:
 
-- features: LOAM's edges, when they are used;
 - thin: choosing the points of the scan;
 - registration: finding the surfaces and solving for the pose;
 - fit: holding the result against the map;
@@ -41,23 +40,22 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.scan_stream import in_order
 from mapping import mapper, sampling
 from mapping.config import MappingConfig
 from mapping.mapper import Mapper
 from mapping.prediction import Prior
-from mapping.tracking import attempts as placement
+from mapping.tracking import attempts
 
 # Stage -> what is timed for it: the object that holds the function, and its name there.
 _STAGES: dict[str, tuple[Any, str]] = {
-    "features": (sampling.Sampler, "_edges"),
     "thin": (sampling.Sampler, "sample"),
-    "registration": (placement, "refine"),
-    "fit": (placement, "measure_fit"),
-    "map update": (mapper.Mapper, "_add"),
+    "registration": (attempts, "register"),
+    "fit": (attempts, "measure_fit"),
+    "map update": (mapper, "_insert"),
     "rest": (mapper.Mapper, "process"),
 }
-_OURS = {"planes": MappingConfig(edges=False), "planes and edges": MappingConfig(edges=True)}
+_OURS = {"default": MappingConfig()}
 
 
 @dataclass

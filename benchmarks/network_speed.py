@@ -17,18 +17,14 @@ import torch
 from mapping_accuracy import simulate
 
 from lidarslam.core.scan import Scan
-from odometry.alignment.alignment import Guess, align
-from odometry.config import OdometryConfig
-from odometry.images.image_config import ImageConfig
-from odometry.images.sweep_images import Imager
-from odometry.images.sweeps import SweepImages, SweepPair
-from odometry.methods.learned_config import LearnedConfig
+from odometry.alignment.alignment import InitialEstimate, align
+from odometry.alignment.sweep_motion import SweepPair
+from odometry.config import ImageConfig, LearnedConfig, NetworkConfig, OdometryConfig
+from odometry.images.sweep_images import Imager, SweepImages
 from odometry.network.candidates import Described, Search
 from odometry.network.checkpoint import load_checkpoint, network_of
-from odometry.network.exported import read_exported
-from odometry.network.network_config import NetworkConfig
+from odometry.network.exported import onnx_search, read_exported
 from odometry.network.networks import make_network
-from odometry.network.onnx_graphs import onnx_search
 from odometry.network.shipped import default_weights, shipped_folder
 from odometry.network.torch_graphs import torch_search
 from odometry.registry import make_odometry
@@ -83,13 +79,13 @@ def _stages(scans: Sequence[Scan], threads: int) -> dict[str, Callable[[], objec
     previous, current = (imager.images(scan) for scan in scans[-2:])
     before = search.describe(previous.network.points, previous.network.normals)
     candidates, _ = search.compare(before, current.network.points, current.network.normals)
-    guess = Guess(candidates[0].T_prev_curr, np.asarray(np.linalg.inv(candidates[0].covariance), dtype=np.float64))
+    information = np.asarray(np.linalg.inv(candidates[0].covariance), dtype=np.float64)
+    start = InitialEstimate(candidates[0].T_prev_curr, information)
     sweeps = SweepPair(current.alignment, previous.alignment, scans[-1].stamp - scans[-2].stamp)
-    config = LearnedConfig(threads=threads).alignment
     return {
         "images and normals": lambda: imager.images(scans[-1]),
         "network": _comparison(search, before, current.network),
-        "alignment": lambda: align(guess, sweeps, config),
+        "alignment": lambda: align(start, sweeps),
         "all of the odometry": _whole(scans, threads),
     }
 

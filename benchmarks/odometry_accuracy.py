@@ -31,10 +31,8 @@ from scipy.stats import chi2
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
-from odometry.alignment.alignment_config import AlignmentConfig
-from odometry.config import OdometryConfig
+from odometry.config import LearnedConfig, OdometryConfig
 from odometry.interface import Motion
-from odometry.methods.learned_config import LearnedConfig
 from odometry.registry import make_odometry
 
 # Numbers of standard deviations, and the share of errors that should lie within each.
@@ -72,9 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def network_alone(weights: Path | None) -> LearnedConfig:
-    """The learned odometry without alignment, and without a judgement."""
-    unrefined = AlignmentConfig(iterations=0, doubtful=0.0)
-    return LearnedConfig(weights=weights, alignment=unrefined, least_explained=0.0, least_points=6)
+    """The learned odometry without alignment."""
+    return LearnedConfig(weights=weights, alignment=False)
 
 
 def _methods(weights: Path | None) -> dict[str, OdometryConfig]:

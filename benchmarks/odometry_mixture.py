@@ -24,8 +24,7 @@ from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.simulation.recording.mixture import Excerpt, mixture
 from lidarslam.simulation.recording.recorder import Simulation
-from odometry.config import OdometryConfig
-from odometry.methods.learned_config import LearnedConfig
+from odometry.config import LearnedConfig, OdometryConfig
 from odometry.registry import make_odometry
 
 # What a motion should be better than: degrees, metres, and part of the step.

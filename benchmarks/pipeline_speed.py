@@ -27,9 +27,9 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.loop_closing import begin_graph, finish_graph
+from lidarslam.pipeline.loop_closing import FinishedGraph, begin_graph
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.scan_stream import in_order
 from odometry.registry import make_odometry
 
 _KISS = "KISS-ICP's own loop"
@@ -86,10 +86,12 @@ def _run_ours(method: str, scans: Sequence[Scan], warm_up: int) -> tuple[float, 
     for number, _ in enumerate(pipeline.run(scans)):
         if number + 1 == warm_up:
             clock = _clock()
-    if pipeline.global_map is not None:
-        pipeline.global_map.points()  # what waits to be merged is part of the work
-    if graph is not None and pipeline.global_map is not None:
-        finish_graph(graph, len(scans), pipeline.global_map.voxel_size_m)
+    if pipeline.map.global_map is not None:
+        pipeline.map.global_map.points()  # what waits to be merged is part of the work
+    if graph is not None and pipeline.map.global_map is not None:
+        finished = FinishedGraph.of_recordings(graph, [len(scans)], pipeline.map.global_map.voxel_size_m)
+        assert finished is not None
+        finished.outcome([0])
         graph.close()
     odometry.close()
     return clock()

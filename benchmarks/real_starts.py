@@ -40,7 +40,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
+from lidarslam.pipeline.scan_stream import in_order
 
 # Methods that `lidarslam run` has, and the options that choose them.
 OPTIONS: dict[str, tuple[str, ...]] = {

@@ -23,29 +23,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mapping_accuracy import METHODS, make_simulation, print_row
+from simulated_faults import (
+    Cover,
+    Faulty,
+    carried_off,
+    covered,
+    dropped,
+    even_tunnel,
+    index_back,
+    open_plain,
+    passing_by,
+    standing_still,
+    straight_drive,
+)
 
 from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.mounts import mount_pose
-from lidarslam.simulation.recording.faults import (
-    Cover,
-    Faulty,
-    carried_off,
-    covered,
-    dropped,
-    index_back,
-    passing_by,
-    standing_still,
-)
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.worlds.featureless import even_tunnel, open_plain, straight_drive
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import GlobalMapConfig
 from mapping.global_map.moved_points import seen_through
@@ -160,11 +163,11 @@ def run(case: Case, config: Config) -> tuple[list[ScanResult], FloatArray]:
         results = list(pipeline.run(case.recorded.scans))
     finally:
         odometry.close()
-    if pipeline.global_map is None:
+    if pipeline.map.global_map is None:
         return results, np.empty((0, 3))
-    points = pipeline.global_map.points()
-    views = pipeline.views.placed(np.array([result.T_world_lidar for result in results]))
-    return results, points[~seen_through(points, views, pipeline.global_map.voxel_size_m)]
+    points = pipeline.map.global_map.points()
+    views = pipeline.map.views.placed(np.array([result.T_world_lidar for result in results]))
+    return results, points[~seen_through(points, views, pipeline.map.global_map.voxel_size_m)]
 
 
 def row(case: Case, name: str, wrong_m: float, keep_moved: bool, verbose: bool) -> list[str]:

@@ -1,4 +1,4 @@
-"""The command line: what is around every command, and where the program begins; the commands have a file each."""
+"""The command line; each command has a file in `lidarslam.commands`."""
 
 import errno
 import io
@@ -19,7 +19,7 @@ from lidarslam.commands.info import info
 from lidarslam.commands.merge import merge
 from lidarslam.commands.run import run
 from lidarslam.commands.simulate import simulate
-from lidarslam.commands.terminal import EXIT_MENDABLE, tell
+from lidarslam.commands.terminal import EXIT_MENDABLE, note
 from lidarslam.commands.train import train
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
@@ -31,73 +31,65 @@ logger = logging.getLogger(__name__)
 
 
 class _Group(click.Group):
-    """Turns what the user can mend into one line on standard error and exit status 1."""
+    """Turns errors that the user can mend into one line on standard error and exit status 1."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        _hold_standard_streams()
-        _speak_any_encoding()
+        _prepare_streams()
         keep_rerun_to_itself()
         try:
-            _require_place()
+            if not _has_current_folder():
+                raise InputError("the current folder was removed; change to another")
             with ended_like_interrupted():
                 return super().invoke(ctx)
         except LidarSlamError as error:
-            tell(str(error))
-            ctx.exit(EXIT_MENDABLE)
+            note(str(error))
         except UnicodeEncodeError as error:
-            tell(f"{error.object}: not a name that every program can read; rename it")
-            ctx.exit(EXIT_MENDABLE)
+            note(f"{error.object}: the name is not valid Unicode; rename it")
         except MemoryError:
-            tell("memory ran out; close other programs, or take fewer scans at a time with --start and --stop")
-            logger.info("where it came from", exc_info=True)
-            ctx.exit(EXIT_MENDABLE)
+            note("out of memory; close other programs, or take fewer scans with --start and --stop")
+            logger.info("raised here:", exc_info=True)
         except OSError as error:
-            if error.errno == errno.EPIPE:  # a reader that has had enough, such as head; click ends quietly
+            if error.errno == errno.EPIPE:  # the reader of the output has ended, such as head; click ends quietly
                 raise
             _drop_unwritable_output()
             place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
-            tell(f"{place}{error.strerror or error}")
-            logger.info("where it came from", exc_info=True)
-            ctx.exit(EXIT_MENDABLE)
+            note(f"{place}{error.strerror or error}")
+            logger.info("raised here:", exc_info=True)
+        raise click.exceptions.Exit(EXIT_MENDABLE)
+
+
+def _prepare_streams() -> None:
+    """Open closed standard streams, whose numbers the next file would get, and spell out unknown characters."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+    sys.stdout = sys.stdout or Path(os.devnull).open("w")  # noqa: SIM115
+    sys.stderr = sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _drop_unwritable_output() -> None:
-    """Spare Python from trying, and complaining, once more at its end when standard output is a full disk."""
+    """Keep Python from writing to a full disk once more at its end."""
     try:
         sys.stdout.flush()
     except OSError:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
 
 
-def _hold_standard_streams() -> None:
-    """Where a standard stream is closed, a file opened next would take its number, and a library's words with it."""
-    for descriptor in range(3):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
-    if sys.stdout is None:
-        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
-    if sys.stderr is None:
-        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115
-
-
-def _require_place() -> None:
-    """Libraries fail in strange ways where the folder one stands in was removed."""
+def _has_current_folder() -> bool:
     try:
         Path.cwd()
     except FileNotFoundError:
-        raise InputError("the folder you stand in is gone; change to another") from None
-
-
-def _speak_any_encoding() -> None:
-    """What the terminal has no letter for is spelt out, instead of ending a run at its last line."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+        return False
+    return True
 
 
 class _PlainFormatter(logging.Formatter):
-    """Log lines may hold names out of recordings too."""
+    """Log lines may hold names from recordings too."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -107,16 +99,12 @@ class _PlainFormatter(logging.Formatter):
     "lidarslam", cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.version_option(package_name="lidarslam", message="%(prog)s %(version)s")
-@click.option("-v", "--verbose", is_flag=True, help="Say more about what is going on.")
+@click.option("-v", "--verbose", is_flag=True, help="Log more.")
 def main(verbose: bool) -> None:
-    """Trajectories and maps from recorded LiDAR runs, and how good they are."""
-    for stream in (sys.stdout, sys.stderr):  # a file's name may hold what the terminal cannot show
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-    level = logging.INFO if verbose else logging.WARNING
+    """LiDAR SLAM: trajectories and maps of recordings, and their accuracy."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_PlainFormatter("lidarslam: %(message)s"))
-    logging.basicConfig(level=level, handlers=[handler])
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
 
 
 for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, config):
@@ -124,16 +112,12 @@ for _command in (demo, info, run, merge, simulate, train, export, evaluate, view
 
 
 def entry_point() -> None:
-    """The program: what `lidarslam` starts."""
+    """The program `lidarslam`."""
     status = 0
     try:
-        main()
+        main(prog_name="lidarslam")
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else int(end.code is not None)
         raise
     finally:
         leave_if_abandoned(status)
-
-
-if __name__ == "__main__":
-    entry_point()

@@ -1,1 +1,1 @@
-"""From motions to maps: deskewing, the global map, and what corrects both."""
+"""Scan-to-map registration, tracking, loop closure, pose graph and global map."""

@@ -1,30 +1,63 @@
-"""Motion compensation: every point of a sweep where it would have been seen at the scan's stamp."""
+"""Motion compensation (deskewing) of sweeps to the scan's stamp."""
 
 import math
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray, log
+from lidarslam.core.state import Shape
 
-# Below this angle, squared, series are exact to double precision.
+# Below this squared angle the series are exact to double precision.
 _SERIES_ANGLE2 = 0.25
 _SINE = tuple((-1) ** k / math.factorial(2 * k + 1) for k in range(8))
 _VERSINE = tuple((-1) ** k / math.factorial(2 * k + 2) for k in range(8))
 _CUBIC = tuple((-1) ** k / math.factorial(2 * k + 3) for k in range(8))
 
 
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Points of a scan as measured, each in the LiDAR frame of its own instant.
+
+    Attributes:
+        points: (N, 3).
+        times: (N,) seconds from the stamp; None when the points are motion compensated already.
+    """
+
+    points: Annotated[FloatArray, Shape(None, 3)]
+    times: Annotated[FloatArray, Shape(None)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.times is not None and len(self.times) != len(self.points):
+            raise ValueError(f"{len(self.times)} times of {len(self.points)} points")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, chosen: NDArray[np.intp]) -> "Sweep":
+        """The points with some indices."""
+        times = None if self.times is None else self.times.take(chosen)
+        return Sweep(self.points.take(chosen, axis=0), times)
+
+    def compensated(self, velocity: FloatArray) -> FloatArray:
+        """The points (N, 3) in the LiDAR frame at the stamp, for a constant velocity (6,)."""
+        return self.points if self.times is None else move(self.points, self.times, velocity)
+
+
 def body_velocity(T_prev_curr: FloatArray, interval_s: float) -> FloatArray:
-    """The constant velocity (6,) in the body's frame, rotation first, that makes a motion in a time."""
+    """Constant body velocity (6,), rotation first, of a motion (4, 4) over an interval."""
     return log(T_prev_curr) / interval_s
 
 
 def deskew(
     points: FloatArray, time_offsets: FloatArray, velocity_before: FloatArray, velocity_after: FloatArray
 ) -> FloatArray:
-    """Move points to the scan's stamp, given how the sensor moved up to it and from it on.
+    """Move points to the scan's stamp, with one velocity before the stamp and one after it.
 
-    A point seen at offset t from the stamp lies at `exp(t * velocity)` in the frame of the stamp.
+    A point `p` measured at offset t lies at `exp(t * velocity) p` in the frame of the stamp.
 
     Args:
         points: (N, 3) as measured, each in the LiDAR frame of its own instant.
@@ -32,21 +65,16 @@ def deskew(
         velocity_before: (6,) for points before the stamp, rotation first, in the frame of the stamp.
         velocity_after: (6,) for points after it.
     """
-    if not len(points):
-        return points
-    if time_offsets.min() >= 0.0 or np.array_equal(velocity_before, velocity_after):
+    if np.array_equal(velocity_before, velocity_after):
         return move(points, time_offsets, velocity_after)
-    if time_offsets.max() <= 0.0:
-        return move(points, time_offsets, velocity_before)
-    before = time_offsets < 0.0
     moved = np.empty_like(points)
-    moved[before] = move(points[before], time_offsets[before], velocity_before)
-    moved[~before] = move(points[~before], time_offsets[~before], velocity_after)
+    for part, velocity in ((time_offsets < 0.0, velocity_before), (time_offsets >= 0.0, velocity_after)):
+        moved[part] = move(points[part], time_offsets[part], velocity)
     return moved
 
 
 def move(points: FloatArray, t: FloatArray, velocity: FloatArray) -> FloatArray:
-    """`exp(t * velocity)` applied to points (N, 3), each at its own time (N,), without a matrix a point.
+    """`exp(t * velocity)` applied to points (N, 3), each at its own time (N,), without a matrix for each point.
 
     Rodrigues' formula for the rotation, the left Jacobian for the translation.
     """
@@ -58,53 +86,31 @@ def move(points: FloatArray, t: FloatArray, velocity: FloatArray) -> FloatArray:
 @compiled
 def _move(points: FloatArray, t: FloatArray, velocity: FloatArray, moved: FloatArray) -> None:
     rate2 = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
-    longest = 0.0
-    for n in range(len(t)):
-        longest = max(longest, abs(t[n]))
-    # Without branches and functions the processor takes several points at once.
-    if rate2 * longest * longest < _SERIES_ANGLE2:
-        for n in range(len(points)):
-            _move_one(n, points, t[n], velocity, _series(rate2 * t[n] * t[n]), moved)
-    else:
-        for n in range(len(points)):
-            _move_one(n, points, t[n], velocity, _closed(rate2 * t[n] * t[n]), moved)
+    for n in range(len(points)):
+        s = t[n]
+        sine, versine, cubic = _coefficients(rate2 * s * s)
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        a, b, c = s * velocity[0], s * velocity[1], s * velocity[2]
+        u, v, w = s * velocity[3], s * velocity[4], s * velocity[5]
+        # Cross products of the rotation vector with the point, twice, and with the translation.
+        px, py, pz = b * z - c * y, c * x - a * z, a * y - b * x
+        qx, qy, qz = b * pz - c * py, c * px - a * pz, a * py - b * px
+        gx, gy, gz = b * w - c * v, c * u - a * w, a * v - b * u
+        hx, hy, hz = b * gz - c * gy, c * gx - a * gz, a * gy - b * gx
+        moved[n, 0] = x + sine * px + versine * (qx + gx) + u + cubic * hx
+        moved[n, 1] = y + sine * py + versine * (qy + gy) + v + cubic * hy
+        moved[n, 2] = z + sine * pz + versine * (qz + gz) + w + cubic * hz
 
 
 @compiled
-def _move_one(
-    n: int, points: FloatArray, s: float, velocity: FloatArray, coefficients: tuple[float, float, float],
-    moved: FloatArray,
-) -> None:  # fmt: skip
-    """The exponential of s times the velocity, applied to a point."""
-    sine, versine, cubic = coefficients
-    x, y, z = points[n, 0], points[n, 1], points[n, 2]
-    a, b, c = s * velocity[0], s * velocity[1], s * velocity[2]
-    u, v, w = s * velocity[3], s * velocity[4], s * velocity[5]
-    # The rotation vector's cross product with the point, and again with that; and so with the translation.
-    px, py, pz = b * z - c * y, c * x - a * z, a * y - b * x
-    qx, qy, qz = b * pz - c * py, c * px - a * pz, a * py - b * px
-    gx, gy, gz = b * w - c * v, c * u - a * w, a * v - b * u
-    hx, hy, hz = b * gz - c * gy, c * gx - a * gz, a * gy - b * gx
-    moved[n, 0] = x + sine * px + versine * (qx + gx) + u + cubic * hx
-    moved[n, 1] = y + sine * py + versine * (qy + gy) + v + cubic * hy
-    moved[n, 2] = z + sine * pz + versine * (qz + gz) + w + cubic * hz
-
-
-@compiled
-def _series(squared: float) -> tuple[float, float, float]:
-    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3 of a^2 below a quarter, to double precision."""
-    x, s, v, c = squared, _SINE, _VERSINE, _CUBIC
-    sine = s[0] + x * (s[1] + x * (s[2] + x * (s[3] + x * (s[4] + x * (s[5] + x * (s[6] + x * s[7]))))))
-    versine = v[0] + x * (v[1] + x * (v[2] + x * (v[3] + x * (v[4] + x * (v[5] + x * (v[6] + x * v[7]))))))
-    cubic = c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * (c[5] + x * (c[6] + x * c[7]))))))
-    return sine, versine, cubic
-
-
-@compiled
-def _closed(squared: float) -> tuple[float, float, float]:
-    """The same of any a^2."""
+def _coefficients(squared: float) -> tuple[float, float, float]:
+    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3 of a^2, by their series for small angles."""
     if squared < _SERIES_ANGLE2:
-        return _series(squared)
+        x, s, v, c = squared, _SINE, _VERSINE, _CUBIC
+        sine = s[0] + x * (s[1] + x * (s[2] + x * (s[3] + x * (s[4] + x * (s[5] + x * (s[6] + x * s[7]))))))
+        versine = v[0] + x * (v[1] + x * (v[2] + x * (v[3] + x * (v[4] + x * (v[5] + x * (v[6] + x * v[7]))))))
+        cubic = c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * (c[5] + x * (c[6] + x * c[7]))))))
+        return sine, versine, cubic
     angle = math.sqrt(squared)
     sine, half = math.sin(angle), math.sin(0.5 * angle)
     return sine / angle, 2.0 * half * half / squared, (angle - sine) / (squared * angle)

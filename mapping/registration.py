@@ -1,60 +1,44 @@
-"""Scan-to-map registration: the pose, and the velocity during the sweep, that lay a scan on the map.
+"""Scan-to-map registration: pose at the stamp, and velocity during the sweep, by point-to-plane Gauss-Newton.
 
-Each point is pulled towards a plane of the map, each edge point towards a line. The pulls are linearised and solved
-(Gauss-Newton on the manifold), the surfaces looked up again, until nothing moves: LOAM's scan matching (Zhang and
-Singh, RSS 2014) with robust weights. A sweep is no snapshot, so the sensor's velocity during it is estimated together
-with the pose at its stamp, as begin and end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
+Correspondences with the map's surfels are found anew at every iteration, as in LOAM (Zhang and Singh, RSS 2014), with
+robust weights. The sensor moves during a sweep, so that its velocity is estimated together with its pose, as begin and
+end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from mapping.config import RefinementConfig
 from mapping.degeneracy import find_degeneracy
-from mapping.deskew import move
-from mapping.prediction import Prediction
-from mapping.surfels.surfel_map import LEVELS, LocalMap, Matches
+from mapping.deskew import Sweep, body_velocity
+from mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
+from mapping.prediction import MotionState, Prediction
+from mapping.sampling import MIN_CORRESPONDENCES
+from mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
 
-# Standard deviation of a range measurement: no surface is known better than that.
+# Iterations on each coarse level, and in all; the second pair where the start is a guess.
+_ITERATIONS, _PATIENT_ITERATIONS = (3, 20), (10, 40)
+# Steps below these end the iteration; on a coarse level, below this share of a cell.
+_CONVERGED_ROTATION, _CONVERGED_TRANSLATION_M = np.deg2rad(0.02), 0.001
+_COARSE_CONVERGED = 0.1
+# Standard deviation of a range measurement: no surface is known better.
 _RANGE_NOISE_M = 0.02
-# The kernel's scale follows the residuals: this many times their median, within bounds in cells.
-_SCALE_PER_MEDIAN = 1.5
-_LEAST_SCALE = 0.03
-# A step of less than this share of a cell makes the next finer cells the better ones.
-_SETTLED = 0.1
-# Farther from its surface than this, in cells, a point belongs to something else.
+# Scale of the robust kernel: this many times the median residual, at least this share of a cell.
+_SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
+# Residuals beyond this, in cells, are outliers.
 _GATE = 6.0
-# How firmly the prior is kept along directions that the matches leave open: as if measured to a tenth of a millimetre.
-_HELD = 1e8
-# Neighbouring points err together, and count for as much less; compared with true errors on simulated recordings.
+# Information of the prediction along degenerate directions: that of a tenth of a millimetre.
+_DEGENERATE_INFORMATION = 1e8
+# Errors of neighbouring points are correlated: so many count as one. From true errors on simulated recordings.
 _CORRELATION = 25.0
+# A velocity that differs by less than this over the interval needs no second compensation.
+_SAME_ROTATION, _SAME_TRANSLATION_M = np.deg2rad(0.1), 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
-    """The points of a scan that are registered, as measured: each in the LiDAR frame of its own instant.
-
-    Attributes:
-        planes, edges: (N, 3) and (E, 3).
-        plane_times, edge_times: (N,) and (E,) seconds from the stamp; None when the scan is compensated already.
-    """
-
-    planes: FloatArray
-    edges: FloatArray
-    plane_times: FloatArray | None = None
-    edge_times: FloatArray | None = None
-
-    @property
-    def is_rolling(self) -> bool:
-        """Whether the points were measured at different times."""
-        return self.plane_times is not None
-
-
-@dataclass(frozen=True, eq=False)
-class Refined:
+class Registration:
     """A registered scan.
 
     Attributes:
@@ -63,7 +47,7 @@ class Refined:
         covariance: (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`:
             rotation first, in the LiDAR frame, as GTSAM has it.
         degeneracy: the directions along which the prediction was kept.
-        iterations: how many it took.
+        iterations: of Gauss-Newton.
     """
 
     T_world_lidar: FloatArray
@@ -73,113 +57,81 @@ class Refined:
     iterations: int
 
 
-def refine(
-    sweep: Sweep,
-    prediction: Prediction,
-    local_map: LocalMap,
-    config: RefinementConfig,
-    coarse_first: bool,
-    with_velocity: bool,
-) -> Refined | None:
-    """Register a sweep to the map, from a prediction.
+def register(
+    sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap, with_velocity: bool, coarse_first: bool = True,
+    patient: bool = False,
+) -> Registration | None:  # fmt: skip
+    """Register a sweep to the map; None where it has too few correspondences.
 
     Args:
-        sweep: the points.
-        prediction: where to start, and what is kept where the map does not tell.
-        local_map: what is registered to.
-        config: limits of the iteration.
-        coarse_first: whether the prediction may be off by more than a cell.
-        with_velocity: whether the velocity during the sweep is estimated too.
-
-    Returns:
-        None when too few points meet a surface.
+        sweep: the keypoints.
+        prediction: start, and prior with its covariance.
+        surfel_map: local map.
+        with_velocity: whether to estimate the velocity during the sweep.
+        coarse_first: whether to begin on coarse cells, for predictions that may be off by more than half a cell.
+        patient: whether to allow more iterations.
     """
-    T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
-    rolling = with_velocity and sweep.is_rolling
-    schedule = _Schedule(config, local_map.cell_m, coarse_first)
-    while True:
-        points, matches = _match(sweep, T_world_lidar, velocity, local_map, schedule.level)
-        if len(matches) < config.min_matches:
+    T_world_lidar, velocity, iterations = prediction.T_world_lidar, prediction.velocity, 0
+    coarse, most = _PATIENT_ITERATIONS if patient else _ITERATIONS
+    try:
+        for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
+            cell_m = surfel_map.cell_m * LEVELS[level]
+            for _ in range(coarse if level else most - iterations):
+                points = sweep.compensated(velocity)
+                matches = surfel_map.match(transform_points(T_world_lidar, points), T_world_lidar, level)
+                if len(matches) < MIN_CORRESPONDENCES:
+                    return None
+                system = _Linearised.at(T_world_lidar, points, matches, cell_m)
+                times = sweep.times.take(matches.index) if with_velocity and sweep.times is not None else None
+                solution = _solve(system, times, prediction, T_world_lidar, velocity)
+                T_world_lidar = T_world_lidar @ exp(solution.step[:6])
+                velocity = velocity + solution.step[6:]
+                iterations += 1
+                if _has_converged(solution.step, level, cell_m, system.lever_m):
+                    break
+        covariance = solution.covariance()
+    except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
+        return None
+    return Registration(orthonormalize(T_world_lidar), velocity, covariance, solution.degeneracy, iterations)
+
+
+def with_mean_velocity(
+    registration: Registration, sweep: Sweep, prediction: Prediction, last: MotionState, surfel_map: SurfelMap,
+    patient: bool,
+) -> Registration | None:  # fmt: skip
+    """The registration with the mean velocity since the last scan, where none was estimated during the sweep.
+
+    A sweep that was compensated with another velocity is compensated and registered again.
+    """
+    interval_s = prediction.stamp - last.stamp
+    velocity = body_velocity(inverse(last.T_world_lidar) @ registration.T_world_lidar, interval_s)
+    change = np.abs(velocity - prediction.velocity) * interval_s
+    same = np.linalg.norm(change[:3]) < _SAME_ROTATION and np.linalg.norm(change[3:]) < _SAME_TRANSLATION_M
+    if sweep.times is not None and not same:
+        again = replace(prediction, T_world_lidar=registration.T_world_lidar, velocity=velocity)
+        second = register(sweep, again, surfel_map, with_velocity=False, coarse_first=False, patient=patient)
+        if second is None:
             return None
-        system = _Linearised.at(T_world_lidar, points, matches, schedule.cell_m)
-        times = _times(sweep, matches) if rolling else None
-        try:
-            solution = _solve(system, times, prediction, T_world_lidar, velocity)
-        except np.linalg.LinAlgError:  # nothing holds the pose, not even the prediction
-            return None
-        T_world_lidar = T_world_lidar @ exp(solution.pose_step)
-        velocity = velocity + solution.velocity_step
-        if schedule.is_done_after(solution.pose_step, system.lever_m):
-            break
-    return Refined(
-        orthonormalize(T_world_lidar), velocity, solution.covariance, solution.degeneracy, schedule.iterations
-    )
+        registration = second
+        velocity = body_velocity(inverse(last.T_world_lidar) @ registration.T_world_lidar, interval_s)
+    pose = registration.covariance[:6, :6]
+    covariance = np.block([
+        [pose, pose / interval_s],
+        [pose / interval_s, (pose + last.covariance[:6, :6]) / interval_s**2],
+    ])  # fmt: skip
+    return replace(registration, velocity=velocity, covariance=covariance)
 
 
-def compensated(points: FloatArray, times: FloatArray | None, velocity: FloatArray) -> FloatArray:
-    """Points (N, 3) as they would have been seen at the stamp."""
-    return points if times is None or not len(points) else move(points, times, velocity)
-
-
-def _match(
-    sweep: Sweep, T_world_lidar: FloatArray, velocity: FloatArray, local_map: LocalMap, level: int
-) -> tuple[FloatArray, Matches]:
-    """The compensated points (N + E, 3), planes first, and what they are pulled to."""
-    planes = compensated(sweep.planes, sweep.plane_times, velocity)
-    matches = local_map.match_planes(transform_points(T_world_lidar, planes), T_world_lidar, first_level=level)
-    if not len(sweep.edges):
-        return planes, matches
-    edges = compensated(sweep.edges, sweep.edge_times, velocity)
-    lines = local_map.match_lines(transform_points(T_world_lidar, edges))
-    shifted = Matches(lines.index + len(planes), lines.points, lines.normals, lines.thickness_m, lines.tilt)
-    return np.concatenate([planes, edges]), Matches.join([matches, shifted])
-
-
-def _times(sweep: Sweep, matches: Matches) -> FloatArray:
-    assert sweep.plane_times is not None
-    times = sweep.plane_times
-    if sweep.edge_times is not None and len(sweep.edge_times):
-        times = np.concatenate([times, sweep.edge_times])
-    return times.take(matches.index)
-
-
-class _Schedule:
-    """Which cells the next step looks at: coarse ones until the pose is within the next finer ones' reach."""
-
-    def __init__(self, config: RefinementConfig, finest_m: float, coarse_first: bool) -> None:
-        self._config = config
-        self._finest_m = finest_m
-        self.level = len(LEVELS) - 1 if coarse_first and config.coarse_iterations else 0
-        self._steps_at_level = 0
-        self.iterations = 0
-
-    @property
-    def cell_m(self) -> float:
-        """The cells' size at the present level."""
-        return self._finest_m * LEVELS[self.level]
-
-    def is_done_after(self, step: FloatArray, lever_m: float) -> bool:
-        """Take note of a step (6,); whether it was the last."""
-        self.iterations += 1
-        self._steps_at_level += 1
-        if self.level == 0:
-            return self.iterations >= self._config.max_iterations or self._has_converged(step)
-        has_settled = displacement_m(step, lever_m) < _SETTLED * self.cell_m
-        if self._steps_at_level >= self._config.coarse_iterations or has_settled:
-            self.level -= 1
-            self._steps_at_level = 0
-        return False
-
-    def _has_converged(self, step: FloatArray) -> bool:
-        return bool(
-            np.linalg.norm(step[:3]) < np.deg2rad(self._config.converged_rotation_deg)
-            and np.linalg.norm(step[3:]) < self._config.converged_translation_m
-        )
+def _has_converged(step: FloatArray, level: int, cell_m: float, lever_m: float) -> bool:
+    if level > 0:
+        return displacement_m(step[:6], lever_m) < _COARSE_CONVERGED * cell_m
+    rotation, translation_m = np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])
+    return bool(rotation < _CONVERGED_ROTATION and translation_m < _CONVERGED_TRANSLATION_M)
 
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """Residuals (M,) of the matches at a pose, and their change (M, 6) with a motion in the LiDAR frame."""
+    """Residuals (M,), their Jacobian (M, 6), information (M,) and tilt (M,) of the normals, at a pose."""
 
     residuals: FloatArray
     jacobian: FloatArray
@@ -188,84 +140,59 @@ class _Linearised:
     lever_m: float
 
     @classmethod
-    def at(cls, T_world_lidar: FloatArray, points: FloatArray, matches: Matches, cell_m: float) -> "_Linearised":
+    def at(
+        cls, T_world_lidar: FloatArray, points: FloatArray, matches: Correspondences, cell_m: float
+    ) -> "_Linearised":
         p = points.take(matches.index, axis=0)
         residuals = matches.residuals(transform_points(T_world_lidar, p))
-        normals = matches.normals @ T_world_lidar[:3, :3]
+        jacobian = point_to_plane_jacobian(p, matches.normals @ T_world_lidar[:3, :3])
+        size, thickness2 = np.abs(residuals), matches.thickness_m**2
+        scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), _LEAST_SCALE * cell_m)
+        weights = geman_mcclure(size, scale**2 + thickness2, thickness2 + _RANGE_NOISE_M**2)
+        weights[size > _GATE * cell_m] = 0.0
         lever_m = float(np.sqrt(np.einsum("ij,ij->", p, p) / max(len(p), 1)))
-        return cls(
-            residuals,
-            np.concatenate([_cross(p, normals), normals], axis=1),
-            _weights(residuals, matches.thickness_m, cell_m),
-            matches.tilt,
-            lever_m,
-        )
-
-
-def _weights(residuals: FloatArray, thickness_m: FloatArray, cell_m: float) -> FloatArray:
-    """Information of each residual, under the kernel of Geman and McClure with a scale that follows the residuals."""
-    size = np.abs(residuals)
-    variances = thickness_m**2 + _RANGE_NOISE_M**2
-    scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), _LEAST_SCALE * cell_m)
-    weights = 1.0 / ((1.0 + size**2 / (scale**2 + thickness_m**2)) ** 2 * variances)
-    weights[size > _GATE * cell_m] = 0.0
-    return np.asarray(weights, dtype=np.float64)
+        return cls(residuals, jacobian, weights, matches.tilt, lever_m)
 
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    pose_step: FloatArray
-    velocity_step: FloatArray
-    covariance: FloatArray
+    """A Gauss-Newton step (12,), with the Hessian (12, 12) of the correspondences and the prior's information."""
+
+    step: FloatArray
+    hessian: FloatArray
+    prior: FloatArray
     degeneracy: Degeneracy
+
+    def covariance(self) -> FloatArray:
+        """(12, 12); along degenerate directions the correspondences' information does not count."""
+        scale = np.array([self.degeneracy.lever_m] * 3 + [1.0] * 3)
+        D = self.degeneracy.directions
+        observed = np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
+        return np.asarray(np.linalg.inv(observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
 
 
 def _solve(
-    system: _Linearised,
-    times: FloatArray | None,
-    prediction: Prediction,
-    T_world_lidar: FloatArray,
+    system: _Linearised, times: FloatArray | None, prediction: Prediction, T_world_lidar: FloatArray,
     velocity: FloatArray,
-) -> _Solution:
+) -> _Solution:  # fmt: skip
     """One Gauss-Newton step of pose and, where `times` (M,) are given, velocity.
 
-    A point seen at time t moves with the velocity's change as with t times the pose's, to first order.
+    The Jacobian with the velocity is `t` times that with the pose, to first order.
     """
     J, r = system.jacobian, system.residuals
     degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
-    held = _HELD * degeneracy.projector()
+    held = _DEGENERATE_INFORMATION * degeneracy.projector()
     prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
-    away = np.concatenate([log(inverse(prediction.T_world_lidar) @ T_world_lidar), velocity - prediction.velocity])
+    error = np.concatenate([log(inverse(prediction.T_world_lidar) @ T_world_lidar), velocity - prediction.velocity])
     JW = J * (system.weights / _CORRELATION)[:, None]
-    matched, b = np.zeros((12, 12)), -prior @ away
-    matched[:6, :6] = JW.T @ J
-    b[:6] -= JW.T @ r + held @ away[:6]
-    holding = np.zeros((12, 12))
-    holding[:6, :6] = held
+    hessian, holding, b = np.zeros((12, 12)), np.zeros((12, 12)), -prior @ error
+    hessian[:6, :6], holding[:6, :6] = JW.T @ J, held
+    b[:6] -= JW.T @ r + held @ error[:6]
     if times is not None:
-        Jt = J * times[:, None]
-        JWt = JW * times[:, None]
-        matched[:6, 6:] = JW.T @ Jt
-        matched[6:, :6] = matched[:6, 6:].T
-        matched[6:, 6:] = JWt.T @ Jt
-        holding[6:, 6:] = held * float(np.mean(times**2))
-        b[6:] -= JWt.T @ r + holding[6:, 6:] @ away[6:]
-    step: FloatArray = np.asarray(np.linalg.solve(matched + prior + holding, b), dtype=np.float64)
-    return _Solution(step[:6], step[6:], _covariance(matched, prior, degeneracy), degeneracy)
-
-
-def _covariance(matched: FloatArray, prior: FloatArray, degeneracy: Degeneracy) -> FloatArray:
-    """The inverse of the information; along directions that were kept, the matches' share of it does not count."""
-    scale = np.array([degeneracy.lever_m] * 3 + [1.0] * 3)
-    D = degeneracy.directions
-    held_by_matches = np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
-    return np.asarray(np.linalg.inv(held_by_matches.T @ matched @ held_by_matches + prior), dtype=np.float64)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products (N, 3), several times as fast as NumPy's."""
-    out = np.empty_like(a)
-    out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-    out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
-    out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return out
+        Jt, JWt = J * times[:, None], JW * times[:, None]
+        hessian[:6, 6:] = JW.T @ Jt
+        hessian[6:, :6] = hessian[:6, 6:].T
+        hessian[6:, 6:], holding[6:, 6:] = JWt.T @ Jt, held * float(np.mean(times**2))
+        b[6:] -= JWt.T @ r + holding[6:, 6:] @ error[6:]
+    step: FloatArray = np.asarray(np.linalg.solve(hessian + prior + holding, b), dtype=np.float64)
+    return _Solution(step, hessian, prior, degeneracy)

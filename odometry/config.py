@@ -1,32 +1,42 @@
-"""Settings of the odometry methods; light, so that reading a configuration imports no method."""
+"""Settings of the odometry methods, and the description of a network that its weights carry; imports no method."""
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
-from lidarslam.core.limits import require_lost_worse, require_range_left
-from odometry.methods.learned_config import LearnedConfig
+from lidarslam.core.limits import require_range_left
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "external"]
+NetworkName = Literal["correlation", "delora"]
 
 
-class KissConfig(BaseModel):
-    """KISS-ICP's own parameters; the defaults are its defaults."""
+class LearnedConfig(BaseModel):
+    """The learned odometry; see `odometry.methods.learned`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_range_m: float = Field(100.0, gt=0.0)
-    min_range_m: float = Field(0.0, ge=0.0)
-    voxel_size_m: float | None = Field(None, gt=0.0, description="null: a hundredth of max_range_m")
-    max_points_per_voxel: int = Field(20, ge=1)
-    deskew: bool = True
-    max_iterations: int = Field(500, ge=1)
-    convergence: float = Field(1e-4, gt=0.0)
+    weights: Path | None = Field(
+        None, description="file of `lidarslam train` or folder of `lidarslam export`; null: the shipped network"
+    )
+    device: str = Field("cpu", min_length=1, description="torch's name of the device, such as cpu or cuda")
+    threads: int = Field(1, ge=1, description="of the network; mapping works beside it")
+    alignment: bool = Field(True, description="false: the network's motion as it is, for ablations")
+
+
+class KissConfig(BaseModel):
+    """KISS-ICP; the defaults are its own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    max_range_m: float = Field(100.0, gt=0.0, description="points farther away are left out")
+    min_range_m: float = Field(0.0, ge=0.0, description="points nearer are left out")
+    voxel_size_m: float | None = Field(None, gt=0.0, description="of the map; null: a hundredth of max_range_m")
+    max_points_per_voxel: int = Field(20, ge=1, description="of the map")
+    initial_threshold_m: float = Field(2.0, gt=0.0, description="first distance of correspondences, adapted later")
+    deskew: bool = Field(True, description="compensate the sensor's motion within each scan")
     threads: int = Field(0, ge=0, description="0: all cores")
-    initial_threshold_m: float = Field(2.0, gt=0.0)
-    min_motion_m: float = Field(0.1, gt=0.0)
-    fixed_threshold_m: float | None = Field(None, gt=0.0, description="switches the adaptive threshold off")
 
     @model_validator(mode="after")
     def _ranges_leave_something(self) -> Self:
@@ -34,29 +44,28 @@ class KissConfig(BaseModel):
         return self
 
 
-class ConsistencyConfig(BaseModel):
-    """When two consecutive scans are said to fit each other; see `odometry.methods.consistency`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    queries: int = Field(1000, ge=100, description="points of the new scan that are looked up in the previous one")
-    gate_ratio: float = Field(0.02, gt=0.0, description="largest residual of an inlier, as a fraction of its range")
-    gate_min_m: float = Field(0.10, gt=0.0, description="smallest gate, for points close to the sensor")
-    degraded_below: float = Field(0.70, ge=0.0, le=1.0, description="inlier ratio under which a scan is degraded")
-    lost_below: float = Field(0.40, ge=0.0, le=1.0, description="inlier ratio under which a scan is lost")
-
-    @model_validator(mode="after")
-    def _lost_is_worse_than_degraded(self) -> Self:
-        require_lost_worse(self.lost_below, self.degraded_below)
-        return self
-
-
 class OdometryConfig(BaseModel):
-    """Which method gives the motion between scans, and how it is set."""
+    """The scan-to-scan odometry."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: OdometryName = "learned"
+    method: OdometryName = Field("learned", description="learned, kiss-icp, constant-velocity or external (--prior)")
     learned: LearnedConfig = LearnedConfig()
     kiss_icp: KissConfig = KissConfig()
-    consistency: ConsistencyConfig = ConsistencyConfig()
+
+
+class ImageConfig(BaseModel):
+    """Size of the network's range images; columns go round once, rows span the sensor's elevations."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    rows: int = Field(16, ge=16, le=256, multiple_of=4, description="of elevation")
+    columns: int = Field(720, ge=64, le=4096, multiple_of=4, description="of azimuth")
+
+
+class NetworkConfig(BaseModel):
+    """The network that compares two scans."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: NetworkName = Field("correlation", description="correlation (default), or delora, the paper's")

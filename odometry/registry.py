@@ -1,10 +1,9 @@
-"""Which odometry methods there are; a method's module is imported when it is chosen."""
+"""The odometry methods by name; a method's module is imported when it is chosen."""
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
-from odometry.config import OdometryConfig
+from odometry.config import LearnedConfig, OdometryConfig
 from odometry.interface import Odometry
-from odometry.methods.learned_config import LearnedConfig
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
@@ -16,7 +15,7 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
 
     Raises:
         ConfigError: the method is `external` and there is no prior, or the other way round; or the learned odometry's
-            device is not there, or its weights did not come along.
+            device or its shipped weights are missing.
         InputError: the learned odometry's weights are no weights.
     """
     if (config.method == "external") != (prior is not None):
@@ -27,7 +26,7 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         return ExternalOdometry(prior)
     if config.method == "learned":
         return _make_learned(config.learned)
-    if config.method != "constant-velocity":
+    if config.method == "kiss-icp":
         from odometry.methods.kiss import KissOdometry
 
         return KissOdometry(config.kiss_icp)
@@ -37,16 +36,15 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
 
 
 def _make_learned(config: LearnedConfig) -> Odometry:
-    """By ONNX Runtime, which starts at once; by torch with a file of weights, or on an accelerator."""
+    """With ONNX Runtime, which starts at once; with torch for a file of weights, or on an accelerator."""
     from odometry.methods.learned import LearnedOdometry
 
     if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
-        from odometry.network.exported import read_exported
-        from odometry.network.onnx_graphs import onnx_search
+        from odometry.network.exported import onnx_search, read_exported
         from odometry.network.shipped import shipped_folder
 
         exported = read_exported(config.weights or shipped_folder())
-        return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config)
+        return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config.alignment)
     from odometry.network.checkpoint import load_checkpoint, network_of
     from odometry.network.shipped import default_weights
     from odometry.network.torch_graphs import torch_search
@@ -57,4 +55,4 @@ def _make_learned(config: LearnedConfig) -> Odometry:
     except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts that it has it
         reason = str(error).splitlines()[0]
         raise ConfigError(f"odometry.learned.device={config.device}: torch cannot use it ({reason})") from error
-    return LearnedOdometry(search, checkpoint.images, config)
+    return LearnedOdometry(search, checkpoint.images, config.alignment)

@@ -26,8 +26,8 @@ MAY_IMPORT = {
 }
 # The way down is cli -> commands -> run -> pipeline -> libraries: nobody looks up it.
 RUN = (
-    *(f"lidarslam.run.{part}" for part in ("run", "request", "results", "tracking", "watch")),
-    "lidarslam.resume.run_state",
+    *(f"lidarslam.run.{part}" for part in ("run", "request", "results", "tracking")),
+    "lidarslam.resume.checkpoints",
 )
 MAY_NOT_IMPORT = {
     "lidarslam": ("lidarslam.cli", "lidarslam.commands"),
@@ -43,18 +43,19 @@ CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}}
 CONFINED = {
     "kiss_icp": ("odometry.methods.kiss*",),
     "gtsam": ("mapping.pose_graph.optimizer",),
-    "rerun": ("lidarslam.viewer.rerun_viewer",),
+    "rerun": ("lidarslam.viewer.rerun_*",),
     "click": ("lidarslam.cli", "lidarslam.commands.*"),
     "laspy": ("lidarslam.evaluate.reference_cloud",),
     "pye57": ("lidarslam.evaluate.reference_cloud",),
-    "lightning_fabric": ("lidarslam.train.devices",),
+    "jinja2": ("evaluation.report.report",),
+    "plotly": ("evaluation.report.*",),
     "safetensors": ("odometry.network.tensor_file",),
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("odometry.network.export",),
     "onnxscript": ("odometry.network.export",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
 }
-HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "lightning_fabric", "numba"}
+HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "common", "base", "helpers", "helper", "misc", "tools"}
 
 

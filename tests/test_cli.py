@@ -1,5 +1,6 @@
 """The command line as a stranger meets it: help, exit statuses, one-line errors."""
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -16,11 +17,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.merge.merge import MergeOutcome
-from lidarslam.run.summary import MergedRecording, MergeSummary, WrittenMap
-from lidarslam.viewer.rerun_viewer import Served
-from odometry.images.image_config import ImageConfig
+from lidarslam.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.summary import WrittenMap
+from odometry.config import ImageConfig, NetworkConfig
 from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.network_config import CorrelationConfig, NetworkConfig
 from odometry.network.networks import make_network
 
 
@@ -74,7 +74,7 @@ def test_run_exits_with_3_when_tracking_was_lost(recording: Path, tmp_path: Path
     np.save(recording / "000003.npy", np.full((100, 3), np.nan))
     result = lidarslam("run", recording, "--out", tmp_path / "run")
     assert result.exit_code == 3
-    assert "LOST on scan 3: there is no point within range" in result.output
+    assert "LOST on scan 3: no points within range" in result.output
     assert (tmp_path / "run" / "map.ply").exists()
 
 
@@ -89,7 +89,7 @@ def test_a_prior_is_an_odometry_of_its_own(recording: Path, tmp_path: Path) -> N
 
 
 def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Path) -> None:
-    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), bird_width=4))
+    network = NetworkConfig()
     weights = tmp_path / "weights of mine: 1.safetensors"
     images = ImageConfig(columns=180)
     save_checkpoint(weights, checkpoint_of(make_network(network), network, images))
@@ -101,7 +101,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
     for other in (("--odometry", "kiss-icp"), ("--odometry", "constant-velocity"), ("--prior", prior)):
         refused = lidarslam("run", recording, "--out", tmp_path / "other", "--weights", weights, *other)
         assert refused.exit_code == 2
-        assert "--weights are those of the learned odometry" in refused.stderr
+        assert "--weights belongs to --odometry learned" in refused.stderr
         assert not (tmp_path / "other").exists()
 
 
@@ -123,7 +123,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         (
             ["run", "{recording}", "--out", "{out}", "--weights", "{recording}/timestamps.txt"],
             1,
-            "timestamps.txt: is no safetensors file; expected weights",
+            "timestamps.txt: is not weights that lidarslam wrote",
         ),
         (["run", "{recording}", "--out", "{out}", "--start", "9"], 1, "none of its 5 scans is left"),
         (["run", "{recording}", "--out", "{out}", "--set", "odometry.kiss=1"], 1, "did you mean kiss_icp?"),
@@ -238,7 +238,7 @@ def test_options_that_the_source_has_no_use_for_are_named(recording: Path) -> No
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a full disk at hand")
 def test_a_full_disk_gets_one_line() -> None:
     with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "lidarslam.cli", "config"]
+        command = [sys.executable, "-m", "lidarslam", "config"]
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert ended.stderr == "lidarslam: No space left on device\n"
     assert ended.returncode == 1
@@ -257,9 +257,9 @@ def test_view_says_where_the_browser_is_served(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert lidarslam("run", recording, "--out", tmp_path / "run", "--stop", 2).exit_code == 0
-    served = Served("http://127.0.0.1:9090/?url=there", None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr("lidarslam.viewer.rerun_viewer.show_runs", lambda *_: served)
+    served = contextlib.nullcontext("http://127.0.0.1:9090/?url=there")
+    monkeypatch.setattr("lidarslam.viewer.rerun_runs.served_runs", lambda *_: served)
     monkeypatch.setattr("signal.pause", lambda: None)
     lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
     assert lines[0] == "http://127.0.0.1:9090/?url=there"
-    assert lines[1].startswith("serving this machine alone until you press Ctrl-C; ")
+    assert lines[1].startswith("serving this machine until Ctrl-C; ")

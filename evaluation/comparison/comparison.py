@@ -1,4 +1,4 @@
-"""What a comparison of methods holds: plain values that the report draws and comparison.json keeps."""
+"""Results of a comparison of methods: plain values that the report draws and comparison.json keeps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,19 +7,22 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.comparison.summary_table import SummaryTable
+from evaluation.comparison.table import Table
 from evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 
 MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
 """`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with what there was. The last four:
-nothing to show but the message; `not run`: the comparison was interrupted before it was this one's turn."""
+no result but the message; `not run`: the comparison was interrupted before."""
+
+WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
+"""Statuses of a run that came to the recording's end; of any other, the figures are of a part."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapErrors:
-    """How far a method's map lies from the reference map, point by point, thinned for drawing.
+    """Distances of a method's map points from the reference map, thinned for drawing.
 
     Attributes:
         points: (K, 3) points of the method's map, in the reference map's frame.
@@ -32,17 +35,18 @@ class MapErrors:
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """One method on one recording; what could not be had is None.
+    """One method on one recording; values that are not available are None.
 
     Attributes:
         name: as the user named it, such as `kiss-icp@0.5` or `learned+map`.
-        status, message: how it ended, and why when it did not end well.
+        status, message: how it ended, and the reason when it did not end well.
         trajectory: its poses, in its own world.
-        lost: (N,) which of them were lost.
-        lost_reasons: why, one for each stretch of successive lost scans; empty when that is not known.
-        metrics: its errors, with the association and the alignment they are of.
+        lost: (N,) whether tracking was lost.
+        lost_reasons: one for each run of successive lost scans; empty when unknown.
+        metrics: its errors, with their association and alignment.
         map_metrics: the content of metrics.json's "map".
-        map_errors: for the picture.
+        map_errors: for the figure.
+        map_entropy: mean map entropy of its map, which needs no reference.
         ms_per_scan_median, ms_per_scan_p95: wall time from one finished scan to the next.
         stage_ms: median wall time of each stage; stages run beside one another.
         peak_rss_mb: of its process and its children.
@@ -61,6 +65,7 @@ class MethodResult:
     metrics: TrajectoryMetrics | None = None
     map_metrics: Mapping[str, object] | None = None
     map_errors: MapErrors | None = None
+    map_entropy: float | None = None
     ms_per_scan_median: float | None = None
     ms_per_scan_p95: float | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
@@ -71,7 +76,7 @@ class MethodResult:
 
     @property
     def lost_scans(self) -> int | None:
-        """How many scans were lost; None when no trajectory came of it."""
+        """Number of lost scans; None without a trajectory."""
         return None if self.lost is None else int(self.lost.sum())
 
     def to_json(self) -> dict[str, object]:
@@ -91,7 +96,7 @@ class MethodResult:
         }
 
     def _metrics_json(self) -> dict[str, object] | None:
-        """As metrics.json; None when there was nothing to compare with."""
+        """As metrics.json; None without any reference."""
         if self.metrics is None and self.map_metrics is None:
             return None
         return metrics_json(self.metrics, self.map_metrics)
@@ -103,11 +108,11 @@ class SequenceComparison:
 
     Attributes:
         sequence: the recording's name.
-        source: where it lies, as the user named it.
-        reference: what the trajectories are held against; None when there is nothing.
+        source: its path, as the user named it.
+        reference: the trajectory that errors are relative to; None when there is none.
         reference_name: "ground truth", or the method or file that serves as the reference.
         methods: in the order asked for.
-        notes: what the reader should know of this recording, such as why there is no reference.
+        notes: remarks on this recording, such as why there is no reference.
     """
 
     sequence: str
@@ -134,7 +139,7 @@ class MissingRecording:
 
     Attributes:
         sequence, source: as in `SequenceComparison`.
-        reason: why, in a sentence.
+        reason: in a sentence.
     """
 
     sequence: str
@@ -163,14 +168,14 @@ class Comparison:
 
     Attributes:
         title: of the report.
-        command: that makes it again.
+        command: that reproduces it.
         sequences: one or more recordings.
-        versions: name -> version of the programs that matter; "commit" when it is known.
+        versions: program -> version; "commit" when it is known.
         machine: name -> text, such as processor, cores, memory, system.
         published: rows quoted beside ours that are in none of the `tables`.
         tables: over several recordings, published rows included; a report shows them first.
         missing: recordings that were asked for and are not there.
-        notes: what the reader should know of the whole, such as that it was interrupted.
+        notes: remarks on the whole, such as that it was interrupted.
     """
 
     title: str
@@ -179,7 +184,7 @@ class Comparison:
     versions: Mapping[str, str] = field(default_factory=dict)
     machine: Mapping[str, str] = field(default_factory=dict)
     published: Sequence[PublishedRow] = ()
-    tables: Sequence[SummaryTable] = ()
+    tables: Sequence[Table] = ()
     missing: Sequence[MissingRecording] = ()
     notes: Sequence[str] = ()
 

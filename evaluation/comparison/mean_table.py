@@ -1,22 +1,19 @@
-"""Means over recordings, as papers print them: a line a method, a column for each group and quantity."""
+"""Means over recordings, as papers print them: a row a method, a column for each group and quantity."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from evaluation.comparison.comparison import MethodResult, SequenceComparison
+from evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison
 from evaluation.comparison.quantities import Quantity
-from evaluation.comparison.summary_table import SummaryTable, TableCell, TableColumn, TableRow
-
-# A run that ended early is no measurement of the whole recording.
-_WHOLE = ("ok", "lost")
+from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 
 
 @dataclass(frozen=True)
 class TablePlan:
-    """What a table is to show.
+    """Content of a table of means.
 
     Attributes:
-        title, note: as in `SummaryTable`.
+        title, note: as in `Table`.
         groups: heading -> the recordings averaged under it.
         quantities: the columns under each heading.
         published: others' rows, a cell for each column.
@@ -29,35 +26,29 @@ class TablePlan:
     note: str = ""
 
 
-def mean_table(plan: TablePlan, sequences: Sequence[SequenceComparison]) -> SummaryTable:
-    """Fill the table: recordings count alike, those without a value or on which the run ended early not at all."""
-    columns = [(group, quantity) for group in plan.groups.values() for quantity in plan.quantities]
-    results = {(sequence.sequence, result.name): result for sequence in sequences for result in sequence.methods}
-    methods = dict.fromkeys(result.name for sequence in sequences for result in sequence.methods)
-    rows = [
-        TableRow(method, [_mean(_chosen(results, group, method), quantity) for group, quantity in columns])
-        for method in methods
+def mean_table(plan: TablePlan, sequences: Sequence[SequenceComparison]) -> Table:
+    """The unweighted means over the recordings of each group that a method finished and has a value of."""
+    columns = [
+        TableColumn(heading, q.label, q.unit, q.digits, q.lower_is_better, tuple(group))
+        for heading, group in plan.groups.items()
+        for q in plan.quantities
     ]
-    return SummaryTable(plan.title, list(_heads(plan)), [*rows, *plan.published], plan.note)
+    quantities = [quantity for _ in plan.groups for quantity in plan.quantities]
+    results = {(sequence.sequence, result.name): result for sequence in sequences for result in sequence.methods}
+    methods = dict.fromkeys(name for _, name in results)
+    rows = []
+    for method in methods:
+        found = [[results.get((name, method)) for name in column.sequences] for column in columns]
+        rows.append(TableRow(method, [_mean(*of) for of in zip(found, quantities, strict=True)]))
+    return Table(plan.title, columns, [*rows, *plan.published], plan.note)
 
 
-def _heads(plan: TablePlan) -> Iterator[TableColumn]:
-    for heading, sequences in plan.groups.items():
-        for quantity in plan.quantities:
-            yield TableColumn(
-                heading, quantity.label, quantity.unit, quantity.digits, quantity.lower_is_better, tuple(sequences)
-            )
-
-
-def _chosen(
-    results: Mapping[tuple[str, str], MethodResult], group: Sequence[str], method: str
-) -> Iterator[MethodResult]:
-    for sequence in group:
-        result = results.get((sequence, method))
-        if result is not None and result.status in _WHOLE:
-            yield result
-
-
-def _mean(results: Iterator[MethodResult], quantity: Quantity) -> TableCell:
-    values = [value for result in results if (value := quantity.of(result)) is not None]
-    return TableCell(sum(values) / len(values) if values else None, len(values))
+def _mean(results: Sequence[MethodResult | None], quantity: Quantity) -> TableCell:
+    """A mean over fewer recordings than the column names has a note, and is not ranked with the others."""
+    finished = [result for result in results if result is not None and result.status in WHOLE]
+    values = [value for result in finished if (value := quantity.of(result)) is not None]
+    if not values:
+        return TableCell(None, 0)
+    complete = len(values) == len(results)
+    note = "" if complete else f"over {len(values)} of {len(results)}"
+    return TableCell(sum(values) / len(values), len(values), note, complete)

@@ -1,121 +1,140 @@
-"""A table as values: what stands in it, which figure is the best of its column, and where rows come from."""
+"""A table as values: methods against quantities; the best figure of each column is found, not stored."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from evaluation.comparison.number_text import number_text
+Value = float | str | None
+
+NOT_AVAILABLE = "–"
+_LONGEST_FIXED = 1e6
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """A column.
 
     Attributes:
-        heading: with the unit in brackets.
-        digits: after the decimal point, of numbers.
-        lower_is_better: which end is the good one; None where neither is.
-        group: columns beside one another with the same group get it as a common heading.
-        numeric: whether it holds numbers, which stand flush right.
+        heading: common to successive columns, such as "09" or "00-08"; empty for none.
+        label, unit: of the quantity, such as "t_rel" and "%".
+        digits: after the decimal point.
+        lower_is_better: None for a column that is not ranked.
+        sequences: names of the recordings that the mean is taken over.
+        numeric: whether it holds numbers, which are set flush right.
     """
 
     heading: str
+    label: str
+    unit: str = ""
     digits: int = 0
     lower_is_better: bool | None = None
-    group: str = ""
+    sequences: Sequence[str] = ()
     numeric: bool = True
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """A cell.
 
     Attributes:
-        value: a number, text as it is, or None for what could not be had.
-        note: small print beside it.
-        may_win: whether it is comparable with the others of its column.
-        best: whether it is the best of its column.
+        value: None where it is not available; text as published, such as "NA".
+        averaged: number of recordings that a mean is taken over; of a published figure, as many as the column names.
+        note: beside the value, such as "over 7 of 9".
+        ranked: whether the value is comparable with the others of its column.
     """
 
-    value: float | str | None
+    value: Value
+    averaged: int = 1
     note: str = ""
-    may_win: bool = True
-    best: bool = False
+    ranked: bool = True
 
 
 @dataclass(frozen=True)
-class Row:
-    """A row.
+class TableRow:
+    """A method's row.
 
     Attributes:
+        method: ours as the user named it, others' as published.
         cells: one a column.
-        method: the method of the report whose colour the row has; empty for none.
-        source: where a published row was published; empty for ours.
+        source: where it was published; empty for ours.
     """
 
-    cells: Sequence[Cell]
-    method: str = ""
+    method: str
+    cells: Sequence[TableCell]
     source: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """Methods against columns.
 
     Attributes:
         title: a few words.
-        columns, rows: the content.
-        note: a sentence below it; may be empty.
+        columns, rows: our rows first, then the published ones.
+        note: a sentence below the table; may be empty.
         folded: whether the page shows it on request only.
     """
 
     title: str
-    columns: Sequence[Column]
-    rows: Sequence[Row]
+    columns: Sequence[TableColumn]
+    rows: Sequence[TableRow]
     note: str = ""
     folded: bool = False
 
-    def cell_text(self, row: Row, column: int) -> str:
-        """The text of a cell, without its note."""
-        return number_text(row.cells[column].value, self.columns[column].digits)
+    def best(self) -> set[tuple[int, int]]:
+        """(row, column) of the best value of each ranked column, and of all that look equal to it.
 
+        None in a column without two comparable numbers that differ.
+        """
+        found = set()
+        for number, column in enumerate(self.columns):
+            cells = [row.cells[number] for row in self.rows]
+            ranked = {i: round(float(c.value or 0.0), column.digits) for i, c in enumerate(cells) if _is_ranked(c)}
+            if column.lower_is_better is not None and len(set(ranked.values())) > 1:
+                best = (min if column.lower_is_better else max)(ranked.values())
+                found |= {(i, number) for i, value in ranked.items() if value == best}
+        return found
 
-def with_best(table: Table) -> Table:
-    """The table with the best of each column marked; all that look equal to it are marked too.
+    def without_empty(self) -> "Table":
+        """The table without the numeric columns that hold no value."""
+        kept = [
+            number
+            for number, column in enumerate(self.columns)
+            if not column.numeric or any(row.cells[number].value is not None for row in self.rows)
+        ]
+        rows = [replace(row, cells=[row.cells[number] for number in kept]) for row in self.rows]
+        return replace(self, columns=[self.columns[number] for number in kept], rows=rows)
 
-    Nothing is marked in columns that are not ranked, or that hold no two comparable numbers that differ.
-    """
-    rows = [list(row.cells) for row in table.rows]
-    for index, column in enumerate(table.columns):
-        if column.lower_is_better is None:
-            continue
-        ranked = {
-            number: round(float(cells[index].value or 0.0), column.digits)
-            for number, cells in enumerate(rows)
-            if _is_ranked(cells[index])
+    def to_json(self) -> dict[str, object]:
+        """The table in comparison.json, each mean with the number of recordings it is taken over."""
+        keys = ("heading", "label", "unit", "digits", "lower_is_better")
+        return {
+            "title": self.title,
+            "note": self.note,
+            "columns": [
+                {**{key: getattr(column, key) for key in keys}, "sequences": list(column.sequences)}
+                for column in self.columns
+            ],
+            "rows": [
+                {
+                    "method": row.method,
+                    "source": row.source,
+                    "cells": [{"value": cell.value, "averaged": cell.averaged} for cell in row.cells],
+                }
+                for row in self.rows
+            ],
         }
-        if len(set(ranked.values())) < 2:
-            continue
-        best = min(ranked.values()) if column.lower_is_better else max(ranked.values())
-        for number, value in ranked.items():
-            if value == best:
-                rows[number][index] = replace(rows[number][index], best=True)
-    return replace(table, rows=[replace(row, cells=cells) for row, cells in zip(table.rows, rows, strict=True)])
 
 
-def without_empty(table: Table) -> Table:
-    """The table without the columns of numbers that no row has one in."""
-    kept = [
-        index
-        for index, column in enumerate(table.columns)
-        if not column.numeric or any(row.cells[index].value is not None for row in table.rows)
-    ]
-    return replace(
-        table,
-        columns=[table.columns[index] for index in kept],
-        rows=[replace(row, cells=[row.cells[index] for index in kept]) for row in table.rows],
-    )
+def number_text(value: Value, digits: int) -> str:
+    """The number with so many decimals; a dash for None and non-finite values, text as it is."""
+    if isinstance(value, str):
+        return value
+    if value is None or not math.isfinite(value):
+        return NOT_AVAILABLE
+    text = f"{value:.2e}" if abs(value) >= _LONGEST_FIXED else f"{value:.{digits}f}"
+    return text.replace("-", "\N{MINUS SIGN}") if float(text) else text.lstrip("-")
 
 
-def _is_ranked(cell: Cell) -> bool:
-    return cell.may_win and isinstance(cell.value, float | int) and math.isfinite(cell.value)
+def _is_ranked(cell: TableCell) -> bool:
+    return cell.ranked and isinstance(cell.value, float | int) and math.isfinite(cell.value)

@@ -1,108 +1,146 @@
-"""The report of a comparison: a page that opens offline by itself, and the same tables as Markdown."""
+"""The report of a comparison: one page that opens offline, and its tables as Markdown."""
 
-from collections.abc import Mapping, Sequence
-from itertools import count
+import re
+from base64 import b64encode
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib.resources import files
+from itertools import groupby
 
-from evaluation.comparison.comparison import Comparison
-from evaluation.comparison.table import Table
-from evaluation.report.figures.figure import Figure, figure_html
-from evaluation.report.figures.palette import Style, method_styles
-from evaluation.report.markup import Markup, element, escape, join
-from evaluation.report.overview import settings_texts
-from evaluation.report.sections import Section, made_with_section, overview_section, sequence_section
-from evaluation.report.style import style_sheet
-from evaluation.report.table_html import table_html
-from evaluation.report.table_markdown import code_block, markdown_text, table_markdown
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from plotly.offline import get_plotlyjs
 
-# Nothing may be fetched and nothing may run: whatever a name or a message holds, it stays text.
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+from evaluation.comparison.comparison import Comparison, SequenceComparison
+from evaluation.comparison.table import Table, number_text
+from evaluation.report.figures.drift import length_figure, speed_figure
+from evaluation.report.figures.errors import deviation_figure, error_figure
+from evaluation.report.figures.figure import Figure, Styles, method_styles
+from evaluation.report.figures.maps import entropy_figure, map_figure
+from evaluation.report.figures.resources import resources_figure
+from evaluation.report.figures.tracking import tracking_figure
+from evaluation.report.figures.trajectories import trajectory_figure
+from evaluation.report.plain_text import printable
+from evaluation.report.tables import published_table, sequence_tables
+
+_TEMPLATES = "templates"
+_MARKDOWN_SPECIAL = re.compile(r"([\\`*_\[\]|~#$])")
+_HTML_SPECIAL = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;"})
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """One recording in the report: its tables and figures in order."""
+
+    sequence: SequenceComparison
+    blocks: list[Table | Figure]
 
 
 def render_html(comparison: Comparison) -> str:
-    """The report as one HTML page without scripts and without anything from elsewhere; it is well-formed XML too."""
+    """The report as one page that fetches nothing and runs no script but its own two.
+
+    Text is escaped by Jinja2, data of figures by plotly; the content security policy names both scripts by their hash,
+    so that no other can run.
+    """
     styles = method_styles(method.name for sequence in comparison.sequences for method in sequence.methods)
-    sections = [
-        overview_section(comparison),
-        *(sequence_section(sequence, styles) for sequence in comparison.sequences),
-        made_with_section(comparison),
-    ]
-    body = element(
-        "main", *_header(comparison), *_sections_html(sections, styles), *_settings_html(comparison),
-    )  # fmt: skip
-    head = element(
-        "head",
-        Markup('<meta charset="utf-8"/>'),
-        Markup('<meta name="viewport" content="width=device-width, initial-scale=1"/>'),
-        Markup(f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY)}"/>'),
-        element("title", escape(comparison.title)),
-        element("style", Markup(style_sheet())),
+    scripts = [get_plotlyjs(), _file("report.js")]
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            comparison=comparison,
+            overview=_overview(comparison),
+            sections=[Section(sequence, list(_html_blocks(sequence, styles))) for sequence in comparison.sequences],
+            settings=_settings(comparison),
+            styles=styles,
+            style_sheet=_file("report.css"),
+            scripts=scripts,
+            hashes=[b64encode(sha256(script.encode()).digest()).decode() for script in scripts],
+        )
     )
-    return f"<!DOCTYPE html>\n{element('html', head, element('body', body), lang='en')}\n"
 
 
 def render_markdown(comparison: Comparison) -> str:
-    """The tables of the report as Markdown, to be pasted into a page."""
-    numbers = count(1)
-    parts = [f"# {markdown_text(comparison.title)}"]
-    if comparison.command:
-        parts.append(code_block(comparison.command))
+    """The tables of the report as Markdown."""
     sections = [
-        overview_section(comparison),
-        *(sequence_section(sequence, None) for sequence in comparison.sequences),
-        made_with_section(comparison),
+        Section(sequence, [table for tables in sequence_tables(sequence).values() for table in tables])
+        for sequence in comparison.sequences
     ]
-    for section in sections:
-        parts += [f"## {markdown_text(section.heading)}"] if section.heading and section.blocks else []
-        parts += [markdown_text(line) for line in section.about]
-        parts += [f"> {markdown_text(remark)}" for remark in section.remarks]
-        parts += [table_markdown(block, next(numbers)) for block in section.blocks if isinstance(block, Table)]
-    return "\n\n".join([*parts, "★ best of its column"]) + "\n"
+    template = _environment().get_template("report.md.j2")
+    return template.render(comparison=comparison, overview=_overview(comparison), sections=sections)
 
 
-def _header(comparison: Comparison) -> list[Markup]:
-    names = [sequence.sequence for sequence in comparison.sequences]
-    links = [
-        element("li", element("a", escape(name), href=f"#recording-{number}"))
-        for number, name in enumerate(names, start=1)
+def _overview(comparison: Comparison) -> list[Table]:
+    """The tables over all recordings."""
+    published = published_table(comparison)
+    return [*comparison.tables, *([] if published is None else [published])]
+
+
+def _html_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table | Figure]:
+    tables = sequence_tables(sequence)
+    order: list[Table | Figure | None] = [
+        *tables["summary"],
+        trajectory_figure(sequence, styles),
+        error_figure(sequence, styles),
+        deviation_figure(sequence, styles),
+        length_figure(sequence, styles),
+        speed_figure(sequence, styles),
+        *tables["drift"],
+        map_figure(sequence),
+        entropy_figure(sequence, styles),
+        *tables["map"],
+        resources_figure(sequence, styles),
+        *tables["time"],
+        tracking_figure(sequence, styles),
+        *tables["tracking"],
     ]
-    methods = len({method.name for sequence in comparison.sequences for method in sequence.methods})
-    counts = f"{_counted(methods, 'method')}, {_counted(len(names), 'recording')}. ★ best of its column."
-    command = [element("pre", element("code", escape(comparison.command)))] if comparison.command else []
-    navigation = [element("nav", element("ul", *links), aria_label="Recordings")] if len(names) > 1 else []
-    return [
-        element("h1", escape(comparison.title)), element("p", escape(counts), class_="about"), *command, *navigation
-    ]  # fmt: skip
+    return (block for block in order if block is not None)
 
 
-def _sections_html(sections: Sequence[Section], styles: Mapping[str, Style]) -> list[Markup]:
-    tables, figures = count(1), count(1)
-    parts = []
-    for number, section in enumerate(sections):
-        heading = [element("h2", escape(section.heading))] if section.heading and section.blocks else []
-        about = [element("p", *_lines(section.about), class_="about")] if section.about else []
-        remarks = [element("p", escape(remark), class_="remark") for remark in section.remarks]
-        blocks = [
-            figure_html(block, next(figures)) if isinstance(block, Figure) else table_html(block, next(tables), styles)
-            for block in section.blocks
-        ]
-        parts.append(element("section", *heading, *about, *remarks, *blocks, id=f"recording-{number}"))
-    return parts
+def _settings(comparison: Comparison) -> list[tuple[str, str]]:
+    """Each different configuration, under the method and the recordings it was used for."""
+    used: dict[tuple[str, str], list[str]] = {}
+    for sequence in comparison.sequences:
+        for method in sequence.methods:
+            if method.settings:
+                used.setdefault((method.name, method.settings), []).append(sequence.sequence)
+    return [(f"{name} ({', '.join(sequences)})", text) for (name, text), sequences in used.items()]
 
 
-def _settings_html(comparison: Comparison) -> list[Markup]:
-    texts = settings_texts(comparison)
-    if not texts:
-        return []
-    folded = [
-        element("details", element("summary", escape(name)), element("pre", element("code", escape(text))))
-        for name, text in texts
-    ]
-    return [element("section", element("h2", escape("Settings")), *folded, id="settings")]
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("evaluation.report", _TEMPLATES),
+        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
+        finalize=lambda value: printable(value) if type(value) is str else value,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "markdown": _markdown,
+        "fence": _fence,
+        "number": number_text,
+        "heading_spans": _heading_spans,
+    }
+    environment.tests["table"] = lambda block: isinstance(block, Table)
+    return environment
 
 
-def _lines(texts: Sequence[str]) -> list[Markup]:
-    return [join([Markup("<br/>") if number else Markup(""), escape(text)]) for number, text in enumerate(texts)]
+def _heading_spans(table: Table) -> list[tuple[str, int]]:
+    """Each common heading with the number of successive columns below it."""
+    return [(heading, len(list(columns))) for heading, columns in groupby(table.columns, lambda column: column.heading)]
 
 
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+def _markdown(text: str) -> str:
+    """The text in one line, shown as it is."""
+    return _MARKDOWN_SPECIAL.sub(r"\\\1", " ".join(text.split()).translate(_HTML_SPECIAL))
+
+
+def _fence(text: str) -> str:
+    """The text between fences longer than any in it."""
+    fence = "`" * max(3, 1 + max((len(run) for run in re.findall("`+", text)), default=0))
+    return f"{fence}\n{text}\n{fence}"
+
+
+def _file(name: str) -> str:
+    return (files("evaluation.report") / _TEMPLATES / name).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""How far a trajectory is from a reference."""
+"""Errors of a trajectory relative to a reference."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +10,13 @@ from evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERAN
 from evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory
+
+# An estimate that stood still is off by the whole spread of the reference, one of another place by more.
+_UNRELATED_SHARE = 0.5
+# Sensors that stay on one spot have no spread to compare with.
+_NEGLIGIBLE_M = 0.1
+# Ratio of the spreads of one drive in two units, of which metres and millimetres are the likeliest.
+_OTHER_UNIT = 20.0
 
 
 @dataclass(frozen=True)
@@ -23,8 +30,8 @@ class TrajectoryErrors:
         rpe_translation_rmse_m: relative pose error from one scan to the next; None when no two successive scans
             have a reference pose.
         rpe_rotation_rmse_deg: likewise for the rotation.
-        end_error_m: distance between the last positions after the first poses are made to coincide: how far off the
-            end is for one who trusts the start. No smaller for a closed loop.
+        end_error_m: distance between the last positions after the first poses are made to coincide; no smaller for a
+            closed loop.
     """
 
     length_m: float
@@ -48,11 +55,11 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryMetrics:
-    """Everything that is said about a trajectory beside a reference.
+    """All errors of a trajectory.
 
     Attributes:
-        association: the pairs of poses the figures are of.
-        T_reference_estimate: (4, 4) the alignment the ATE was computed with.
+        association: the pairs of poses that were compared.
+        T_reference_estimate: (4, 4) the alignment of the ATE.
         errors: absolute and relative errors.
         kitti: KITTI's drift; None under 100 m.
         segments: metres -> drift over short segments; None where the reference is too short.
@@ -148,6 +155,45 @@ def relative_errors(association: Association) -> tuple[FloatArray, FloatArray]:
     successive = np.diff(association.rows) == 1
     estimate = association.estimate.relative_motions()[successive]
     return _differences(estimate, association.reference.relative_motions()[successive])
+
+
+def deviations(association: Association, T_reference_estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pose of the aligned estimate in the frame of the reference's LiDAR (x forward, y left, z up), for each match.
+
+    Translation (M, 3) in metres and roll, pitch, yaw (M, 3) in degrees, R = Rz(yaw) Ry(pitch) Rx(roll).
+    """
+    T_true_estimated = (
+        inverse(association.reference.T_world_lidar) @ T_reference_estimate @ association.estimate.T_world_lidar
+    )
+    R = T_true_estimated[:, :3, :3]
+    # At a pitch of 90 degrees roll and yaw are ambiguous; atan2 gives numbers without SciPy's warning.
+    pitch = np.arcsin(np.clip(-R[:, 2, 0], -1.0, 1.0))
+    roll, yaw = np.arctan2(R[:, 2, 1], R[:, 2, 2]), np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    return T_true_estimated[:, :3, 3], np.rad2deg(np.stack([roll, pitch, yaw], axis=-1))
+
+
+def disagreement(metrics: TrajectoryMetrics) -> str | None:
+    """Warning that the two trajectories are not of one drive, so that their errors mean nothing; None if they agree.
+
+    They agree while the ATE is less than half of the reference's spread, the root mean square distance of its
+    positions from their mean.
+    """
+    spread_m, own_spread_m = _spread_m(metrics.association.reference), _spread_m(metrics.association.estimate)
+    error_m = metrics.errors.ate_rmse_m
+    if error_m <= max(_UNRELATED_SHARE * spread_m, _NEGLIGIBLE_M):
+        return None
+    message = (
+        f"the trajectory does not follow its reference: the ATE is {error_m:.3g} m, the spread of the reference"
+        f" {spread_m:.3g} m"
+    )
+    if min(spread_m, own_spread_m) > 0.0 and max(spread_m / own_spread_m, own_spread_m / spread_m) > _OTHER_UNIT:
+        return f"{message}, that of the trajectory {own_spread_m:.3g} m; are both in metres?"
+    return f"{message}; tracking was lost, or the reference belongs to another recording or sensor"
+
+
+def _spread_m(trajectory: Trajectory) -> float:
+    offsets = trajectory.positions - trajectory.positions.mean(axis=0)
+    return float(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
 
 
 def _differences(T_a: FloatArray, T_b: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""`lidarslam compare`: several methods, one table."""
+"""`lidarslam compare`: several methods in one table."""
 
 from pathlib import Path
 from typing import Any
@@ -6,8 +6,16 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.options import FILE, PATH, CommandWithExample, config_options, reader_options, scan_options
-from lidarslam.commands.terminal import EXIT_MENDABLE, say, tell
+from lidarslam.commands.options import (
+    FILE,
+    PATH,
+    POSITIVE,
+    CommandWithExample,
+    config_options,
+    reader_options,
+    scan_options,
+)
+from lidarslam.commands.terminal import EXIT_MENDABLE, note, say
 
 
 @click.command(
@@ -17,32 +25,31 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say, tell
     lidarslam compare --benchmark configs/benchmarks/kitti.yaml --data KITTI --out compared""",
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that everything is written to.")
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder for runs and report.")
 @click.option(
     "--methods",
     metavar="NAME,...",
     help="BASE[@VOXEL][+map][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  "
     "[default: learned+map,kiss-icp, or the benchmark's]",
 )
-@click.option("--benchmark", type=FILE, metavar="FILE", help="Recordings, methods and tables as the file has them.")
-@click.option("--data", type=PATH, metavar="DIR", help="Folder that the benchmark's paths are relative to.")
-@click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory that the methods prior and prior+map take.")
-@click.option("--reference", metavar="METHOD|FILE", help="What to hold against.  [default: the ground truth]")
-@click.option("--reference-map", type=FILE, metavar="FILE", help="Point cloud to hold the maps against.")
-@click.option("--memory-limit-mb", type=click.FloatRange(min=0, min_open=True), help="End a method that takes more.")
-@click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), help="End a method that takes longer.")
+@click.option("--benchmark", type=FILE, metavar="FILE", help="Recordings and methods as in the file.")
+@click.option("--data", type=PATH, metavar="DIR", help="Root of the benchmark's paths.")
+@click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory of the methods prior and prior+map.")
+@click.option("--reference", metavar="METHOD|FILE", help="Reference.  [default: the ground truth]")
+@click.option("--reference-map", type=FILE, metavar="FILE", help="Point cloud to compare the maps with.")
+@click.option("--memory-limit-mb", type=POSITIVE, help="Memory limit of a method.")
+@click.option("--timeout-s", type=POSITIVE, help="Time limit of a method.")
 @scan_options
-@click.option("--reuse", is_flag=True, help="Keep the runs in DIR that finished with the same settings.")
+@click.option("--reuse", is_flag=True, help="Keep finished runs in DIR with the same settings.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier comparison in DIR.")
 @reader_options
 @config_options
 @click.pass_context
 def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, **options: Any) -> None:
-    """Run several methods on one or more recordings: one table, one report.
+    """Compare several methods on one or more recordings in one report.
 
     Each method runs in a process of its own, one after another. A method that crashes or gets lost is a row of the
-    table, and the exit status is 0 all the same; it is 1 when no method came to a result, or on Ctrl-C, which writes
-    the report of what there is.
+    table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes the report so far.
     """
     from lidarslam.compare.command import run_compare
 
@@ -56,5 +63,5 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
         if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT and len(sources) != 1:
             flag = f"--{name.replace('_', '-')}"
             raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
-    if not run_compare(say, tell, sources=sources, benchmark=benchmark, **options):
+    if not run_compare(say, note, sources=sources, benchmark=benchmark, **options):
         ctx.exit(EXIT_MENDABLE)

@@ -1,12 +1,14 @@
-"""`lidarslam evaluate`: how good a trajectory and its map are."""
+"""`lidarslam evaluate`: accuracy of a trajectory and its map."""
 
 from pathlib import Path
 from typing import Any
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample
+from lidarslam.commands.options import PATH, POSITIVE, CommandWithExample
 from lidarslam.commands.terminal import say
+
+_SECONDS = click.FloatRange(min=0.0)
 
 
 @click.command(
@@ -20,64 +22,53 @@ from lidarslam.commands.terminal import say
     "--reference",
     type=PATH,
     metavar="TRAJ",
-    help="TUM or KITTI file, run directory, or recording with ground truth.  [default: what came with the source]",
+    help="TUM or KITTI file, run directory, or recording with ground truth.  [default: that of the source]",
 )
-@click.option("--no-reference", is_flag=True, help="Do without; of the map, tell its entropy only.")
+@click.option("--no-reference", is_flag=True, help="Compute only the entropy of the map.")
 @click.option(
     "--alignment",
     type=click.Choice(["se3", "first_pose", "none"]),
     default="se3",
     show_default=True,
-    help="How the trajectory is brought to the reference for the ATE.",
+    help="Alignment of the trajectory to the reference for the ATE.",
 )
-@click.option("--tolerance-s", type=click.FloatRange(min=0.0), help="Poses this close in time match.  [default: 0.02]")
-@click.option(
-    "--max-gap-s", type=click.FloatRange(min=0.0), help="Gaps in the reference that are bridged.  [default: 0.5]"
-)
+@click.option("--tolerance-s", type=_SECONDS, help="Largest time between matching poses.  [default: 0.02]")
+@click.option("--max-gap-s", type=_SECONDS, help="Largest gap of the reference to interpolate.  [default: 0.5]")
 @click.option(
     "--reference-map",
     type=PATH,
     metavar="MAP",
     help=".ply, .pcd, .las, .laz or .e57 file.  [default: the exact map of a simulated source]",
 )
-@click.option("--map", "map_file", type=PATH, metavar="FILE", help="Map of a bare trajectory, or instead of the run's.")
+@click.option("--map", "map_file", type=PATH, metavar="FILE", help="Map to evaluate.  [default: that of the run]")
 @click.option(
     "--map-alignment",
     metavar="[auto|trajectory|global|none|FILE]",
     default="auto",
     show_default=True,
-    help="How the map is brought to the reference map: by the trajectories, by a global search, not at all, or by a"
-    " text file with the 4x4 matrix from the map to the reference.",
+    help="Alignment of the map to the reference map: by the trajectories, by a global search, none, or the 4x4 matrix"
+    " in a text file, which takes the map to the reference.",
 )
-@click.option(
-    "--refine/--no-refine", default=None, help="Improve that by ICP.  [default: refine, unless the alignment is none]"
-)
-@click.option(
-    "--spacing",
-    "spacing_m",
-    type=click.FloatRange(min=0.0, min_open=True),
-    help="Both maps are thinned to one point in cells of this size, metres.  [default: 0.05]",
-)
+@click.option("--refine/--no-refine", default=None, help="Refine the alignment by ICP.  [default: refine, unless none]")
+@click.option("--spacing", "spacing_m", type=POSITIVE, help="Voxel that both maps are thinned to, m.  [default: 0.05]")
 @click.option(
     "--max-range",
     "max_range_m",
-    type=click.FloatRange(min=0.0, min_open=True),
-    help="What is farther from the path does not count as missing, metres.  [default: the reach of the run's map]",
+    type=POSITIVE,
+    help="Distance from the path up to which the map should be complete, m.  [default: the range of the run's map]",
 )
-@click.option(
-    "--errors", type=PATH, multiple=True, metavar="FILE", help="Write the map coloured by its errors, .ply or .rrd."
-)
+@click.option("--errors", type=PATH, multiple=True, metavar="FILE", help="Save the map coloured by error: .ply, .rrd.")
 @click.option(
     "--errors-clip",
     "errors_clip_m",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=POSITIVE,
     default=0.5,
     show_default=True,
-    help="Error of the brightest colour, metres.",
+    help="Error of the brightest colour, m.",
 )
-@click.option("--out", type=PATH, metavar="FILE", help="Write the figures there.  [default: metrics.json of the run]")
+@click.option("--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
 def evaluate(run: Path, **options: Any) -> None:
-    """Say how good a trajectory and its map are.
+    """Evaluate a trajectory and its map.
 
     RUN is a run directory, or a trajectory in TUM or KITTI text.
     """

@@ -9,13 +9,13 @@ from lidarslam.commands.terminal import say
 
 
 @click.command(cls=CommandWithExample, epilog="lidarslam export --weights trained/weights.safetensors --out exported")
-@click.option("--weights", type=PATH, metavar="FILE", help="Trained weights.  [default: those of the program]")
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that the ONNX graphs go to.")
+@click.option("--weights", type=PATH, metavar="FILE", help="Trained weights.  [default: included]")
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder for the ONNX graphs.")
 def export(weights: Path | None, out: Path) -> None:
-    """Write a trained network as ONNX.
+    """Export a trained network as ONNX.
 
-    `lidarslam run --weights DIR` starts faster with the folder than with the file of weights, because it does without
-    torch. Other programs can run the graphs; docs/odometry.md lists their inputs and outputs.
+    `lidarslam run --weights DIR` starts faster with the folder than with the weights file, as it does not import torch.
+    docs/odometry.md lists inputs and outputs of the graphs.
     """
     from odometry.network.checkpoint import load_checkpoint
     from odometry.network.export import export_onnx

@@ -1,4 +1,4 @@
-"""`lidarslam info`: what a recording holds."""
+"""`lidarslam info`: the contents of a recording."""
 
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,7 @@ from lidarslam.commands.terminal import say
 @reader_options
 @config_options
 def info(source: Path, **options: Any) -> None:
-    """Say what a recording holds, and what was inferred about it."""
+    """Print what a recording holds, and what was inferred about it."""
     from lidarslam.datasets.info_text import describe_source
 
-    config = take_config(options, options.pop("settings"), source)
-    say(describe_source(source, config.reader))
+    say(describe_source(source, take_config(options, source).reader))

@@ -9,12 +9,11 @@ from lidarslam.commands.options import (
     PATH,
     CommandWithExample,
     config_options,
-    method_settings,
     odometry_options,
     reader_options,
     take_config,
 )
-from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
 @click.command(cls=CommandWithExample, epilog="lidarslam merge ground_floor.mcap stairs.mcap --out building")
@@ -29,26 +28,23 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
 def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options: Any) -> None:
     """Build one map of several recordings of a place.
 
-    Each recording is run by itself and finds itself in the earlier ones where both show the same places. DIR holds the
-    common map, and for each recording a run directory with its poses in the common frame. A recording that nothing
-    joins to the others is left out of the common map, and the exit status is 1.
+    Each recording is run, and joined to the earlier ones by loop closures. DIR holds the common map, and for each
+    recording a run directory with its poses in the common frame. A recording without a loop closure to the others is
+    left out of the common map, and the exit status is 1.
     """
-    from lidarslam.merge.merge import MergeRequest
     from lidarslam.merge.merge import merge as execute
+    from lidarslam.merge.parts import MergeRequest
     from lidarslam.merge.text import format_merge
     from lidarslam.run.progress import show_progress
 
-    settings = method_settings(
-        options.pop("odometry"), options.pop("weights"), None, None, None, options.pop("settings")
-    )
-    config = take_config(options, settings, *sources)
+    config = take_config(options, *sources)
     outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:
-        tell(line)
+        note(line)
     apart = [recording for recording in outcome.apart if recording.directory is not None]
     for recording in apart:
-        tell(f"{recording.directory}: not joined to the others, left out of the common map")
+        note(f"{recording.directory}: not joined to the others, left out of the common map")
     if outcome.stopped or apart:
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.lost_scans or any(run is not None and run.summary.contradictions for run in outcome.runs):

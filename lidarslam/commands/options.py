@@ -1,13 +1,16 @@
-"""Options that several commands share, the values they take, and what they come to in the configuration."""
+"""Options that several commands share, and the configuration they result in."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
 
-from lidarslam.commands.terminal import tell
+from lidarslam.commands.terminal import note
+
+if TYPE_CHECKING:
+    from lidarslam.config.settings import Config
 
 
 class CommandWithExample(click.Command):
@@ -22,7 +25,7 @@ class CommandWithExample(click.Command):
 
 
 class _Path(click.Path):
-    """A path that is not empty, which would mean the folder one stands in."""
+    """A path that is not empty, which would mean the current folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
@@ -31,25 +34,35 @@ class _Path(click.Path):
 
 
 class Registered(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
-    """One of the names in a registry, which is imported when they are asked for."""
+    """One of the names in a registry, which is imported when needed."""
 
     name = "name"
 
     def __init__(self, names: Callable[[], Iterable[str]]) -> None:
         self._names = names
 
+    def _choice(self) -> "click.Choice[str]":
+        return click.Choice(list(self._names()))
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return click.Choice(list(self._names())).convert(value, param, ctx)
+        return self._choice().convert(value, param, ctx)
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:  # noqa: ARG002
         return f"[{'|'.join(self._names())}]"
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return click.Choice(list(self._names())).shell_complete(ctx, param, incomplete)
+        return self._choice().shell_complete(ctx, param, incomplete)
+
+
+def _readers() -> Iterable[str]:
+    from lidarslam.datasets.registry import READERS
+
+    return READERS
 
 
 PATH = _Path(path_type=Path)
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+POSITIVE = click.FloatRange(min=0.0, min_open=True)
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
@@ -67,108 +80,75 @@ def _together(*decorators: _Decorator) -> _Decorator:
 SOURCE = click.argument("source", type=PATH)
 
 config_options = _together(
-    click.option("--config", "config_file", type=FILE, help="YAML file with whatever differs from the defaults."),
-    click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One value; may be repeated."),
+    click.option("--config", "config_file", type=FILE, help="YAML file of settings that differ from the defaults."),
+    click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One setting; may be repeated."),
 )
-
-
-def _readers() -> Iterable[str]:
-    from lidarslam.datasets.registry import READERS
-
-    return READERS
-
-
 reader_options = _together(
-    click.option(
-        "--reader", type=Registered(_readers), help="Reader to use instead of the one that recognises the source."
-    ),
-    click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag that holds several."),
+    click.option("--reader", type=Registered(_readers), help="Reader of the source.  [default: recognised]"),
+    click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag with several."),
     click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
 )
-
 scan_options = _together(
     click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan."),
     click.option("--stop", type=click.IntRange(min=0), help="Scan to stop before."),
     click.option("--step", type=click.IntRange(min=1), default=1, show_default=True, help="Take every n-th scan."),
 )
-
 odometry_options = _together(
     click.option(
-        "--odometry",
-        type=click.Choice(["learned", "kiss-icp", "constant-velocity"]),
-        help="Where the motion between scans comes from.  [default: learned]",
+        "--odometry", type=click.Choice(["learned", "kiss-icp", "constant-velocity"]), help="[default: learned]"
     ),
-    click.option(
-        "--weights", type=FILE, metavar="FILE", help="Of the learned odometry.  [default: those of the program]"
-    ),
+    click.option("--weights", type=FILE, metavar="FILE", help="Weights of the learned odometry.  [default: included]"),
 )
 
 
-def resolve(config_file: Path | None, settings: tuple[str, ...], **reader: str | None) -> Any:
-    """The configuration (`lidarslam.config.settings.Config`), with the options applied last.
+def take_config(options: dict[str, Any], *sources: Path) -> "Config":
+    """The configuration for these sources; the options it is made of are removed, all but the prior.
+
+    Options that a source does not use are noted.
 
     Raises:
-        ConfigError: a file or a setting is not what it should be.
+        UsageError: options exclude each other.
+        ConfigError, InputError: a file or a setting is invalid, or no reader recognises a source.
     """
     from lidarslam.config.settings import load_config, reader_settings
 
-    return load_config(config_file, [*settings, *reader_settings(**reader)])
-
-
-def take_config(options: dict[str, Any], settings: tuple[str, ...], *sources: Path) -> Any:
-    """The configuration for these sources, its options taken out of a command's; what they have no use for is told.
-
-    Raises:
-        ConfigError, InputError: a file or a setting is not what it should be, or nothing reads a source.
-    """
     reader = {"name": options.pop("reader"), "topic": options.pop("topic"), "sequence": options.pop("sequence")}
-    config = resolve(options.pop("config_file"), settings, **reader)
+    settings = [*options.pop("settings"), *_method_settings(options), *reader_settings(**reader)]
+    config = load_config(options.pop("config_file"), settings)
     for source in sources:
-        _warn_of_ignored(source, config.reader.name, reader["topic"], reader["sequence"])
+        _note_unused(source, config.reader.name, reader["topic"], reader["sequence"])
     return config
 
 
-def _warn_of_ignored(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
-    """Say which of the reader's options the source has no use for.
+def _method_settings(options: dict[str, Any]) -> list[str]:
+    """The options of the method as settings; a command may lack some of them."""
+    from lidarslam.config.settings import setting
 
-    Raises:
-        InputError: the source is not there, or nothing reads it.
-    """
+    odometry, weights, prior = options.pop("odometry", None), options.pop("weights", None), options.get("prior")
+    settings = []
+    if weights is not None:
+        if odometry not in (None, "learned") or prior is not None:
+            raise click.UsageError("--weights belongs to --odometry learned; leave it, or the other odometry, out")
+        odometry = "learned"
+        settings.append(setting("odometry.learned.weights", str(weights.resolve())))
+    if prior is not None:
+        if odometry is not None:
+            raise click.UsageError("--prior replaces the odometry; leave --odometry out")
+        odometry = "external"
+    if odometry is not None:
+        settings.append(f"odometry.method={odometry}")
+    for section in ("mapping", "pose_graph"):
+        enabled = options.pop(section, None)
+        if enabled is not None:
+            settings.append(f"{section}.enabled={str(enabled).lower()}")
+    return settings
+
+
+def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
     from lidarslam.datasets.registry import choose_reader
 
     chosen = choose_reader(source, reader)
     if topic is not None and chosen != "rosbag":
-        tell(f"--topic {topic} is ignored; {source} is no bag ({chosen})")
+        note(f"--topic {topic} is ignored: {source} is not a bag ({chosen})")
     if sequence is not None and chosen != "kitti-odometry":
-        tell(f"--sequence {sequence} is ignored; {source} is no KITTI odometry ({chosen})")
-
-
-def method_settings(
-    odometry: str | None,
-    weights: Path | None,
-    prior: Path | None,
-    mapping: bool | None,
-    pose_graph: bool | None,
-    settings: tuple[str, ...],
-) -> tuple[str, ...]:
-    """The settings, and those that the options of the method stand for; None where an option was not given.
-
-    Raises:
-        UsageError: options exclude each other.
-    """
-    from lidarslam.config.settings import setting
-
-    if weights is not None:
-        if odometry not in (None, "learned") or prior is not None:
-            raise click.UsageError(
-                "--weights are those of the learned odometry; leave them, or the other odometry, out"
-            )
-        odometry, settings = "learned", (*settings, setting("odometry.learned.weights", str(weights.resolve())))
-    if prior is not None:
-        if odometry is not None:
-            raise click.UsageError("--prior is an odometry of its own; leave --odometry out")
-        odometry = "external"
-    if odometry is not None:
-        settings = (*settings, f"odometry.method={odometry}")
-    switches = {"mapping.enabled": mapping, "pose_graph.enabled": pose_graph}
-    return (*settings, *(f"{key}={str(on).lower()}" for key, on in switches.items() if on is not None))
+        note(f"--sequence {sequence} is ignored: {source} is not a KITTI odometry root ({chosen})")

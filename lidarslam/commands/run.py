@@ -11,13 +11,12 @@ from lidarslam.commands.options import (
     SOURCE,
     CommandWithExample,
     config_options,
-    method_settings,
     odometry_options,
     reader_options,
     scan_options,
     take_config,
 )
-from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
 @click.command(
@@ -28,61 +27,45 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, say, tell
     lidarslam run office.mcap --out runs/office --rerun save --resume""",
 )
 @SOURCE
-@click.option("--out", type=PATH, required=True, metavar="RUN", help="Directory that the results are written to.")
+@click.option("--out", type=PATH, required=True, metavar="RUN", help="Run directory for the results.")
 @odometry_options
-@click.option("--prior", type=FILE, metavar="TUM_FILE", help="A trajectory of another program as the odometry.")
-@click.option(
-    "--mapping/--no-mapping", default=None, help="Lay every scan on the map of those before.  [default: mapping]"
-)
-@click.option(
-    "--pose-graph/--no-pose-graph", default=None, help="Close loops in a pose graph.  [default: no-pose-graph]"
-)
+@click.option("--prior", type=FILE, metavar="TUM_FILE", help="External trajectory to use as the odometry.")
+@click.option("--mapping/--no-mapping", default=None, help="Register scans to the map.  [default: mapping]")
+@click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
 @scan_options
 @click.option(
     "--rerun",
     type=click.Choice(["off", "save", "spawn"]),
     default="off",
     show_default=True,
-    help="Write a Rerun recording beside the results; spawn opens a window too.",
+    help="Save a Rerun recording; spawn opens a window too.",
 )
 @click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
-@click.option(
-    "--resume",
-    is_flag=True,
-    help="Go on with the run in the directory, which was killed or stopped, to the results that it would have had;"
-    " give all other options as they were.",
-)
+@click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @reader_options
 @config_options
 @click.pass_context
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
+    from lidarslam.resume.resuming import lost_when_finished
     from lidarslam.run.progress import show_progress
     from lidarslam.run.request import RunRequest
-    from lidarslam.run.run import astray_when_finished, execute
+    from lidarslam.run.run import execute
     from lidarslam.run.summary_text import format_outcome
 
     if options["resume"] and options["overwrite"]:
-        raise click.UsageError("--resume goes on with a run, --overwrite replaces it; choose one")
-    settings = method_settings(
-        options.pop("odometry"),
-        options.pop("weights"),
-        options["prior"],
-        options.pop("mapping"),
-        options.pop("pose_graph"),
-        options.pop("settings"),
-    )
-    config = take_config(options, settings, source)
+        raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
+    config = take_config(options, source)
     request = RunRequest(source, out, config, **options)
-    if request.resume and (astray := astray_when_finished(request)) is not None:
-        say(f"{out}: is finished, nothing is left to do")
-        ctx.exit(EXIT_LOST if astray else 0)
+    if request.resume and (lost := lost_when_finished(request)) is not None:
+        say(f"{out}: is finished already")
+        ctx.exit(EXIT_LOST if lost else 0)
     with show_progress(source.name) as progress:
         outcome = execute(request, progress)
     say(format_outcome(out, outcome))
     if outcome.stopped is not None:
-        tell(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; --resume goes on with it")
+        note(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; continue with --resume")
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.went_astray:
         ctx.exit(EXIT_LOST)

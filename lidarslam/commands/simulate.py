@@ -29,7 +29,7 @@ def _motions() -> Iterable[str]:
 
 
 def _mounts() -> Iterable[str]:
-    from lidarslam.simulation.motion.mounts import MOUNTS
+    from lidarslam.simulation.motion.carriers import MOUNTS
 
     return MOUNTS
 
@@ -47,39 +47,35 @@ def _formats() -> Iterable[str]:
     lidarslam simulate --out recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
     lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000""",
 )
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder that the recording is made in.")
-@click.option("--world", type=Registered(_worlds), default="office", show_default=True, help="Place to record in.")
-@click.option("--sensor", type=Registered(_sensors), default="vlp-16", show_default=True, help="LiDAR to record with.")
+@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder of the recording.")
+@click.option("--world", type=Registered(_worlds), default="office", show_default=True, help="Scene.")
+@click.option("--sensor", type=Registered(_sensors), default="vlp-16", show_default=True, help="LiDAR model.")
 @click.option(
     "--motion",
     type=Registered(_motions),
-    help="What carries the LiDAR.  [default: handheld; car on a trajectory]",
+    help="Carrier of the LiDAR.  [default: handheld; car with --trajectory]",
 )
 @click.option(
     "--speed",
     "speed_mps",
     type=click.FloatRange(min=0.1, max=60.0),
     metavar="M/S",
-    help="How fast it goes where no bend slows it down.  [default: as what carries it does, within the route's limit]",
+    help="Speed on straight stretches.  [default: that of the carrier, within the limit of the route]",
 )
 @click.option(
     "--trajectory",
     type=FILE,
     metavar="FILE",
-    help="TUM or KITTI file to move along, KITTI's smoothed over 0.25 s. The street is built around it; elsewhere it"
-    " has to keep clear of what stands there.",
+    help="TUM or KITTI file to follow, KITTI's smoothed over 0.25 s. The street is built around it; in other worlds it"
+    " must keep clear of obstacles.",
 )
-@click.option(
-    "--mount", type=Registered(_mounts), default="upright", show_default=True, help="How the LiDAR is mounted."
-)
-@click.option(
-    "--scans", type=click.IntRange(min=1), help="How many scans.  [default: 300, or as long as the trajectory lasts]"
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same recording.")
+@click.option("--mount", type=Registered(_mounts), default="upright", show_default=True, help="Mounting of the LiDAR.")
+@click.option("--scans", type=click.IntRange(min=1), help="Number of scans.  [default: 300, or all of the trajectory]")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
 @click.option("--format", type=Registered(_formats), default="mcap", show_default=True, help="Format of the files.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
-    """Make a recording in a simulated world, with the exact trajectory and the exact map."""
+    """Simulate a recording, with the exact trajectory and the exact map."""
     from lidarslam.run.progress import show_count
     from lidarslam.simulation.recording.record import record
     from lidarslam.simulation.recording.request import RecordRequest

@@ -1,4 +1,4 @@
-"""What commands leave behind on the terminal: lines of theirs, and an exit status."""
+"""Output of the commands on the terminal, and their exit status."""
 
 import click
 
@@ -13,6 +13,6 @@ def say(text: str) -> None:
     click.echo(printable(text))
 
 
-def tell(line: str) -> None:
-    """What there is to know beside it, a line on standard error."""
+def note(line: str) -> None:
+    """A warning or an error, a line on standard error."""
     click.echo(f"lidarslam: {one_line(line)}", err=True)

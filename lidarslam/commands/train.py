@@ -18,36 +18,36 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
 @click.option("--out", type=PATH, required=True, metavar="DIR", help="Directory of the training.")
-@click.option("--resume", is_flag=True, help="Go on with the training in DIR, on the recordings it was begun with.")
+@click.option("--resume", is_flag=True, help="Continue the training in DIR, on the same recordings.")
 @click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
 @click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
     show_default=True,
-    help="Where to compute; auto takes a GPU where there is one.",
+    help="auto: a GPU where there is one.",
 )
-@click.option("--steps", type=click.IntRange(min=1), help="How long to train.  [default: 12000]")
+@click.option("--steps", type=click.IntRange(min=1), help="Training steps.  [default: 12000]")
 @click.option("--network", type=click.Choice(["correlation", "delora"]), help="What to train.  [default: correlation]")
 @click.option(
     "--losses",
     type=click.Choice(["both", "point-to-plane", "plane-to-plane", "paper", "alignment"]),
-    help="What to minimise: geometric losses, as they are or as DeLORA's paper has them, or the distance to the motion"
-    " that alignment finds.  [default: both and alignment]",
+    help="Losses: the geometric ones, in DeLORA's form (paper), or the distance to the aligned motion (alignment)."
+    "  [default: both and alignment]",
 )
-@click.option("--from", "start_from", metavar="WEIGHTS", help="Begin with these weights; shipped: the program's own.")
+@click.option("--from", "start_from", metavar="WEIGHTS", help="Initial weights; shipped: the included ones.")
 @click.option(
-    "--prepared", type=PATH, metavar="DIR", help="Where prepared recordings are kept.  [default: prepared in --out]"
+    "--prepared", type=PATH, metavar="DIR", help="Cache of preprocessed recordings.  [default: prepared in --out]"
 )
 @reader_options
 @config_options
 @click.pass_context
 def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> None:
-    """Teach a network how a sensor moves between scans; recordings need no labels.
+    """Train the network of the learned odometry, self-supervised: recordings need no labels.
 
-    Ctrl-C ends the training with what there is, and --resume goes on with it. Several GPUs: start it with torchrun.
+    Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
     """
     from lidarslam.train.command import TrainOptions, run_train
 
-    if run_train(TrainOptions(sources, **options), say).interrupted:
+    if not run_train(TrainOptions(sources, **options), say):
         ctx.exit(EXIT_MENDABLE)

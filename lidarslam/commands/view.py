@@ -1,11 +1,11 @@
-"""`lidarslam view`: finished runs, looked at."""
+"""`lidarslam view`: finished runs in Rerun."""
 
 import signal
 from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample, config_options, resolve
+from lidarslam.commands.options import PATH, CommandWithExample, config_options
 from lidarslam.commands.terminal import say
 from lidarslam.core.errors import InputError
 
@@ -18,7 +18,7 @@ from lidarslam.core.errors import InputError
 )
 @click.argument("runs", type=PATH, nargs=-1, required=True)
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
-@click.option("--save", type=PATH, metavar="FILE.rrd", help="Write a Rerun recording instead of opening a window.")
+@click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
 @click.option("--picture", type=PATH, metavar="FILE.png", help="Draw the map of one run, or a .ply file, instead.")
 @config_options
 def view(
@@ -29,7 +29,8 @@ def view(
     config_file: Path | None,
     settings: tuple[str, ...],
 ) -> None:
-    """Look at finished runs in Rerun: trajectories, maps, and where tracking was lost."""
+    """Show finished runs in Rerun: trajectories, maps, and where tracking was lost."""
+    from lidarslam.config.settings import load_config
     from lidarslam.run.finished_run import load_run
 
     if sum([web, save is not None, picture is not None]) > 1:
@@ -37,17 +38,20 @@ def view(
     if picture is not None:
         _draw_map(runs, picture)
         return
-    config = resolve(config_file, settings)
+    config = load_config(config_file, settings).viewer
     finished = [load_run(path) for path in runs]
-    from lidarslam.viewer.rerun_viewer import show_runs
+    from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs
 
-    served = show_runs(finished, config.viewer, save, web)
     if save is not None:
+        save_runs(finished, config, save)
         say(f"written to {save}")
-    elif served is not None:
-        say(served.address)
-        say("serving this machine alone until you press Ctrl-C; from another, forward ports 9090 and 9876 by ssh -L")
-        signal.pause()
+    elif web:
+        with served_runs(finished, config) as address:
+            say(address)
+            say("serving this machine until Ctrl-C; from another machine, forward ports 9090 and 9876 with ssh -L")
+            signal.pause()
+    else:
+        open_runs(finished, config)
 
 
 def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:

@@ -10,7 +10,7 @@ from typing_extensions import Self
 
 from evaluation.comparison.mean_table import TablePlan
 from evaluation.comparison.quantities import find_quantity
-from evaluation.comparison.summary_table import TableCell, TableRow
+from evaluation.comparison.table import TableCell, TableRow
 from lidarslam.compare.methods import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry

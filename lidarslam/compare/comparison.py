@@ -11,8 +11,8 @@ from lidarslam.compare.metrics import measure
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
 from lidarslam.compare.request import CompareRequest
 from lidarslam.compare.text import format_result
-from lidarslam.core.directory_lock import only_writer
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import only_writer
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.machine import machine, versions
 from lidarslam.run.request import RunRequest

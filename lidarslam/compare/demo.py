@@ -67,9 +67,9 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
     (sequence,) = outcome.comparison.sequences
     runs = [out / result.run for result in sequence.methods if result.run and result.trajectory is not None]
     if runs:
-        from lidarslam.viewer.rerun_viewer import show_runs
+        from lidarslam.viewer.rerun_runs import save_runs
 
-        show_runs([load_run(run) for run in runs], ViewerConfig(), out / REPLAY, web=False)
+        save_runs([load_run(run) for run in runs], ViewerConfig(), out / REPLAY)
     return Demo(out, outcome, tuple(_picture(out, place) for place in (source, *runs)))
 
 

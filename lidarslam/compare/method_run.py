@@ -13,6 +13,7 @@ from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import remove_partial_files
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.finished_run import load_run
@@ -50,8 +51,7 @@ def run_method(
             progress(int(words[0]), int(words[1]))
 
     ending = supervise([*command, *encode(run)], folder / LOG, limits, see, _ROOT)
-    for partial in folder.glob(".partial-*"):
-        partial.unlink()
+    remove_partial_files(folder)
     status, message = judge(ending, folder, folder / LOG, limits)
     result = MethodResult(folder.name, status, message, wall_s=ending.wall_s, peak_rss_mb=ending.peak_rss_mb)
     RunDirectory(folder).write_json(PROCESS, {name: getattr(result, name) for name in _RECORDED})
@@ -90,6 +90,7 @@ def _collect(run: RunRequest, result: MethodResult) -> MethodResult:
             trajectory=finished.trajectory,
             lost=finished.lost,
             lost_reasons=tuple(stretch["reason"] for stretch in summary["lost"]),
+            map_entropy=summary["map_entropy"],
             ms_per_scan_median=ms.pop("total"),
             ms_per_scan_p95=summary["ms_per_scan"]["total"]["p95"],
             stage_ms=ms,

@@ -10,7 +10,8 @@ from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
-from lidarslam.evaluate.map_evaluation import evaluate_map_of_run
+from lidarslam.evaluate.inputs import read_estimate
+from lidarslam.evaluate.map_evaluation import evaluate_map
 from lidarslam.evaluate.reference_map import ReferenceMap, find_reference_map, load_reference_map
 
 GROUND_TRUTH = "ground truth"
@@ -90,7 +91,7 @@ def _measure_map(
     if result.trajectory is None:
         return result
     try:
-        evaluation = evaluate_map_of_run(folder, None if by_map_alone else result.metrics, reference)
+        evaluation = evaluate_map(read_estimate(folder), None if by_map_alone else result.metrics, reference)
     except InputError as error:
         notes.append(f"{result.name}: no map is compared: {error}")
         return result

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from evaluation.comparison.quantities import QUANTITIES, Quantity
-from evaluation.comparison.summary_table import SummaryTable, TableCell, TableColumn
+from evaluation.comparison.table import Table, TableCell, TableColumn
 from evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.compare.method_ending import WHOLE
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD
@@ -75,7 +75,7 @@ def _shown_quantities(results: Sequence[MethodResult]) -> Iterator[Quantity]:
     yield QUANTITIES["lost_scans"]
 
 
-def _summary_lines(table: SummaryTable) -> Iterator[str]:
+def _summary_lines(table: Table) -> Iterator[str]:
     yield table.title
     sources = list(dict.fromkeys(row.source for row in table.rows if row.source))
     marks = [f" [{sources.index(row.source) + 1}]" if row.source else "" for row in table.rows]

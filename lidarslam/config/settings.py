@@ -13,15 +13,13 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.yaml_text import YamlError, parse_yaml
+from lidarslam.config.yaml_text import YamlError, parse_yaml, settings_as_yaml
 from lidarslam.config.yaml_text import read_yaml as read_yaml_file
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.resume.config import CheckpointConfig
 from lidarslam.run.directory import RUN_SECTION
 from lidarslam.train.directory import SOURCES_SECTION
-from mapping.config import GlobalMapConfig, MappingConfig
-from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
 # The sections of a run's or a training's config.yaml that are no configuration.
@@ -36,14 +34,22 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class ViewerConfig(BaseModel):
-    """What the Rerun recording holds."""
+    """Contents of the Rerun recording; no effect on the results."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    scan_points: int = Field(20_000, ge=1, description="points of each scan that are shown")
-    map_points: int = Field(200_000, ge=1, description="points of the map around the sensor that are shown")
-    map_radius_m: float = Field(60.0, gt=0.0, description="how far around the sensor the map is shown")
-    map_every: int = Field(20, ge=1, description="the map is shown anew every so many scans")
+    scan_points: int = Field(20_000, ge=1, description="points of a scan that are shown")
+    map_points: int = Field(200_000, ge=1, description="points of the map that are shown")
+    map_every: int = Field(20, ge=1, description="scans between two views of the growing map")
+
+
+class CheckpointConfig(BaseModel):
+    """Saving for --resume; no effect on the results."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    interval_s: float = Field(10.0, ge=0.0, description="least time between checkpoints; they take 2 % of it at most")
+    every_scans: int | None = Field(None, ge=1, description="instead, scans between checkpoints")
 
 
 class Config(BaseModel):
@@ -54,7 +60,7 @@ class Config(BaseModel):
     reader: ReaderConfig = ReaderConfig()
     odometry: OdometryConfig = OdometryConfig()
     mapping: MappingConfig = MappingConfig()
-    pose_graph: SlamGraphConfig = SlamGraphConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
     global_map: GlobalMapConfig = GlobalMapConfig()
     viewer: ViewerConfig = ViewerConfig()
     checkpoints: CheckpointConfig = CheckpointConfig()
@@ -99,10 +105,12 @@ def setting(key: str, text: str) -> str:
     return f"{key}='{quoted}'"
 
 
-def dump_yaml(config: Config, run: dict[str, Any] | None = None) -> str:
-    """The resolved configuration as YAML; `run` becomes the section that says what was run."""
-    tree: dict[str, Any] = {} if run is None else {RUN_SECTION: run}
-    return str(yaml.safe_dump(tree | config.model_dump(mode="json"), sort_keys=False, allow_unicode=True))
+def dump_yaml(config: BaseModel, described: dict[str, Any] | None = None, section: str = RUN_SECTION) -> str:
+    """The resolved configuration as commented YAML, after a section that says what was computed."""
+    if described is None:
+        return settings_as_yaml(config)
+    first = yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)
+    return f"{first}\n{settings_as_yaml(config)}"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -1,26 +1,28 @@
-"""YAML as plain values; the only file that imports yaml to read, and never with tags that make objects."""
+"""YAML in and out: plain values only, never tags that make objects; settings with a comment each."""
 
-from collections.abc import Hashable
+import re
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
 from lidarslam.core.plain_text import one_line
 
-# A configuration is a few kilobytes.
+# A configuration has a few kilobytes.
 _LONGEST_BYTES = 4 << 20
-# What PyYAML lets through besides its own errors: a value with the form of a date or number (2021-13-45), and nesting
-# that its parser follows call by call.
-_UNREADABLE = (yaml.YAMLError, ValueError, AttributeError, RecursionError)
 _MERGE_TAG = "tag:yaml.org,2002:merge"
+# Comments begin at this column at the latest, unless the setting is longer.
+_LAST_COLUMN = 48
+_FIRST_CLAUSE = re.compile(r"[.;\n]")
 
 
 class YamlError(ValueError):
-    """A text that is not the YAML that is meant; its message is one line.
+    """A text that is not valid YAML; the message is one line.
 
     Attributes:
-        is_syntax: whether the text would be YAML if it were written otherwise, so that it may be meant as a plain text.
+        is_syntax: whether only the syntax is wrong, so that it may be meant as a plain text.
     """
 
     def __init__(self, message: str, is_syntax: bool = False) -> None:
@@ -29,19 +31,17 @@ class YamlError(ValueError):
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice in a section, of which the later would win unseen."""
+    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()
         for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else []:
-            if key_node.tag == _MERGE_TAG:
-                continue
-            key: Any = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable) and key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} stands twice", key_node.start_mark
-                )
-            if isinstance(key, Hashable):
+            key: Any = None if key_node.tag == _MERGE_TAG else self.construct_object(key_node, deep=True)
+            if isinstance(key, Hashable) and key is not None:
+                if key in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key {key!r} occurs twice", key_node.start_mark
+                    )
                 seen.add(key)
         return super().construct_mapping(node, deep)
 
@@ -50,15 +50,15 @@ def parse_yaml(text: str) -> Any:
     """The values of a text: dictionaries, lists, texts, numbers, dates, null.
 
     Raises:
-        YamlError: it is not YAML, asks for other objects, or a key stands twice.
+        YamlError: it is not YAML, asks for other objects, or a key occurs twice.
     """
     try:
         return yaml.load(text, Loader=_StrictLoader)  # a SafeLoader that refuses more
-    except _UNREADABLE as error:
-        if isinstance(error, yaml.YAMLError):
-            raise YamlError(f"not YAML: {' '.join(str(error).split())}", is_syntax=True) from error
-        if isinstance(error, RecursionError):
-            raise YamlError("not YAML: it is nested too deeply") from error
+    except yaml.YAMLError as error:
+        raise YamlError(f"not YAML: {' '.join(str(error).split())}", is_syntax=True) from error
+    except RecursionError as error:
+        raise YamlError("not YAML: it is nested too deeply") from error
+    except (ValueError, AttributeError) as error:  # PyYAML converts without a check, as 2021-13-45
         raise YamlError(f"a value looks like a date or a number but is none: {error}") from error
 
 
@@ -77,3 +77,37 @@ def read_yaml(path: Path) -> Any:
     except (OSError, UnicodeDecodeError) as error:
         raise YamlError(f"the file cannot be read ({one_line(str(error))})") from error
     return parse_yaml(text)
+
+
+def settings_as_yaml(settings: BaseModel) -> str:
+    """Every setting on a line with its description, every section below its title."""
+    return "\n".join(_section(settings, "")).lstrip("\n") + "\n"
+
+
+def _section(settings: BaseModel, indent: str) -> Iterator[str]:
+    values = settings.model_dump(mode="json")
+    entries = [(name, field, getattr(settings, name)) for name, field in type(settings).model_fields.items()]
+    plain = {name: f"{indent}{name}: {_flow(values[name])}" for name, _, value in entries if not _is_section(value)}
+    column = min(max(map(len, plain.values()), default=0), _LAST_COLUMN)
+    for name, field, value in entries:
+        if _is_section(value):
+            if not indent:
+                yield ""
+            title = field.description or (type(value).__doc__ or "")
+            yield f"{indent}# {_FIRST_CLAUSE.split(title.strip())[0]}"
+            yield f"{indent}{name}:"
+            yield from _section(value, f"{indent}  ")
+        elif field.description:
+            yield f"{plain[name]:{column}}  # {field.description}"
+        else:
+            yield plain[name]
+
+
+def _is_section(value: Any) -> bool:
+    return isinstance(value, BaseModel)
+
+
+def _flow(value: Any) -> str:
+    """A value on one line."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=float("inf"))
+    return text.removesuffix("\n").removesuffix("\n...")

@@ -1,8 +1,7 @@
 """Loops over points, compiled to machine code: the only file that knows numba.
 
-A scan's loops over 100,000 points are written as loops and compiled when they are first called. They run without the
-interpreter's lock, so that odometry and mapping do not wait for one another. This stands in the core, which otherwise
-has NumPy and SciPy only, because odometry and mapping both need it and share nothing else.
+They are compiled on their first call and run without the interpreter's lock, so that odometry and mapping run side by
+side. Both need this file and share nothing else but the core.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""Ways of moving that what a sensor sees leaves open: along a corridor, around the axis of a tank."""
+"""Degenerate directions of motion, which a scan does not constrain: along a corridor, around the axis of a tank."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,17 @@ _NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
 def lever_scale(lever_m: float) -> FloatArray:
-    """(6,) metres that each part of a motion counts for, rotation first, with rotations acting at a distance."""
+    """(6,) scale of a motion, rotation first, to metres: rotations act at the end of a lever."""
     return np.array([lever_m] * 3 + [1.0] * 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Degeneracy:
-    """Directions of motion that a scan says too little about.
+    """Directions of motion that a scan does not constrain.
 
     Attributes:
         directions: (D, 6) orthonormal, rotation first, rotations scaled by `lever_m`, in the LiDAR frame.
-        lever_m: metres that a rotation of a radian counts for.
+        lever_m: metres that correspond to a rotation of one radian.
     """
 
     directions: FloatArray
@@ -31,7 +31,7 @@ class Degeneracy:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The axes nearest to the directions, each but once, in the LiDAR frame."""
+        """The nearest axes of the LiDAR frame, each once (pivoted Cholesky of the projector)."""
         left = self.directions.T @ self.directions  # the same for any basis of the directions
         axes = []
         for _ in self.directions:
@@ -42,13 +42,13 @@ class Degeneracy:
 
     @property
     def rows(self) -> FloatArray:
-        """(D, 6): takes from a motion (rotation first, radians and metres) how far it goes along each, metres."""
+        """(D, 6): from a motion (rotation first, radians and metres) to its components along the directions, metres."""
         return np.asarray(self.directions * lever_scale(self.lever_m), dtype=np.float64)
 
     def projector(self) -> FloatArray:
-        """(6, 6): the part of a motion (rotation first, radians and metres), in metres, along the directions."""
+        """(6, 6) quadratic form: the squared length, metres, of the part of a motion along the directions."""
         return np.asarray(self.rows.T @ self.rows, dtype=np.float64)
 
     def part_along(self) -> FloatArray:
-        """(6, 6): takes from a motion (rotation first, radians and metres) its part along the directions."""
+        """(6, 6): from a motion (rotation first, radians and metres) to its part along the directions."""
         return np.asarray(self.directions.T @ self.rows / lever_scale(self.lever_m)[:, None], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What can go wrong and be mended by the user.
+"""Errors that a user can mend.
 
 Everything derived from `LidarSlamError` is caught once, at the command line, and printed as one line without a
 traceback; its message says what was expected, what came, and what to do.

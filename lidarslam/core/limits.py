@@ -1,4 +1,4 @@
-"""Limits among settings that must be in order; a breach is a ValueError that names both."""
+"""Checks of settings against each other; a ValueError names both."""
 
 
 def require_range_left(min_range_m: float, max_range_m: float) -> None:

@@ -1,4 +1,4 @@
-"""Text of unknown origin, such as names in a recording, made fit for a terminal and for one line of it."""
+"""Text of unknown origin, such as names in a recording, made safe for a terminal."""
 
 import re
 
@@ -9,16 +9,13 @@ _UNSEEN = (
 _STEERING = re.compile(f"[{_UNSEEN}]")
 _STEERING_BUT_LINES = re.compile(f"(?!\n)[{_UNSEEN}]")
 
-# Longer lines have something else in them than what they say.
+# Longer lines are cut in the middle.
 _LONGEST = 2_000
 _TAIL = 400
 
 
 def one_line(text: str, longest: int = _LONGEST) -> str:
-    """The text in one line that a terminal shows as it is: what it would act on is spelt out, as in `\\x1b`.
-
-    Of a text longer than `longest` characters the middle is left out.
-    """
+    """The text in one line: control characters are escaped, as in `\\x1b`, and a long middle is left out."""
     spelt = _STEERING.sub(_spelt, text)
     if len(spelt) <= longest:
         return spelt
@@ -27,8 +24,13 @@ def one_line(text: str, longest: int = _LONGEST) -> str:
 
 
 def printable(text: str) -> str:
-    """The same for a text of several lines, which stay lines; nothing is left out."""
+    """Likewise for a text of several lines, at full length."""
     return _STEERING_BUT_LINES.sub(_spelt, text)
+
+
+def count(number: int, noun: str) -> str:
+    """A number with its noun: 1 scan, 2,000 scans."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _spelt(match: re.Match[str]) -> str:

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 
 # No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
@@ -103,22 +102,6 @@ class Scan:
             None if self.time_offsets is None else self.time_offsets[chosen],
             None if self.rings is None else self.rings[chosen],
             self.dropped,
-        )
-
-    def state(self) -> State:
-        """All of it."""
-        return dict(vars(self))
-
-    @classmethod
-    def restored(cls, saved: Saved) -> "Scan":
-        """The scan with a state."""
-        points = saved.array("points", (None, 3))
-        return cls(
-            points,
-            saved.number("stamp"),
-            saved.optional_array("time_offsets", (len(points),)),
-            saved.optional_array("rings", (len(points),), np.int32),
-            saved.integer("dropped"),
         )
 
 

@@ -1,4 +1,4 @@
-"""Fewer points with the same coverage."""
+"""Voxel downsampling by a spatial hash, after Teschner et al., "Optimized Spatial Hashing" (VMV 2003)."""
 
 import threading
 
@@ -14,16 +14,14 @@ _PRIME_X, _PRIME_Y, _PRIME_Z = 73_856_093, 19_349_669, 83_492_791
 # Farther away, in cells, all is one cell: integers go no farther.
 _FARTHEST = float(1 << 31)
 
-_room = (
-    threading.local()
-)  # the slots, which need not be cleared: to have them anew for every scan takes longer than all
+# Slots of this thread; they are never cleared, as allocating them for every scan takes longer than all the rest.
+_room = threading.local()
 
 
 def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     """Indices, ascending, of one point in nearly every occupied cell of a grid.
 
-    A spatial hash that keeps the last comer, after Teschner et al., "Optimized Spatial Hashing" (VMV 2003): several
-    times faster than sorting, the same for the same points.
+    The last point of a cell is kept: several times faster than sorting, and deterministic.
 
     Args:
         points: (N, 3).
@@ -35,10 +33,9 @@ def one_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
 
 
 def central_per_cell(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
-    """Indices, ascending, of one point in nearly every occupied cell of a grid: the nearest to the mean of the cell's.
+    """Indices, ascending, of one point in nearly every occupied cell of a grid: the nearest to the mean of the cell.
 
-    That is on the same part of a surface whichever way the sensor goes round, which the last comer is not. The hash is
-    that of `one_per_cell`; where two cells meet in one slot they count as one.
+    It does not depend on the order of the points, unlike the last point. Cells that share a slot count as one.
 
     Args:
         points: (N, 3), finite.
@@ -58,7 +55,7 @@ def _slots_of(points: FloatArray, cell_m: float) -> NDArray[np.int32]:
 
 
 def _slot_values() -> NDArray[np.int32]:
-    """This thread's slots, with whatever is in them."""
+    """This thread's slots, with arbitrary content."""
     if not hasattr(_room, "values"):
         _room.values = np.empty(_SLOTS, dtype=np.int32)
     values: NDArray[np.int32] = _room.values

@@ -1,13 +1,13 @@
-"""How well a scan was tracked."""
+"""Tracking status."""
 
 from enum import Enum
 
 
 class Status(str, Enum):
-    """What to believe of a scan's pose.
+    """Quality of a scan's pose.
 
-    `ok`: it fits what was seen before. `degraded`: it fits badly, or only in some directions. `lost`: it does not fit;
-    the pose is a prediction.
+    `ok`: the scan fits the map. `degraded`: it fits badly, or only some directions are constrained. `lost`: it does not
+    fit, and the pose is a prediction.
     """
 
     OK = "ok"

@@ -16,7 +16,7 @@ from lidarslam.core.trajectory import Trajectory
 
 # Ten million poses and more.
 _LONGEST_BYTES = 1 << 30
-# Positions in metres end well within this, however far away a survey puts its origin; squares of more overflow.
+# Survey coordinates are far below; squares of much larger numbers overflow.
 _FARTHEST_M = 1e9
 
 
@@ -101,7 +101,7 @@ def read_kitti_poses(path: Path) -> FloatArray:
 def _require_near(path: Path, positions: FloatArray) -> None:
     farthest = float(np.abs(positions).max())
     if farthest > _FARTHEST_M:
-        raise InputError(f"{path}: a position lies {farthest:.3g} m from the origin; expected metres on this planet")
+        raise InputError(f"{path}: a position lies {farthest:.3g} m from the origin; expected metres")
 
 
 def format_kitti(poses: FloatArray) -> str:

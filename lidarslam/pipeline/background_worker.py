@@ -1,66 +1,36 @@
-"""Who follows a run on a thread of its own, such as a pose graph, and what it is told."""
+"""Calls that are carried out in order on a thread of its own, so that the caller need not wait for them."""
 
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol
-
-from lidarslam.core.geometry import FloatArray
-from lidarslam.core.tracking import Status
-from lidarslam.pipeline.localisation import Estimated, Localised
-from mapping.pose_graph.graph_scan import GraphScan
-
-# How many jobs the thread may lag behind: a loop may take as long as all the scans up to the next keyframe.
-_MAX_BEHIND = 64
+from typing import Any
 
 
-class Follower(Protocol):
-    """Sees everything that a run comes to, scan by scan: what the scan before showed, then the next scan."""
+class BackgroundWorker:
+    """One thread, a bounded queue of calls.
 
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
-        """Points (N, 3) of the latest scan, in its LiDAR frame, that belong in the map."""
+    Args:
+        name: of the thread.
+        max_pending: calls that may wait; `submit` waits while there are more, to bound the memory they hold.
+    """
 
-    def add(self, scan: GraphScan) -> None:
-        """The next scan."""
+    def __init__(self, name: str, max_pending: int) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+        self._pending: deque[Future[Any]] = deque()
+        self._max_pending = max_pending
 
+    def submit(self, call: Callable[..., Any], *arguments: Any) -> None:
+        """Queue a call; an error of an earlier one may be raised here."""
+        self._pending.append(self._pool.submit(call, *arguments))
+        while len(self._pending) > self._max_pending:
+            self._pending.popleft().result()
 
-class Behind:
-    """Lets a follower work on a thread of its own, and wait no longer than is good for the memory."""
+    def wait(self) -> None:
+        """Wait until all calls are done, and raise the first error among them."""
+        while self._pending:
+            self._pending.popleft().result()
 
-    def __init__(self, follower: Follower) -> None:
-        self._follower = follower
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graph")
-        self._jobs: deque[Future[None]] = deque()
-
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
-        """See `Follower.draw`."""
-        self._jobs.append(self._pool.submit(self._follower.draw, points, T_world_lidar, voxel_size_m))
-
-    def add(self, scan: GraphScan) -> None:
-        """See `Follower.add`."""
-        self._jobs.append(self._pool.submit(self._follower.add, scan))
-        while len(self._jobs) > _MAX_BEHIND:
-            self._jobs.popleft().result()
-
-    def catch_up(self) -> None:
-        """Wait until all is done; an error of the follower's is raised."""
-        while self._jobs:
-            self._jobs.popleft().result()
-
-    def finish(self) -> None:
-        """Wait until all is done, for the last time."""
-        self.catch_up()
+    def close(self) -> None:
+        """Wait for all calls and end the thread."""
+        self.wait()
         self._pool.shutdown()
-
-
-def graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:
-    """What a follower is told of a scan: how it was found, and its compensated points (N, 3) in the LiDAR frame."""
-    measured = estimated.interval_s is not None and (localised.way_known or localised.status is Status.LOST)
-    return GraphScan(
-        T_world_lidar=localised.T_world_lidar,
-        points=points,
-        covariance=localised.covariance,
-        T_prev_curr=estimated.motion.T_prev_curr if measured else None,
-        motion_covariance=estimated.motion.covariance if measured else None,
-        lost=localised.status is Status.LOST or not localised.way_known,
-        belongs_in_map=localised.belongs_in_map,
-    )

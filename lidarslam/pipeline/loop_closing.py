@@ -1,4 +1,4 @@
-"""What a run does with its pose graph: begin it, and in the end correct trajectory and map by it."""
+"""The pose graph of a run: begun with it, and in the end trajectory and map corrected by it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
@@ -14,132 +13,126 @@ from lidarslam.core.state import Saved
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.global_map import GlobalMap
-from mapping.pose_graph.g2o import GraphFile
+from mapping.loops.closure import LoopClosure, RelativePose
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
-    from mapping.loops.detection import LoopClosure
-    from mapping.pose_graph.slam_graph import Corrected, SlamGraph
+    from mapping.pose_graph.correction import Corrected
+    from mapping.pose_graph.slam_graph import SlamGraph
 
 
 @dataclass(frozen=True)
 class LoopReport:
-    """One place seen twice, or nearly believed to be; for the summary.
+    """A loop closure in the summary.
 
     Attributes:
-        first_scan, second_scan: which scans of their recordings, the second the later one.
-        accepted, reason: whether it is in the graph; why not.
-        rest: overlap, residual and so on.
-        first_recording, second_recording: which recordings, from 1; None where there is one only.
+        closure: between keyframes.
+        accepted: whether it is in the graph: an outlier of the optimisation is not.
+        scans: which of their recordings, the second the later one.
+        recordings: which, from 1; None where there is one only.
     """
 
-    first_scan: int
-    second_scan: int
+    closure: LoopClosure
     accepted: bool
-    reason: str
-    found_by: str
-    overlap: float
-    residual_m: float
-    inlier_ratio: float
-    consistent: int
-    distance_m: float
-    turn_deg: float
-    first_recording: int | None = None
-    second_recording: int | None = None
+    scans: tuple[int, int]
+    recordings: tuple[int, int] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """An entry of summary.json."""
-        known = {name: value for name, value in vars(self).items() if value is not None}
-        return {name: round(value, 4) if isinstance(value, float) else value for name, value in known.items()}
+        closure, of = self.closure, self.recordings
+        outlier = closure.accepted and not self.accepted
+        return {
+            "first_scan": self.scans[0],
+            "second_scan": self.scans[1],
+            "accepted": self.accepted,
+            "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
+            "found_by": "appearance" if closure.by_appearance else "nearby",
+            "overlap": round(closure.overlap, 4),
+            "residual_m": round(closure.residual_m, 4),
+            "inlier_ratio": round(closure.inlier_ratio, 4),
+            "consistent": closure.consistent,
+            "distance_m": round(float(np.linalg.norm(closure.T_first_second[:3, 3])), 4),
+            "turn_deg": round(float(np.rad2deg(rotation_angle(closure.T_first_second))), 4),
+            **({} if of is None else {"first_recording": of[0], "second_recording": of[1]}),
+        }
 
 
 @dataclass(frozen=True, eq=False)
 class GraphOutcome:
-    """What a pose graph did to a run, or to several that it joined.
+    """A run, or several connected ones, corrected by the graph.
 
     Attributes:
         T_world_lidar: (M, 4, 4) corrected poses of all scans.
         global_map: drawn anew.
-        graph: for pose_graph.g2o.
-        loops: accepted ones, and those that were looked at closely and refused.
-        largest_correction_m: by how much a scan moved; being moved into the frame of another run does not count.
+        keyframe_poses, edges: (K, 4, 4) and the relative poses between them, for pose_graph.g2o.
+        loops: accepted and rejected.
+        largest_correction_m: by how much a scan moved; a move into the frame of another run does not count.
         keyframe_ms: wall time of each keyframe, on a thread of its own.
     """
 
     T_world_lidar: FloatArray
     global_map: GlobalMap
-    graph: GraphFile
+    keyframe_poses: FloatArray
+    edges: tuple[RelativePose, ...]
     loops: tuple[LoopReport, ...]
     largest_correction_m: float
     keyframe_ms: tuple[float, ...]
 
-    @property
-    def accepted(self) -> tuple[LoopReport, ...]:
-        """The loops that were closed."""
-        return tuple(loop for loop in self.loops if loop.accepted)
-
 
 def begin_graph(config: Config, directory: Path | None = None, file: Path | None = None) -> "SlamGraph | None":
-    """A pose graph, when the configuration asks for one; what it puts aside lies in the directory, or in the file."""
+    """A pose graph, when the configuration asks for one; its submaps lie in the directory, or in the file."""
     if not config.pose_graph.enabled:
         return None
     from mapping.pose_graph.slam_graph import SlamGraph
 
-    return SlamGraph(config.pose_graph, directory, file, _local_radius_m(config))
+    local_radius_m = config.mapping.radius_m if config.mapping.enabled else 0.0
+    return SlamGraph(config.pose_graph, directory, file, local_radius_m)
 
 
-def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph":
-    """A pose graph with a state; what it put aside lies in the file.
+def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph | None":
+    """A pose graph with a state, whose submaps lie in the file.
 
     Raises:
         InputError: one of them is damaged.
     """
-    from mapping.pose_graph.slam_graph import SlamGraph
-
-    return SlamGraph.restored(config.pose_graph, saved, file, _local_radius_m(config))
-
-
-def finish_graph(graph: "SlamGraph", scans: int, voxel_size_m: float) -> GraphOutcome | None:
-    """Close the loops of so many scans for good, and draw the map anew; None where no scan could be believed."""
-    finished = finish_recordings(graph, [scans], voxel_size_m)
-    return None if finished is None else finished.of([0])
-
-
-def _local_radius_m(config: Config) -> float:
-    return config.mapping.radius_m if config.mapping.enabled else 0.0
+    graph = begin_graph(config, file=file)
+    if graph is not None:
+        graph.restore(saved)
+    return graph
 
 
 def close_loops(
     graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog, viewer: Viewer
 ) -> GraphOutcome | None:
-    """Correct what was logged, and show it, once all scans are there; None where there is nothing to correct."""
+    """Correct the log, and show it, once all scans are there; None where there is nothing to correct."""
     if graph is None or global_map is None:
         return None
-    closed = finish_graph(graph, len(log), global_map.voxel_size_m)
+    finished = FinishedGraph.of_recordings(graph, [len(log)], global_map.voxel_size_m)
+    closed = None if finished is None else finished.outcome([0])
     if closed is not None:
         log.correct(closed.T_world_lidar)
-        pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
+        pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
     return closed
 
 
-def finish_recordings(graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float) -> "FinishedGraph | None":
-    """Close the loops within and between recordings of so many scans each; None where no scan could be believed."""
-    result = graph.finish()
-    return None if result is None else FinishedGraph(graph, result, tuple(scans), voxel_size_m)
-
-
 @dataclass(frozen=True, eq=False)
 class FinishedGraph:
-    """A graph of one recording or more, all loops decided upon; maps are drawn when they are asked for."""
+    """An optimised graph of one recording or more; maps are drawn when they are asked for."""
 
     _graph: "SlamGraph"
     _result: "Corrected"
     _scans: tuple[int, ...]
     _voxel_size_m: float
 
+    @classmethod
+    def of_recordings(cls, graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float) -> "FinishedGraph | None":
+        """Optimise recordings of so many scans each; None where no scan was registered."""
+        result = graph.finish()
+        return None if result is None else cls(graph, result, tuple(scans), voxel_size_m)
+
     @property
     def joined(self) -> list[int]:
-        """The recordings that most of them are in one frame with; of several such frames, those of the first."""
+        """The recordings of the largest connected component, of several the first."""
         mapped = np.unique(self._result.keyframe_recordings)
         mapped = mapped[np.array(self._scans)[mapped] > 0]
         if not len(mapped):
@@ -148,31 +141,34 @@ class FinishedGraph:
         return [int(recording) for recording in mapped[self._result.frames[mapped] == frames[counts.argmax()]]]
 
     def common(self) -> GraphOutcome | None:
-        """What became of the recordings that are joined; its refused loops tell why others are not."""
-        joined = self.joined
-        ours = {recording + 1 for recording in joined}
-        loops = tuple(
+        """The connected recordings, and why others are apart: the rejected loops between recordings."""
+        outcome = self.outcome(self.joined)
+        if outcome is None:
+            return None
+        apart = [
             loop
             for loop in self._loops(range(len(self._scans)), numbered=True)
-            if {loop.first_recording, loop.second_recording} <= ours
-            or (loop.first_recording != loop.second_recording and not loop.accepted)
-        )
-        return self._outcome(joined, loops)
+            if not (loop.accepted or self._are_in(self.joined, loop.closure)) and len(set(loop.recordings or ())) > 1
+        ]
+        return replace(outcome, loops=(*outcome.loops, *apart))
 
-    def of(self, recordings: Sequence[int]) -> GraphOutcome | None:
-        """What became of some recordings, and of the loops between them; None when none has a keyframe."""
-        return self._outcome(recordings, self._loops(recordings, numbered=len(recordings) > 1))
-
-    def _outcome(self, recordings: Sequence[int], loops: tuple[LoopReport, ...]) -> GraphOutcome | None:
-        chosen = np.flatnonzero(np.isin(self._result.keyframe_recordings, recordings))
+    def outcome(self, recordings: Sequence[int]) -> GraphOutcome | None:
+        """Some recordings, and the loops between them; None when none has a keyframe."""
+        result = self._result
+        chosen = np.flatnonzero(np.isin(result.keyframe_recordings, recordings))
         if not len(chosen):
             return None
-        poses = [self._scan_poses(recording) for recording in recordings]
+        row = {int(key): new for new, key in enumerate(chosen)}
         return GraphOutcome(
-            T_world_lidar=np.concatenate(poses),
-            global_map=self._graph.draw_map(self._result, self._voxel_size_m, recordings),
-            graph=_part(self._result.graph, chosen),
-            loops=loops,
+            T_world_lidar=np.concatenate([self._scan_poses(recording) for recording in recordings]),
+            global_map=self._graph.draw_map(result, self._voxel_size_m, recordings),
+            keyframe_poses=result.keyframe_poses[chosen],
+            edges=tuple(
+                replace(edge, first=row[edge.first], second=row[edge.second])
+                for edge in result.edges
+                if self._are_in(recordings, edge)
+            ),
+            loops=self._loops(recordings, numbered=len(recordings) > 1),
             largest_correction_m=max(self._correction_m(recording) for recording in recordings),
             keyframe_ms=tuple(self._graph.keyframe_ms[k] for k in chosen),
         )
@@ -184,61 +180,28 @@ class FinishedGraph:
     def _correction_m(self, recording: int) -> float:
         """How far a recording's scans moved, its first keyframe held where it is."""
         keys = np.flatnonzero(self._result.keyframe_recordings == recording)
-        if not len(keys) or not self._scans[recording]:
+        after = self._scan_poses(recording)
+        if not len(keys) or not len(after):
             return 0.0
         begin, first = self._result.first_scans[recording], self._result.keyframe_scans[keys[0]]
-        before, after = (
-            np.array(self._graph.scan_poses[begin : begin + self._scans[recording]]),
-            self._scan_poses(recording),
-        )
+        before = np.array(self._graph.scan_poses[begin : begin + len(after)])
         T_common_own = self._result.T_world_lidar[first] @ inverse(self._graph.scan_poses[first])
         return float(np.linalg.norm(after[:, :3, 3] - (T_common_own @ before)[:, :3, 3], axis=1).max())
 
+    def _are_in(self, recordings: Sequence[int], edge: RelativePose) -> bool:
+        of = self._result.keyframe_recordings
+        return bool(of[edge.first] in recordings and of[edge.second] in recordings)
+
     def _loops(self, recordings: Sequence[int], numbered: bool) -> tuple[LoopReport, ...]:
-        of, scans = self._result.keyframe_recordings, self._result.keyframe_scans - self._first_of_keyframes
-        found = []
-        for closure, believed in zip(self._result.closures, self._result.believed, strict=True):
-            first, second = int(of[closure.first]), int(of[closure.second])
-            if first in recordings and second in recordings:
-                ends = (int(scans[closure.first]), int(scans[closure.second]))
-                found.append(_report(closure, believed, ends, (first + 1, second + 1) if numbered else (None, None)))
-        return tuple(found)
-
-    @property
-    def _first_of_keyframes(self) -> NDArray[np.intp]:
-        """(K,) the first scan of each keyframe's recording."""
-        return self._result.first_scans[self._result.keyframe_recordings]
-
-
-def _part(graph: GraphFile, keys: NDArray[np.intp]) -> GraphFile:
-    """Some of the poses of a graph whose keys count up from 0, counted anew, and the edges between them."""
-    new = np.full(len(graph.keys), -1)
-    new[keys] = np.arange(len(keys))
-    edges = [
-        replace(edge, first=int(new[edge.first]), second=int(new[edge.second]))
-        for edge in graph.edges
-        if new[edge.first] >= 0 and new[edge.second] >= 0
-    ]
-    return GraphFile(np.arange(len(keys)), graph.poses[keys], tuple(edges))
-
-
-def _report(
-    closure: "LoopClosure", believed: bool, scans: tuple[int, int], recordings: tuple[int | None, int | None]
-) -> LoopReport:
-    outvoted = closure.verdict == "accepted" and not believed
-    T = closure.T_first_second
-    return LoopReport(
-        first_scan=scans[0],
-        second_scan=scans[1],
-        accepted=believed,
-        reason="does not fit the other edges of the graph" if outvoted else closure.reason,
-        found_by=closure.found_by,
-        overlap=closure.overlap,
-        residual_m=closure.residual_m,
-        inlier_ratio=closure.inlier_ratio,
-        consistent=closure.consistent,
-        distance_m=float(np.linalg.norm(T[:3, 3])),
-        turn_deg=float(np.rad2deg(rotation_angle(T))),
-        first_recording=recordings[0],
-        second_recording=recordings[1],
-    )
+        of = self._result.keyframe_recordings
+        scans = self._result.keyframe_scans - self._result.first_scans[of]
+        return tuple(
+            LoopReport(
+                closure,
+                inlier,
+                (int(scans[closure.first]), int(scans[closure.second])),
+                (int(of[closure.first]) + 1, int(of[closure.second]) + 1) if numbered else None,
+            )
+            for closure, inlier in zip(self._result.closures, self._result.inliers, strict=True)
+            if self._are_in(recordings, closure)
+        )

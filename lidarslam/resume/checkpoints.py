@@ -1,37 +1,55 @@
-"""When a run saves its state, and what that is made of."""
+"""Checkpoints of a run: when its state is saved, what it consists of, how a run goes on from it."""
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
+from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import OutputError
-from lidarslam.core.state import State
+from lidarslam.core.scan import Scan
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.resume.config import CheckpointConfig
+from lidarslam.resume.resuming import scans_left
 from lidarslam.resume.state_file import write_state
 from lidarslam.resume.unfinished import Unfinished
+from lidarslam.run.directory import RERUN
+from lidarslam.run.scan_log import ScanLog
+from odometry.interface import Odometry
+
+if TYPE_CHECKING:
+    from mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
 
+# Saving takes at most this share of the time.
+_SHARE = 0.02
+# How the sentence in the summary begins.
+_RESUMED = "the run was resumed "
+
 
 class Checkpoints:
-    """Saves the state of a run now and then; see `lidarslam.pipeline.pipeline.Keeper`.
+    """Saves the state of a run now and then; see `lidarslam.pipeline.pipeline.Checkpointer`.
 
     Args:
         unfinished: where.
         config: how often.
-        rest: the state of what is not the pipeline's.
-        warn: told when it cannot be written; the run goes on.
+        odometry, log, graph: of the run, saved with the pipeline.
     """
 
     def __init__(
-        self, unfinished: Unfinished, config: CheckpointConfig, rest: Callable[[], State], warn: Callable[[str], None]
+        self,
+        unfinished: Unfinished,
+        config: CheckpointConfig,
+        odometry: Odometry,
+        log: ScanLog,
+        graph: "SlamGraph | None",
     ) -> None:
-        self._file = unfinished.state
+        self._unfinished = unfinished
         self._config = config
-        self._rest = rest
-        self._warn = warn
-        self._scans = 0  # since the last one
+        self._odometry = odometry
+        self._log = log
+        self._graph = graph
+        self._scans = 0  # since the last checkpoint
         self._done = self._asked = time.monotonic()
         self._cost_s = 0.0
 
@@ -41,16 +59,56 @@ class Checkpoints:
         if self._config.every_scans is not None:
             return self._scans >= self._config.every_scans
         self._asked = time.monotonic()
-        share = self._config.most_percent / 100.0
-        return self._asked - self._done >= max(self._config.interval_s, self._cost_s / share)
+        return self._asked - self._done >= max(self._config.interval_s, self._cost_s / _SHARE)
 
-    def keep(self, pipeline: Pipeline) -> None:
-        """Save the state of a pipeline at rest, and all else."""
+    def save(self, pipeline: Pipeline) -> None:
+        """Save the state of the pipeline, which is at rest, log and graph; a failure is a warning."""
         try:
-            write_state(self._file, {"pipeline": pipeline.state(), **self._rest()})
+            state = {
+                "pipeline": pipeline.state(),
+                "odometry": self._odometry.state(),
+                "graph": None if self._graph is None else self._graph.state(),
+                "log": self._log.state(),
+            }
+            write_state(self._unfinished.state, state)
         except (OutputError, OSError) as error:
             logger.info("%s", error)
-            self._warn(f"the state could not be saved, so that --resume would go back further: {error}")
+            self._log.warn(f"a checkpoint could not be saved, so that --resume would go back further: {error}")
         self._scans, self._done = 0, time.monotonic()
-        # Waiting until all was at rest is part of what it costs.
+        # Waiting for the threads to come to rest is part of the cost.
         self._cost_s = self._done - self._asked
+
+    def begin(self, pipeline: Pipeline, scans: Iterator[Scan], is_recorded: bool) -> Iterator[Scan]:
+        """Restore log, pipeline and odometry, and mark the run as being at work; the scans that are left.
+
+        Args:
+            pipeline: new.
+            scans: all that the run takes.
+            is_recorded: whether a Rerun recording is written.
+
+        Raises:
+            InputError: the checkpoint is damaged, or the recording is another one.
+        """
+        saved, self._unfinished.saved = self._unfinished.saved, None  # its arrays are in use now
+        if saved is not None:
+            self._log.restore(saved.part("log"))
+            pipeline.restore(saved.part("pipeline"))
+            if pipeline.held is None:
+                raise saved.refuse("no scan is held")
+            scans = scans_left(scans, pipeline.held.scan, self._odometry, saved)
+        self._unfinished.begin(len(self._log))
+        self._warn_of_resuming(saved is None, is_recorded)
+        return scans
+
+    def _warn_of_resuming(self, from_start: bool, is_recorded: bool) -> None:
+        resumed = self._unfinished.about.resumed_after
+        if not resumed:
+            return
+        if from_start:
+            logger.warning("%s: there is no checkpoint yet; the run begins from the start", self._unfinished.run)
+        elif is_recorded:
+            self._log.warn(f"{RERUN} holds the scans from {len(self._log)} on; lidarslam view shows the whole run")
+        times = "once" if len(resumed) == 1 else f"{len(resumed)} times"
+        after = ", ".join(map(str, resumed))
+        self._log.warnings = [warning for warning in self._log.warnings if not warning.startswith(_RESUMED)]
+        self._log.warn(f"{_RESUMED}{times}, after {after} scans; peak memory is that of the last part")

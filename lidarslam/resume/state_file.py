@@ -1,30 +1,28 @@
-"""A tree of arrays, numbers and texts in one file: whole or absent, checked as it is read, and never a pickle."""
+"""A tree of arrays, numbers and texts in one .npz file: atomic, with checksums, never a pickle."""
 
-import contextlib
 import json
-import os
 import zipfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.errors import InputError
+from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.state import Saved, State
 
-# An .npz file holds a checksum of each of its members, and without its end it is none.
+# An .npz file holds a checksum of each of its members, and is refused without its end.
 _TREE, _ARRAY = "tree", "array"
 _DAMAGE = (
     OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error,
-    MemoryError, OverflowError,  # of an array whose shape is not its own
+    MemoryError, OverflowError,  # a damaged shape
 )  # fmt: skip
 
 
 def write_state(path: Path, state: State) -> None:
-    """Write the file. Whenever this is cut short, be it by the power, the earlier file or the whole new one is there.
+    """Write the file; after a crash or power failure, the earlier file or the whole new one is there.
 
     Raises:
         OutputError: it cannot be written.
@@ -33,30 +31,11 @@ def write_state(path: Path, state: State) -> None:
     text = json.dumps(_encoded(state, arrays))
     members = {f"{_ARRAY}{number}": array for number, array in enumerate(arrays)}
     members[_TREE] = np.frombuffer(text.encode(), dtype=np.uint8)
-    with replacing_for_good(path) as out:
-        np.savez(out, allow_pickle=False, **members)
-
-
-@contextlib.contextmanager
-def replacing_for_good(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to, which takes its name when it is on the disk; the earlier one stays until then.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    partial = path.with_name(f"{path.name}.partial")
     try:
-        with partial.open("wb") as out:
-            yield out
-            out.flush()
-            os.fsync(out.fileno())
-        partial.replace(path)
-        _sync_directory(path.parent)
+        with replacing(path, durable=True) as partial, partial.open("wb") as out:
+            np.savez(out, allow_pickle=False, **members)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+        raise cannot_write(path, error) from error
 
 
 def read_state(path: Path) -> Saved:
@@ -67,8 +46,7 @@ def read_state(path: Path) -> Saved:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            tree = json.loads(bytes(file[_TREE]))
-            values = _decoded(tree, file)
+            values = _decoded(json.loads(bytes(file[_TREE])), file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except _DAMAGE as error:
@@ -77,18 +55,8 @@ def read_state(path: Path) -> Saved:
     return Saved(values, str(path))
 
 
-def _sync_directory(path: Path) -> None:
-    """See that the names in a directory are on the disk, where the system can do that."""
-    with contextlib.suppress(OSError):
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
 def _encoded(value: Any, arrays: list[NDArray[Any]]) -> Any:
-    """The tree as JSON has it; arrays are put aside, and their numbers in their places."""
+    """The tree as JSON; arrays are appended to the list, and referred to by their numbers."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
         return {_ARRAY: len(arrays) - 1}

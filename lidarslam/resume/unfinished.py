@@ -1,33 +1,32 @@
-"""What a run leaves for `--resume` until it is finished: a folder in its directory, and who is at work there."""
+"""The folder `unfinished` in a run directory: the checkpoint of a run until it is finished."""
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from lidarslam.core.directory_lock import only_writer
-from lidarslam.core.errors import InputError, OutputError
+from lidarslam.core.errors import InputError
+from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
 from lidarslam.core.state import Saved
-from lidarslam.resume.state_file import read_state, replacing_for_good
-from lidarslam.run.directory import ABOUT, FILES, UNFINISHED
+from lidarslam.resume.state_file import read_state
+from lidarslam.run.directory import ABOUT, FILES, UNFINISHED, RunDirectory
 
-_STATE, _ROWS, _SUBMAPS = "state.npz", "scans.csv", "submaps.bin"
-# Differences to what was asked for that are told.
-_TOLD = 3
+_STATE, _SUBMAPS = "state.npz", "submaps.bin"
+# Differences to another run that an error lists.
+_LISTED = 3
 
 Standing = Literal["at work", "stopped"]
 
 
 @dataclass(frozen=True)
 class About:
-    """Which run lies in a directory unfinished, and how far it is.
+    """Which run is unfinished; the content of run.json.
 
     Attributes:
-        description: all that decides what it computes.
-        standing: whether its results are yet to be written; those of a run that was stopped are there, as far as it
-            came.
+        description: everything that decides what it computes.
+        standing: at work, or stopped with its results so far written.
         resumed_after: how many scans were done each time it was resumed.
     """
 
@@ -53,16 +52,16 @@ class About:
             raise InputError(f"{path}: is damaged ({error}); begin again with --overwrite") from error
 
     def write(self, run: Path) -> None:
-        """Write it, for good.
+        """Write run.json, durably.
 
         Raises:
-            OutputError: it cannot be written.
+            OSError, OutputError: it cannot be written.
         """
-        with replacing_for_good(run / ABOUT) as out:
-            out.write(json.dumps(vars(self), indent=2).encode())
+        with replacing(run / ABOUT, durable=True) as partial:
+            partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
 
     def remedy(self, run: Path) -> str:
-        """What to do about it, as the end of a sentence that says where it lies."""
+        """What to do about it, as the end of a sentence that begins with the directory."""
         if "merge" not in self.description:
             source = self.description.get("source", "SOURCE")
             return (
@@ -78,7 +77,7 @@ class About:
 
 
 def require_whole(run: Path) -> None:
-    """See that a directory's results are not those of a run that was killed or is at work.
+    """Refuse the results of a run that was killed or is at work.
 
     Raises:
         InputError: they are.
@@ -92,118 +91,103 @@ def remove_unfinished(run: Path) -> None:
     """Remove a run, or a part of a merge, that was killed, and its directory when nothing else lies there.
 
     Raises:
-        OutputError: somebody is at work on it.
+        OutputError: it is at work.
     """
-    with Unfinished.claim(run, {}, resume=False) as unfinished:
+    with only_writer(run):
         for name in FILES:
             (run / name).unlink(missing_ok=True)
-    unfinished.end(stopped=False)
+        Unfinished(run, About({})).end(stopped=False)
     if not any(run.iterdir()):
         run.rmdir()
 
 
 class Unfinished:
-    """The folder of one run at work.
+    """The checkpoint of one run.
 
     Attributes:
-        saved: the state to go on from, None to begin.
+        run: its directory.
         about: which run it is.
+        saved: the state to go on from, None to begin.
+        state, submaps: the files of the state and of the pose graph's submaps.
     """
 
-    def __init__(self, run: Path, about: About, saved: Saved | None) -> None:
-        self._run = run
-        self.about, self.saved = about, saved
+    def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
+        self.run, self.about, self._resumes = run, about, resumes
+        self._folder = run / UNFINISHED
+        self.state, self.submaps = self._folder / _STATE, self._folder / _SUBMAPS
+        self.saved: Saved | None = None
 
     @classmethod
     @contextlib.contextmanager
-    def claim(
-        cls, run: Path, description: dict[str, Any], resume: bool, is_mixed: Callable[[], bool] = lambda: False
-    ) -> Iterator["Unfinished"]:
-        """Be the only one at work on a run, new or resumed; what nobody could resume is removed when this fails.
+    def claim(cls, directory: RunDirectory, description: dict[str, Any], resume: bool) -> Iterator["Unfinished"]:
+        """Begin or resume a run in a directory that is locked.
 
-        It stays where some results are this run's by then and some an earlier one's, which `is_mixed` tells.
+        When the block fails, the folder is removed if there is nothing to resume; not if it marks results that are
+        partly this run's and partly an earlier one's.
 
         Raises:
-            InputError: there is nothing to resume, it is damaged, or another run than the described one.
-            OutputError: somebody else is at work on it, or the folder cannot be written.
+            InputError: there is nothing to resume, it is damaged, or it is another run.
+            OutputError: the folder cannot be written.
         """
-        folder = run / UNFINISHED
+        run = directory.path
         about = About.read(run) if resume else None
         if resume and about is None:
-            raise InputError(f"{run}: holds no run to go on with; leave --resume out to begin one")
+            raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
         if about is not None:
             _require_same(run, about.description, description)
+        unfinished = cls(run, about or About(description), resume)
         try:
-            folder.mkdir(exist_ok=True)
+            unfinished._folder.mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{folder}: cannot be written ({error.strerror or error})") from error
-        with contextlib.ExitStack() as held:
-            try:
-                held.enter_context(only_writer(folder))
-            except OutputError:
-                raise OutputError(f"{run}: somebody else is at work on this run; wait, or end that first") from None
-            for partial in run.glob(".partial-*"):
-                partial.unlink(missing_ok=True)  # of whoever was killed
-            saved = read_state(folder / _STATE) if about is not None and (folder / _STATE).is_file() else None
-            unfinished = cls(run, about or About(description), saved)
-            was_there = (run / ABOUT).exists()  # and says so of results that are not whole, until others are there
-            if about is None:
-                unfinished._remove(_STATE, _ROWS, _SUBMAPS)
-            try:
-                yield unfinished
-            except BaseException:
-                if not was_there and not unfinished.state.is_file() and not is_mixed():
-                    unfinished._remove_all()
-                raise
+            raise cannot_write(unfinished._folder, error) from error
+        for folder in (run, unfinished._folder):
+            remove_partial_files(folder)  # of a run that was killed
+        was_there = (run / ABOUT).exists()
+        if about is None:
+            unfinished._remove_files()
+        elif unfinished.state.is_file():
+            unfinished.saved = read_state(unfinished.state)
+        try:
+            yield unfinished
+        except BaseException:
+            if not was_there and not unfinished.state.is_file() and not directory.is_mixed:
+                unfinished._remove()
+            raise
 
-    @property
-    def state(self) -> Path:
-        """The file of the state."""
-        return self._run / UNFINISHED / _STATE
-
-    @property
-    def rows(self) -> Path:
-        """The file of scans.csv so far."""
-        return self._run / UNFINISHED / _ROWS
-
-    @property
-    def submaps(self) -> Path:
-        """The file of a pose graph's submaps."""
-        return self._run / UNFINISHED / _SUBMAPS
-
-    def begin(self, scans: int | None) -> None:
-        """From now on the results in the directory, if any, are not this run's; resumed after so many scans, or new."""
-        resumed = self.about.resumed_after + (() if scans is None else (scans,))
+    def begin(self, scans: int) -> None:
+        """Mark the results in the directory, if any, as not this run's; `scans` are done already where it resumes."""
+        resumed = (*self.about.resumed_after, scans) if self._resumes else ()
         self.about = replace(self.about, standing="at work", resumed_after=resumed)
-        self.about.write(self._run)
+        self.about.write(self.run)
 
     def end(self, stopped: bool) -> None:
-        """The results are written; of a run that was stopped, what it takes to go on is kept."""
+        """The results are written; the checkpoint of a run that was stopped is kept."""
         if stopped:
-            replace(self.about, standing="stopped").write(self._run)
+            replace(self.about, standing="stopped").write(self.run)
         else:
-            self._remove_all()
+            self._remove()
 
-    def _remove_all(self) -> None:
-        """Remove the folder, that first which says what the others are: without it they are nothing."""
-        self._remove(Path(ABOUT).name, _STATE, _ROWS, _SUBMAPS)
-        with contextlib.suppress(OSError):  # something else lies there
-            (self._run / UNFINISHED).rmdir()
+    def _remove(self) -> None:
+        (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are nothing
+        self._remove_files()
+        with contextlib.suppress(OSError):  # another file lies there
+            self._folder.rmdir()
 
-    def _remove(self, *names: str) -> None:
-        for name in names:
-            for path in (name, f"{name}.partial"):
-                (self._run / UNFINISHED / path).unlink(missing_ok=True)
+    def _remove_files(self) -> None:
+        if self._folder.is_dir():
+            remove_partial_files(self._folder)
+        for path in (self.state, self.submaps):
+            path.unlink(missing_ok=True)
 
 
 def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
     old, new = _flat(was), _flat(asked)
     names = [name for name in [*old, *(n for n in new if n not in old)] if old.get(name) != new.get(name)]
     if names:
-        told = ", ".join(f"{name} {old.get(name)} (now {new.get(name)})" for name in names[:_TOLD])
-        more = f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+        listed = ", ".join(f"{name} {old.get(name)} (now {new.get(name)})" for name in names[:_LISTED])
+        more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
         raise InputError(
-            f"{run}: was begun with {told}{more}; give what it was begun with, or begin again with --overwrite"
+            f"{run}: was begun with {listed}{more}; give the options it was begun with, or begin again with --overwrite"
         )
 
 

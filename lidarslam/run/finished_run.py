@@ -23,18 +23,18 @@ from lidarslam.run import directory as files
 from mapping.global_map.global_map import PointCloud
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
-# As .ply and as .pcd files call them.
+# In .ply and in .pcd files.
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """What is looked at of a run.
+    """A run as it is viewed.
 
     Attributes:
         name: of its directory.
         trajectory: the final poses.
-        lost: (N,) which of them were lost.
+        lost: (N,) which scans were lost.
         map_points: (M, 3) in the world, none when the map is missing.
         loops: (L, 2) pairs of scans between which loops were closed.
     """
@@ -53,30 +53,25 @@ def load_run(path: Path) -> FinishedRun:
         InputError: there is no run, or a file of it is damaged.
     """
     trajectory = read_trajectory(path)
-    return FinishedRun(
-        path.resolve().name,
-        trajectory,
-        _lost(path / files.SCANS_CSV, trajectory),
-        load_map(path).points,
-        _loops(path / files.SUMMARY, len(trajectory)),
-    )
+    lost, loops = _lost(path / files.SCANS_CSV, len(trajectory)), _loops(path, len(trajectory))
+    return FinishedRun(path.resolve().name, trajectory, lost, load_map(path).points, loops)
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """The final poses of a run directory, as many as its summary says.
+    """The final poses of a run directory.
 
     Raises:
         InputError: there is no run, it did not finish, or its trajectory is damaged or cut off.
     """
     require_whole(path)
-    if not (path / files.TRAJECTORY_TUM).is_file():
+    file = path / files.TRAJECTORY_TUM
+    if not file.is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
-    trajectory = read_tum(path / files.TRAJECTORY_TUM)
-    scans = _scans(path / files.SUMMARY)
+    trajectory, scans = read_tum(file), _summary(path).get("scans")
     if scans not in (None, len(trajectory)):
         raise InputError(
-            f"{path / files.TRAJECTORY_TUM}: holds {len(trajectory):,} poses, {files.SUMMARY} says {scans:,} scans:"
-            " one of them is cut off; copy it or make the run again"
+            f"{file}: holds {len(trajectory):,} poses, {files.SUMMARY} says {scans:,} scans: one of them is cut off;"
+            " copy it or make the run again"
         )
     return trajectory
 
@@ -104,71 +99,58 @@ def load_map(path: Path) -> PointCloud:
     normals = _normals(table)
     usable = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
     if not usable.any():
-        raise InputError(f"{file}: not a readable point cloud; expected points, found none that is finite")
+        raise InputError(f"{file}: not a readable point cloud; no point is finite")
     return PointCloud(points[usable], normals[usable])
 
 
 def _normals(table: NDArray[np.void]) -> FloatArray:
-    """The normals (N, 3) of a cloud, upright where it has none."""
-    names = next((names for names in _NORMALS if set(names) <= set(table.dtype.names or ())), None)
-    if names is None:
-        return np.tile([0.0, 0.0, 1.0], (len(table), 1))
-    return np.column_stack([table[name].astype(np.float64) for name in names])
+    """The normals (N, 3) of a cloud; upright where it has none."""
+    for names in _NORMALS:
+        if set(names) <= set(table.dtype.names or ()):
+            return np.column_stack([table[name].astype(np.float64) for name in names])
+    return np.tile([0.0, 0.0, 1.0], (len(table), 1))
 
 
-def _loops(summary: Path, scans: int) -> NDArray[np.intp]:
-    """The loops that a run closed; none for a run without a graph."""
-    content = _read_summary(summary)
-    if content is None:
-        return np.empty((0, 2), dtype=np.intp)
+def _summary(path: Path) -> dict[str, Any]:
+    """The content of summary.json, empty when there is none."""
+    file = path / files.SUMMARY
+    if not file.is_file():
+        return {}
     try:
-        graph = content.get("pose_graph") or {"loops": []}
-        pairs = [(loop["first_scan"], loop["second_scan"]) for loop in graph["loops"] if loop["accepted"]]
-        loops = np.array(pairs, dtype=np.intp).reshape(-1, 2)
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise _no_summary(summary, error) from error
-    return loops[((loops >= 0) & (loops < scans)).all(axis=1)]
-
-
-def _scans(summary: Path) -> int | None:
-    """How many scans a run had; None when nothing says so, as with one that was cut off."""
-    try:
-        scans = (_read_summary(summary) or {}).get("scans")
-    except InputError:
-        return None
-    return scans if isinstance(scans, int) else None
-
-
-def _read_summary(summary: Path) -> dict[str, Any] | None:
-    """The content of summary.json; None when there is none."""
-    if not summary.is_file():
-        return None
-    try:
-        content = json.loads(summary.read_text(encoding="utf-8"))
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError(f"expected keys and values, got a {type(content).__name__}")
     except (OSError, ValueError, RecursionError) as error:
-        raise _no_summary(summary, error) from error
-    if not isinstance(content, dict):
-        raise _no_summary(summary, f"expected keys and values, got a {type(content).__name__}")
+        raise _damaged(file, "a run's summary", error) from error
     return content
 
 
-def _no_summary(summary: Path, reason: object) -> InputError:
-    return InputError(f"{summary}: not a run's summary ({reason}); make the run again")
+def _loops(path: Path, scans: int) -> NDArray[np.intp]:
+    """The loops that a run closed; none for a run without a graph."""
+    try:
+        loops = (_summary(path).get("pose_graph") or {"loops": []})["loops"]
+        pairs = [(loop["first_scan"], loop["second_scan"]) for loop in loops if loop["accepted"]]
+        found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise _damaged(path / files.SUMMARY, "a run's summary", error) from error
+    return found[((found >= 0) & (found < scans)).all(axis=1)]
 
 
-def _lost(scans_csv: Path, trajectory: Trajectory) -> NDArray[np.bool_]:
-    lost = np.zeros(len(trajectory), dtype=np.bool_)
-    if scans_csv.is_file():
-        try:
-            with scans_csv.open(encoding="utf-8", newline="") as rows:
-                statuses = [row["status"] for row in csv.DictReader(rows)]
-        except KeyError as error:
-            raise InputError(f"{scans_csv}: has no column 'status'; make the run again") from error
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{scans_csv}: not a table in UTF-8 ({error}); make the run again") from error
-        if len(statuses) != len(lost):
-            raise InputError(
-                f"{scans_csv}: has {len(statuses):,} rows for {len(lost):,} poses; it is cut off, make the run again"
-            )
-        lost[:] = [status == Status.LOST.value for status in statuses]
-    return lost
+def _lost(scans_csv: Path, poses: int) -> NDArray[np.bool_]:
+    if not scans_csv.is_file():
+        return np.zeros(poses, dtype=np.bool_)
+    try:
+        with scans_csv.open(encoding="utf-8", newline="") as rows:
+            statuses = [row["status"] for row in csv.DictReader(rows)]
+    except (KeyError, UnicodeDecodeError, csv.Error) as error:
+        raise _damaged(scans_csv, "a run's table", error) from error
+    if len(statuses) != poses:
+        raise InputError(
+            f"{scans_csv}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again"
+        )
+    return np.array([status == Status.LOST.value for status in statuses], dtype=np.bool_)
+
+
+def _damaged(file: Path, kind: str, error: Exception) -> InputError:
+    reason = f"{error} is missing" if isinstance(error, KeyError) else error
+    return InputError(f"{file}: not {kind} ({reason}); make the run again")

@@ -1,4 +1,4 @@
-"""Requests to end, as `kill`, `timeout` and a closed terminal send them, are Ctrl-C: what there is gets written."""
+"""SIGTERM and SIGHUP, as `kill`, `timeout` and a closed terminal send them, act like Ctrl-C: results are written."""
 
 import contextlib
 import signal
@@ -10,7 +10,7 @@ _REQUESTS = (signal.SIGTERM, signal.SIGHUP)
 
 @contextlib.contextmanager
 def ended_like_interrupted() -> Iterator[None]:
-    """For the time of the block; a request that is ignored, as `nohup` asks, stays ignored."""
+    """For the time of the block; a signal that is ignored, as with `nohup`, stays ignored."""
     if threading.current_thread() is not threading.main_thread():  # signals go to the main thread
         yield
         return

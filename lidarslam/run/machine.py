@@ -1,4 +1,4 @@
-"""What a measurement was made with: versions of the programs, and the machine."""
+"""Versions of the programs and description of the machine, for reports of measurements."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ _PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "open3d", "torch")
 
 
 def versions() -> dict[str, str]:
-    """Name -> version of the programs that results depend on, and the commit when it runs from a checkout."""
+    """Versions of the programs that results depend on, and the commit of a checkout."""
     found = {}
     for name in _PROGRAMS:
         with contextlib.suppress(PackageNotFoundError):
@@ -22,53 +22,40 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, str]:
-    """Processor, cores this process may use, memory and system, in words; what is not known is left out."""
-    words = {
+    """Processor, cores of this process, memory and system; unknown entries are left out."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()  # not on macOS
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    described = {
         "processor": _processor(),
-        "cores": str(_usable_cores()),
-        "memory": _memory(),
+        "cores": str(cores or 1),
+        "memory": f"{memory:.1f} GiB",
         "system": f"{platform.system()} {platform.release()} ({platform.machine()})",
     }
-    return {name: text for name, text in words.items() if text}
+    return {name: text for name, text in described.items() if text}
 
 
 def _commit(folder: Path) -> str | None:
-    """The commit of a checkout, marked where files differ from it; None where there is no checkout of ours."""
+    """The commit of a checkout, marked where files differ from it; None without git or checkout."""
     if not (folder / ".git").exists():
         return None
-    head = _git(folder, "rev-parse", "--short=12", "HEAD")
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return head and f"{head} and changes" if changed else head
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
-    """What git says; None when it says nothing, is not installed, or does not answer."""
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True)
+        head = _git(folder, "rev-parse", "--short=12", "HEAD")
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() or None
+    return f"{head} and changes" if changed else head
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True).stdout.strip()
 
 
 def _processor() -> str:
-    """Its name; the standard library knows only its architecture on Linux."""
+    """Its name, which the standard library lacks on Linux."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
             key, _, value = line.partition(":")
             if key.strip() == "model name":
                 return " ".join(value.split())
     return platform.processor()
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def _memory() -> str:
-    try:
-        return f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB"
-    except (OSError, ValueError):
-        return ""

@@ -10,8 +10,8 @@ from rich.text import Text
 
 from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
-from lidarslam.pipeline.pipeline import ScanResult
-from lidarslam.run.watch import Progress as ProgressCallback
+from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.run.tracking import Progress as ProgressCallback
 
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
 
@@ -54,7 +54,7 @@ def show_progress(name: str) -> Iterator[ProgressCallback]:
 
 @contextlib.contextmanager
 def show_count(name: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar that is told the number of the scan just finished, from 1, and how many there are."""
+    """A bar; its callback takes the number of the scan just finished, from 1, and their total."""
     with _bar() as bar:
         task = bar.add_task(one_line(name), total=None)
         yield lambda number, total: bar.update(task, completed=number, total=total)

@@ -1,4 +1,4 @@
-"""What a run is asked for."""
+"""The request for a run."""
 
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -11,19 +11,19 @@ from lidarslam.viewer.viewer import RerunMode
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What is to be run, how, and where it goes.
+    """Source, configuration and destination of a run.
 
     Attributes:
         source: the recording.
         out: the run directory.
-        config: how it is computed.
+        config: of the computation.
         start, stop, step: which scans, as in `range`.
         prior: TUM file of an external odometry, for `odometry.method: external`.
-        rerun: no Rerun recording, one in the run directory, or one there and a window.
+        rerun: no Rerun recording, one in the run directory, or that and a window.
         pcd: whether the map is written as .pcd too.
         overwrite: whether an earlier run in `out` is replaced.
-        resume: whether the run in `out`, which was killed or stopped, is gone on with.
-        resumable: whether the state is saved now and then, so that it can be.
+        resume: whether the run in `out`, which was killed or stopped, is continued.
+        resumable: whether checkpoints are saved.
     """
 
     source: Path
@@ -41,7 +41,7 @@ class RunRequest:
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:
-    """What was run, for config.yaml."""
+    """The section of config.yaml about what was run."""
     return {
         "version": version("lidarslam"),
         "source": str(request.source.resolve()),

@@ -1,17 +1,18 @@
-"""What a run leaves in its directory, and what it came to."""
+"""The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
 from dataclasses import dataclass
 
 from evaluation.map.entropy import sampled_map_entropy
-from evaluation.trajectory.metrics import TrajectoryMetrics
+from evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.config.settings import dump_yaml
+from lidarslam.core.geometry import inverse
+from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.pipeline.loop_closing import GraphOutcome
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
-from lidarslam.run.tracking import Tracked
-from lidarslam.run.trajectory_files import write_trajectories
+from lidarslam.run.tracking import Tracked, unless_damaged
 from mapping.config import GlobalMapConfig
 from mapping.global_map.global_map import GlobalMap, PointCloud
 from mapping.global_map.map_io import write_cloud
@@ -22,11 +23,11 @@ from mapping.slides.slides import find_contradictions
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What a run came to.
+    """The outcome of a run.
 
     Attributes:
         summary: the run in numbers.
-        metrics: its errors, when the recording came with ground truth for it.
+        metrics: its errors; None without ground truth.
         stopped: why it ended before its last scan, None when it did not.
     """
 
@@ -37,12 +38,11 @@ class RunOutcome:
 
 @dataclass(frozen=True, eq=False)
 class DrawnMap:
-    """A map as it is written.
+    """The final map.
 
     Attributes:
-        cloud: its points; None when no scan was drawn.
-        voxel_size_m: it has one point in each of these; None when no scan was drawn.
-        moved: points that are left out, of what has moved.
+        cloud, voxel_size_m: its points, one in each voxel; None when no scan was added.
+        moved: number of points that were removed as moving objects.
     """
 
     cloud: PointCloud | None
@@ -51,34 +51,35 @@ class DrawnMap:
 
 
 def final_map(tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig) -> DrawnMap:
-    """The map of a run whose poses are final; a graph has drawn it anew."""
+    """The map of a run whose poses are final; a pose graph has drawn it anew."""
     views = tracked.views.placed(tracked.log.trajectory.T_world_lidar)
     return drawn_map(tracked.global_map if closed is None else closed.global_map, views, config)
 
 
 def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig) -> DrawnMap:
-    """A map without what the views see through."""
+    """A map without the points that the views see through."""
     if global_map is None:
         return DrawnMap(None, None)
     moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
-    cloud = global_map.cloud(config.normal_neighbours, config.min_hits, moved)
+    cloud = global_map.cloud(config.min_hits, moved)
     return DrawnMap(cloud, global_map.voxel_size_m, int(moved.sum()))
 
 
 def write_results(
     directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None, drawn: DrawnMap
 ) -> RunOutcome:
-    """Write everything but the log of the scans: their poses are final by now."""
+    """Write everything; the poses are final."""
     config, log = request.config, tracked.log
     directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
     if closed is not None:
-        directory.write_text(files.POSE_GRAPH, format_g2o(closed.graph))
-    metrics = write_trajectories(directory, tracked.recording, tracked.truth, log)
+        directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))
+    directory.write_text(files.SCANS_CSV, log.format_csv())
+    metrics = _write_trajectories(directory, tracked)
     written = write_map(directory, drawn, request.pcd)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
-    summary = summarise(log, tracked.total_ms, written, skipped, closed, contradictions)
+    summary = summarise(log, written, skipped, closed, contradictions)
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, tracked.stopped)
 
@@ -93,3 +94,24 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, pcd: bool) -> WrittenMap
             write_cloud(path, cloud)
     entropy = sampled_map_entropy(cloud.points)
     return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean)
+
+
+def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:
+    """Write final poses and odometry, and metrics.json where there is ground truth."""
+    log, recording, truth = tracked.log, tracked.recording, tracked.truth
+    trajectory = log.trajectory
+    directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
+    directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
+    T_cam_lidar = unless_damaged(
+        lambda: recording.T_cam_lidar, log, f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame"
+    )
+    poses = trajectory.T_world_lidar
+    if T_cam_lidar is not None:  # the devkit compares camera poses
+        poses = T_cam_lidar @ poses @ inverse(T_cam_lidar)
+    directory.write_text(files.TRAJECTORY_KITTI, format_kitti(poses))
+    if truth is None:
+        return None
+    metrics = unless_damaged(lambda: evaluate_trajectory(trajectory, truth), log, "no metrics")
+    if metrics is not None:
+        directory.write_json(files.METRICS, metrics.to_json())
+    return metrics

@@ -1,32 +1,35 @@
 """One run on disk: from a source to a run directory."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.trajectory_io import read_tum
-from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.loop_closing import close_loops
-from lidarslam.resume.resuming import astray_before, describe_computed
-from lidarslam.resume.run_state import log_and_graph
+from lidarslam.pipeline.loop_closing import begin_graph, close_loops, restore_graph
+from lidarslam.resume.resuming import describe_computed
 from lidarslam.resume.unfinished import Unfinished
-from lidarslam.run.directory import RunDirectory
-from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.directory import RERUN, RunDirectory
+from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, final_map, write_results
-from lidarslam.run.tracking import track
-from lidarslam.run.watch import Progress
-from lidarslam.viewer.viewer import viewing
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.tracking import Progress, track
+from lidarslam.viewer.viewer import Viewer
 from odometry.interface import Odometry
 from odometry.registry import make_odometry
+
+if TYPE_CHECKING:
+    from mapping.pose_graph.slam_graph import SlamGraph
 
 
 def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     """Run, and write the run directory.
 
-    A recording that turns out damaged on the way, or an interruption, ends the run with what there is. A run that is
-    killed leaves a folder from which it can be resumed to the results it would have had.
+    A damaged recording or an interruption ends the run early, with the results so far. A run that is killed can be
+    resumed, to the same results.
 
     Raises:
         LidarSlamError: the source, the configuration or the output directory is not usable, or there is nothing to
@@ -44,9 +47,14 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         odometry = open_odometry(config, request.prior)
         stack.callback(odometry.close)
         directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
-        unfinished = _claim(request, recording, directory, stack)
-        log, graph = log_and_graph(config, directory, unfinished, stack)
-        with viewing(request.rerun, recording.name, config.viewer, directory, log) as viewer:
+        unfinished = None
+        if request.resumable:
+            description = describe_computed(request, recording)
+            unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
+        log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+        if graph is not None:
+            stack.callback(graph.close)
+        with _viewing(request, recording.name, directory, log) as viewer:
             tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
             closed = close_loops(graph, tracked.global_map, log, viewer)
             drawn = final_map(tracked, closed, config.global_map)
@@ -58,43 +66,59 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     return outcome
 
 
-def astray_when_finished(request: RunRequest) -> bool | None:
-    """Whether tracking was lost, if `out` holds this very run with nothing left to resume; None if it does not.
+def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished | None) -> "SlamGraph | None":
+    """The pose graph, if there is one: new, or as it was saved.
 
     Raises:
-        InputError: it holds another one.
+        InputError: the checkpoint is damaged.
     """
-    return astray_before(request.out, request.config, describe_run(request))
+    if unfinished is None:
+        return begin_graph(config, directory.path)
+    saved = unfinished.saved
+    if saved is None:
+        return begin_graph(config, file=unfinished.submaps)
+    return restore_graph(config, saved.part("graph"), unfinished.submaps) if saved.has("graph") else None
 
 
-def _claim(request: RunRequest, recording: Recording, directory: RunDirectory, stack: ExitStack) -> Unfinished | None:
-    """What makes a run resumable."""
-    if not request.resumable:
-        return None
-    description = describe_computed(request.config, recording, describe_run(request), request.prior)
-    return stack.enter_context(Unfinished.claim(request.out, description, request.resume, lambda: directory.is_mixed))
+@contextmanager
+def _viewing(request: RunRequest, name: str, directory: RunDirectory, log: ScanLog) -> Iterator[Viewer]:
+    """The viewer of a run; a Rerun recording that cannot be written is a warning."""
+    if request.rerun == "off":
+        yield Viewer()
+        return
+    from lidarslam.viewer.rerun_recording import IncompleteRecordingError
+    from lidarslam.viewer.rerun_viewer import rerun_viewer
+
+    try:
+        with (
+            directory.replacing(RERUN) as path,
+            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn") as viewer,
+        ):
+            yield viewer
+    except IncompleteRecordingError as error:
+        log.warn(f"no {RERUN}: {error}")
 
 
 def require_apart(out: Path, source: Path) -> None:
-    """See that nothing is written into a recording.
+    """Refuse to write into a recording.
 
     Raises:
-        OutputError: it would be.
+        OutputError: `out` is the source.
     """
     if out.resolve() == source.resolve():
         raise OutputError(f"{out}: is the recording itself; name another directory for the run")
 
 
 def open_odometry(config: Config, prior: Path | None) -> Odometry:
-    """The odometry that is configured; whoever asks for it closes it.
+    """The configured odometry; the caller closes it.
 
     Raises:
-        LidarSlamError: the configuration contradicts itself, or a file is not what it should be.
+        LidarSlamError: the configuration contradicts itself, or a file is damaged.
     """
     method = config.odometry.method
     if method == "constant-velocity" and not config.mapping.enabled:
         raise ConfigError(
-            "constant-velocity only predicts; without scan-to-map refinement it would stand still."
+            "constant-velocity only predicts the motion, and needs scan-to-map registration."
             " Choose --odometry learned, give a trajectory with --prior, or leave --no-mapping out"
         )
     if method == "external" and prior is None:

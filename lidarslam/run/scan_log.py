@@ -1,25 +1,16 @@
-"""What a run remembers of every scan: a row in scans.csv at once, and the few numbers the summary needs."""
+"""The log of a run: what scans.csv and summary.json say of each scan, its poses and timings."""
 
-import contextlib
 import csv
-import os
-import shutil
-import zlib
-from array import array
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, BinaryIO
+import io
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.pipeline import STAGES, ScanResult
-from lidarslam.run.directory import SCANS_CSV, RunDirectory
+from lidarslam.pipeline.estimates import STAGES, ScanResult
 
 COLUMNS = (
     "index",
@@ -35,162 +26,62 @@ COLUMNS = (
     "message",
 )
 
-
-def _doubles(values: FloatArray | None = None) -> "array[float]":
-    """Numbers (whatever their shape) after one another, and more to come."""
-    numbers = array("d")
-    if values is not None:
-        numbers.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-    return numbers
-
-
-def _poses(numbers: "array[float]") -> FloatArray:
-    return np.array(numbers).reshape(-1, 4, 4)
-
-
-class _Rows:
-    """A table that is written row by row, and knows how far it is."""
-
-    def __init__(self, out: BinaryIO, size: int = 0, checksum: int = 0) -> None:
-        self._out = out
-        self._size, self._checksum = size, checksum
-        self._writer = csv.writer(self, lineterminator="\n")
-        if not size:
-            self.add(COLUMNS)
-
-    @classmethod
-    def restored(cls, out: BinaryIO, saved: Saved) -> "_Rows":
-        """The table as it was; rows that came later are cut off."""
-        size, checksum = saved.integer("size"), saved.integer("checksum")
-        if zlib.crc32(out.read(size)) != checksum:
-            raise InputError(f"{out.name}: is damaged; begin again with --overwrite")
-        out.truncate(size)
-        out.seek(size)
-        return cls(out, size, checksum)
-
-    def add(self, row: Any) -> None:
-        """One row."""
-        self._writer.writerow(row)
-
-    def write(self, text: str) -> int:
-        """What the writer of rows calls."""
-        content = text.encode()
-        self._size, self._checksum = self._size + len(content), zlib.crc32(content, self._checksum)
-        return self._out.write(content)
-
-    def state(self) -> State:
-        """How far it is; up to there it is on the disk by now."""
-        self._out.flush()
-        os.fsync(self._out.fileno())
-        return {"size": self._size, "checksum": self._checksum}
+_STATUSES = tuple(Status)
+# The numbers of a scan, 361 bytes; NaN where there is none.
+_ROW = np.dtype(
+    [
+        ("stamp", "f8"),
+        ("status", "u1"),
+        ("points", "i8"),
+        ("points_dropped", "i8"),
+        ("points_used", "i8"),
+        ("residual_m", "f8"),
+        ("inlier_ratio", "f8"),
+        ("total_ms", "f8"),
+        ("stage_ms", "f8", len(STAGES)),
+        ("T_world_lidar", "f8", (4, 4)),
+        ("T_odom_lidar", "f8", (4, 4)),
+    ]
+)
 
 
-@dataclass
-class ScanLog:
-    """The scans of a run so far; two poses and a few numbers each, some 350 bytes, and no points."""
+class ScanLog(Stateful):
+    """The scans of a run so far; no points.
 
-    _rows: _Rows
-    stamps: "array[float]" = field(default_factory=_doubles)
-    statuses: list[Status] = field(default_factory=list)
-    messages: list[str] = field(default_factory=list)
-    points_read: int = 0
-    points_dropped: int = 0
-    warnings: list[str] = field(default_factory=list)
-    # Numbers after one another: an array of its own for each pose would take twice the memory.
-    _stage_ms: "array[float]" = field(default_factory=_doubles)
-    _T_world_lidar: "array[float]" = field(default_factory=_doubles)
-    _T_odom_lidar: "array[float]" = field(default_factory=_doubles)
+    Attributes:
+        messages: of each scan.
+        warnings: sentences for the summary.
+    """
+
+    messages: list[str]
+    warnings: list[str]
+    _degenerate: list[str]
+
+    def __init__(self) -> None:
+        self.messages, self.warnings, self._degenerate = [], [], []
+        self._rows = bytearray()  # of `_ROW`
 
     def __len__(self) -> int:
-        return len(self.stamps)
+        return len(self.messages)
 
-    @classmethod
-    @contextlib.contextmanager
-    def open(cls, directory: RunDirectory, rows: Path | None = None, saved: Saved | None = None) -> Iterator["ScanLog"]:
-        """Log to the run's scans.csv, which appears when the run ends well.
-
-        Args:
-            directory: of the run.
-            rows: a file for the table until then, so that it outlives the program.
-            saved: a state to go on from, whose rows are there.
-
-        Raises:
-            InputError: the rows are damaged.
-        """
-        if rows is None:
-            with directory.replacing(SCANS_CSV) as partial, partial.open("wb") as out:
-                yield cls(_Rows(out))
-            return
-        with rows.open("wb" if saved is None else "r+b") as out:
-            log = cls(_Rows(out)) if saved is None else cls._restored(out, saved)
-            yield log
-            out.flush()
-            with directory.replacing(SCANS_CSV) as partial:
-                shutil.copyfile(rows, partial)
-
-    def state(self) -> State:
-        """All of it; the rows are on the disk by now.
-
-        Raises:
-            OSError: the disk is full.
-        """
-        return {
-            "rows": self._rows.state(),
-            "stamps": np.array(self.stamps),
-            "statuses": [status.value for status in self.statuses],
-            "messages": list(self.messages),
-            "stage_ms": self.stage_ms,
-            "points_read": self.points_read,
-            "points_dropped": self.points_dropped,
-            "warnings": list(self.warnings),
-            "T_world_lidar": _poses(self._T_world_lidar),
-            "T_odom_lidar": _poses(self._T_odom_lidar),
-        }
-
-    @classmethod
-    def _restored(cls, out: BinaryIO, saved: Saved) -> "ScanLog":
-        stamps = saved.array("stamps", (None,))
-        statuses, messages = saved.texts("statuses"), saved.texts("messages")
-        if not len(stamps) == len(statuses) == len(messages) or not set(statuses) <= {s.value for s in Status}:
-            raise saved.refuse(f"{len(stamps)} scans have {len(statuses)} statuses and {len(messages)} messages")
-        return cls(
-            _Rows.restored(out, saved.part("rows")),
-            _doubles(stamps),
-            [Status(status) for status in statuses],
-            messages,
-            saved.integer("points_read"),
-            saved.integer("points_dropped"),
-            saved.texts("warnings"),
-            _doubles(saved.array("stage_ms", (len(stamps), len(STAGES)))),
-            _doubles(saved.array("T_world_lidar", (len(stamps), 4, 4))),
-            _doubles(saved.array("T_odom_lidar", (len(stamps), 4, 4))),
-        )
-
-    def add(self, result: ScanResult) -> None:
-        """Take note of one scan."""
-        ms = [result.stage_ms.get(stage, 0.0) for stage in STAGES]
-        row = [
-            len(self),
-            f"{result.stamp:.9f}",
-            result.status.value,
+    def add(self, result: ScanResult, total_ms: float = 0.0) -> None:
+        """Log one scan; `total_ms` is the wall time since the scan before was done."""
+        row = (
+            result.stamp,
+            _STATUSES.index(result.status),
             result.points_read,
             result.points_dropped,
             result.points_used,
-            _number(result.residual_m),
-            _number(result.inlier_ratio),
-            " ".join(result.degenerate),
-            *(f"{value:.2f}" for value in ms),
-            result.message,
-        ]
-        self._rows.add(row)
-        self.stamps.append(result.stamp)
-        self.statuses.append(result.status)
+            np.nan if result.residual_m is None else result.residual_m,
+            np.nan if result.inlier_ratio is None else result.inlier_ratio,
+            total_ms,
+            [result.stage_ms.get(stage, 0.0) for stage in STAGES],
+            result.T_world_lidar,
+            result.T_odom_lidar,
+        )
+        self._rows += np.array(row, dtype=_ROW).tobytes()
+        self._degenerate.append(" ".join(result.degenerate))
         self.messages.append(result.message)
-        self.points_read += result.points_read
-        self.points_dropped += result.points_dropped
-        self._stage_ms.extend(ms)
-        self._T_world_lidar.extend(result.T_world_lidar.ravel())
-        self._T_odom_lidar.extend(result.T_odom_lidar.ravel())
 
     def warn(self, message: str) -> None:
         """Keep a sentence for the summary, once."""
@@ -198,26 +89,80 @@ class ScanLog:
             self.warnings.append(message)
 
     def correct(self, T_world_lidar: FloatArray) -> None:
-        """Take other poses (N, 4, 4), one for each scan, as the final ones."""
+        """Replace the poses (N, 4, 4) by those that the pose graph corrected."""
         if T_world_lidar.shape != (len(self), 4, 4):
             raise ValueError(f"expected a pose for each of {len(self)} scans, got {T_world_lidar.shape}")
-        self._T_world_lidar = _doubles(T_world_lidar)
+        rows = self._table()
+        rows["T_world_lidar"] = T_world_lidar
+        self._rows = bytearray(rows.tobytes())
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Of each scan."""
+        return [_STATUSES[index] for index in self._table()["status"]]
+
+    @property
+    def points_read(self) -> int:
+        """Valid points of all scans."""
+        return int(self._table()["points"].sum())
+
+    @property
+    def points_dropped(self) -> int:
+        """Invalid points of all scans."""
+        return int(self._table()["points_dropped"].sum())
+
+    @property
+    def stamps(self) -> FloatArray:
+        """(N,) seconds."""
+        return self._table()["stamp"]
+
+    @property
+    def total_ms(self) -> FloatArray:
+        """(N,) wall time from one scan done to the next."""
+        return self._table()["total_ms"]
 
     @property
     def stage_ms(self) -> FloatArray:
         """(N, 6) wall time of each of the `STAGES`."""
-        return np.array(self._stage_ms).reshape(-1, len(STAGES))
+        return self._table()["stage_ms"]
 
     @property
     def trajectory(self) -> Trajectory:
         """The final poses."""
-        return Trajectory(np.array(self.stamps), _poses(self._T_world_lidar))
+        return Trajectory(self.stamps, self._table()["T_world_lidar"])
 
     @property
     def odometry(self) -> Trajectory:
-        """The odometry's own poses."""
-        return Trajectory(np.array(self.stamps), _poses(self._T_odom_lidar))
+        """The poses of the odometry alone."""
+        return Trajectory(self.stamps, self._table()["T_odom_lidar"])
 
+    def format_csv(self) -> str:
+        """The content of scans.csv: a row a scan, empty where there is no number."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        rows = zip(self._table(), self._degenerate, self.messages, strict=True)
+        for index, (row, degenerate, message) in enumerate(rows):
+            counts = (row["points"], row["points_dropped"], row["points_used"])
+            fit = ("" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in ("residual_m", "inlier_ratio"))
+            ms = (f"{ms:.2f}" for ms in row["stage_ms"])
+            status = _STATUSES[row["status"]].value
+            writer.writerow([index, f"{row['stamp']:.9f}", status, *counts, *fit, degenerate, *ms, message])
+        return out.getvalue()
 
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}"
+    def state(self) -> State:
+        """All of it."""
+        return super().state() | {"rows": self._table()}
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+        super().restore(saved)
+        rows = saved.value("rows")
+        if getattr(rows, "dtype", None) != _ROW or rows.shape != (len(self),) or len(self._degenerate) != len(self):
+            raise saved.unfit(f"{len(self)} rows of the log", rows)
+        if (rows["status"] >= len(_STATUSES)).any():
+            raise saved.refuse("unknown status")
+        self._rows = bytearray(rows.tobytes())
+
+    def _table(self) -> NDArray[np.void]:
+        return np.frombuffer(bytearray(self._rows), _ROW)  # a copy: a view would keep the buffer from growing

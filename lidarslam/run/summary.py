@@ -1,42 +1,43 @@
-"""A run in a few numbers."""
+"""summary.json: a run in numbers, and its warnings."""
 
 import resource
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plain_text import count
 from lidarslam.core.tracking import Status
+from lidarslam.pipeline.estimates import STAGES
 from lidarslam.pipeline.loop_closing import GraphOutcome, LoopReport
-from lidarslam.pipeline.pipeline import STAGES
+from lidarslam.run.directory import SCANS_CSV
 from lidarslam.run.scan_log import ScanLog
 from mapping.slides.slides import Contradiction
 
-# A time between scans that is longer than usual by so much of it, and so many seconds, is a gap.
-_PAUSE_OF_STEP = 2.0
-_SHORTEST_PAUSE_S = 0.3
+# An interval between scans is a gap when it exceeds the median by this many times and seconds.
+_GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
 
 
 @dataclass(frozen=True)
 class Milliseconds:
-    """Time per scan: half of the scans take no longer than the median, 95 % no longer than p95."""
+    """Median and 95th percentile of wall times."""
 
     median: float
     p95: float
 
     @classmethod
     def of(cls, values: Sequence[float] | FloatArray) -> "Milliseconds":
-        """Of times that were measured, at least one."""
+        """Of at least one time."""
         return cls(float(np.median(values)), float(np.percentile(values, 95.0)))
 
 
 @dataclass(frozen=True)
 class LostStretch:
-    """Successive scans on which tracking was lost: indices, stamps and the first one's reason."""
+    """Successive lost scans: indices, stamps, and the message of the first."""
 
     first: int
     last: int
@@ -51,9 +52,9 @@ class GraphSummary:
 
     Attributes:
         keyframes, edges: how many.
-        loops: the closures, and what was looked at closely and refused.
-        largest_correction_m: by how much a scan's position changed.
-        ms_per_keyframe: on a thread of its own; None when there was none.
+        loops: accepted loop closures, and rejected candidates.
+        largest_correction_m: by how much the graph moved a scan.
+        ms_per_keyframe: on the thread of the graph; None when there was no keyframe.
     """
 
     keyframes: int
@@ -64,10 +65,10 @@ class GraphSummary:
 
     @classmethod
     def of(cls, closed: GraphOutcome) -> "GraphSummary":
-        """Of what became of a graph."""
+        """Of an optimised graph."""
         return cls(
-            keyframes=len(closed.graph.keys),
-            edges=len(closed.graph.edges),
+            keyframes=len(closed.keyframe_poses),
+            edges=len(closed.edges),
             loops=closed.loops,
             largest_correction_m=closed.largest_correction_m,
             ms_per_keyframe=Milliseconds.of(closed.keyframe_ms) if closed.keyframe_ms else None,
@@ -75,26 +76,22 @@ class GraphSummary:
 
     @property
     def closed(self) -> int:
-        """How many loops were closed."""
+        """Number of accepted loop closures."""
         return sum(loop.accepted for loop in self.loops)
 
     def to_json(self) -> dict[str, Any]:
         """The section of summary.json."""
-        return {
-            "keyframes": self.keyframes,
-            "edges": self.edges,
-            "largest_correction_m": self.largest_correction_m,
-            "ms_per_keyframe": None if self.ms_per_keyframe is None else vars(self.ms_per_keyframe),
-            "loops": [loop.to_json() for loop in self.loops],
-        }
+        return asdict(self) | {"loops": [loop.to_json() for loop in self.loops]}
 
 
 @dataclass(frozen=True)
 class WrittenMap:
-    """A map as it was written: its points and the size of its voxels, None without a map; and what was left out.
+    """The map as it was written.
 
-    `moved` counts the points where something was that had moved away. `entropy` is the mean map entropy, None where it
-    cannot be computed; see `evaluation.map.entropy`.
+    Attributes:
+        points, voxel_size_m: number of points and edge of a voxel; None without a map.
+        moved: number of points that were removed as moving objects.
+        entropy: mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed.
     """
 
     points: int
@@ -105,10 +102,9 @@ class WrittenMap:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What summary.json holds; the contract names the keys.
+    """The content of summary.json.
 
-    `ms_per_scan["total"]` is the time from one finished scan to the next. Stages run beside one another, so they add up
-    to more.
+    `ms_per_scan["total"]` is the time from one finished scan to the next; the stages overlap and add up to more.
     """
 
     scans: int
@@ -127,12 +123,12 @@ class RunSummary:
 
     @property
     def went_astray(self) -> bool:
-        """Whether tracking was lost: by a scan's own status, or because the map contradicts itself."""
+        """Whether tracking was lost: a scan is lost, or the map contradicts itself."""
         return bool(self.lost_scans or self.contradictions)
 
     @property
     def lost_scans(self) -> int:
-        """How many scans were lost."""
+        """Number of lost scans."""
         return sum(stretch.last - stretch.first + 1 for stretch in self.lost)
 
     def to_json(self) -> dict[str, Any]:
@@ -149,92 +145,42 @@ class RunSummary:
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
             "map_contradictions": [vars(found) for found in self.contradictions],
-            **_of_graph_and_map(self),
+            **graph_and_map_json(self.graph, self.map, self.warnings),
         }
 
 
-@dataclass(frozen=True)
-class MergedRecording:
-    """One of several recordings that were to become one map.
-
-    Attributes:
-        name: of the recording.
-        directory: of its run, beside the common map; None when there is none, for lack of a scan.
-        source: where it lies.
-        scans, length_m, lost_scans: of its run.
-        joined: whether its poses are in the common frame.
-    """
-
-    name: str
-    directory: str | None
-    source: str
-    scans: int
-    length_m: float
-    lost_scans: int
-    joined: bool
-
-
-@dataclass(frozen=True)
-class MergeSummary:
-    """What the summary.json of several recordings in one map holds."""
-
-    recordings: tuple[MergedRecording, ...]
-    elapsed_s: float
-    peak_rss_mb: float
-    graph: GraphSummary | None
-    map: WrittenMap
-    warnings: tuple[str, ...]
-
-    @property
-    def lost_scans(self) -> int:
-        """How many scans were lost, of all recordings."""
-        return sum(recording.lost_scans for recording in self.recordings)
-
-    def to_json(self) -> dict[str, Any]:
-        """The content of summary.json."""
-        return {
-            "recordings": [vars(recording) for recording in self.recordings],
-            "elapsed_s": self.elapsed_s,
-            "peak_rss_mb": self.peak_rss_mb,
-            "lost_scans": self.lost_scans,
-            **_of_graph_and_map(self),
-        }
-
-
-def _of_graph_and_map(summary: RunSummary | MergeSummary) -> dict[str, Any]:
-    """What the summary.json of a run and of several say alike."""
+def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings: Sequence[str]) -> dict[str, Any]:
+    """The keys of summary.json that runs and merges share."""
     return {
-        "loop_closures": 0 if summary.graph is None else summary.graph.closed,
-        "pose_graph": None if summary.graph is None else summary.graph.to_json(),
-        "map_points": summary.map.points,
-        "map_voxel_size_m": summary.map.voxel_size_m,
-        "map_points_moved": summary.map.moved,
-        "map_entropy": summary.map.entropy,
-        "warnings": list(summary.warnings),
+        "loop_closures": 0 if graph is None else graph.closed,
+        "pose_graph": None if graph is None else graph.to_json(),
+        "map_points": written.points,
+        "map_voxel_size_m": written.voxel_size_m,
+        "map_points_moved": written.moved,
+        "map_entropy": written.entropy,
+        "warnings": list(warnings),
     }
 
 
 def summarise(
     log: ScanLog,
-    total_ms: list[float],
     written: WrittenMap,
     skipped: int,
     closed: GraphOutcome | None = None,
     contradictions: tuple[Contradiction, ...] = (),
 ) -> RunSummary:
-    """Sum a run up.
+    """Summarise a run.
 
     Args:
         log: its scans.
-        total_ms: wall time of each scan, from the one before finished to this one finished.
         written: the map.
-        skipped: scans that were asked for and did not come, for no reason that the log warns of.
-        closed: what its pose graph did to it, if it had one.
-        contradictions: where its map contradicts itself.
+        skipped: scans that were asked for and are missing without a warning in the log.
+        closed: the optimised pose graph, if there is one.
+        contradictions: where the map contradicts itself.
     """
-    trajectory = log.trajectory
+    trajectory, total_ms = log.trajectory, log.total_ms
     stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
-    elapsed_s = sum(total_ms) / 1e3
+    elapsed_s = float(total_ms.sum()) / 1e3
     return RunSummary(
         scans=len(log),
         length_m=trajectory.length_m,
@@ -243,64 +189,49 @@ def summarise(
         ms_per_scan={stage: Milliseconds.of(values) for stage, values in stages.items()},
         realtime_factor=trajectory.duration_s / elapsed_s if elapsed_s > 0.0 and len(log) > 1 else None,
         peak_rss_mb=peak_rss_mb(),
-        lost=_lost_stretches(log),
+        lost=tuple(_lost_stretches(log)),
         degraded_scans=log.statuses.count(Status.DEGRADED),
         graph=None if closed is None else GraphSummary.of(closed),
         map=written,
-        warnings=(*_warnings(log, skipped), *_contradicted(contradictions)),
+        warnings=(*log.warnings, *_warnings(log, skipped, contradictions)),
         contradictions=contradictions,
     )
 
 
-def _lost_stretches(log: ScanLog) -> tuple[LostStretch, ...]:
-    stretches = []
-    for status, group in groupby(range(len(log)), key=lambda index: log.statuses[index]):
-        indices = list(group)
+def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
+    stamps = log.stamps.tolist()
+    for status, group in groupby(enumerate(log.statuses), key=lambda item: item[1]):
         if status is Status.LOST:
+            indices = [index for index, _ in group]
             first, last = indices[0], indices[-1]
-            stretches.append(LostStretch(first, last, log.stamps[first], log.stamps[last], log.messages[first]))
-    return tuple(stretches)
+            yield LostStretch(first, last, stamps[first], stamps[last], log.messages[first])
 
 
-def _warnings(log: ScanLog, skipped: int) -> tuple[str, ...]:
-    warnings = list(log.warnings)
+def _warnings(log: ScanLog, skipped: int, contradictions: Sequence[Contradiction]) -> Iterator[str]:
     if skipped:
-        warnings.append(f"{skipped} scans that were asked for did not come")
-    warnings.extend(_pauses(log))
-    if log.points_dropped:
-        share = log.points_dropped / max(1, len(log))
-        warnings.append(
-            f"{log.points_dropped} invalid points (NaN, at the origin, out of range) were left out, {share:.0f} a scan"
-        )
-    if degraded := log.statuses.count(Status.DEGRADED):
-        warnings.append(f"{degraded} scans are believed only in part (status degraded; scans.csv says why)")
-    return tuple(warnings)
-
-
-def _contradicted(contradictions: tuple[Contradiction, ...]) -> Iterator[str]:
-    """Where the map contradicts itself, the clearest place spelt out."""
-    if not contradictions:
-        return
-    clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)
-    more = f"; {len(contradictions) - 1} more such stretches" if len(contradictions) > 1 else ""
-    farther = "farther on" if clearest.shift_m > 0.0 else "farther back"
-    yield (
-        f"the map contradicts itself between scans {clearest.first} and {clearest.last}: held against one another, they"
-        f" fit {abs(clearest.shift_m):.1f} m {farther} along the way, not at their poses, as after a slip of"
-        f" registration{more}"
-    )
-
-
-def _pauses(log: ScanLog) -> Iterator[str]:
-    """Where scans are missing, by the stamps; a pause is told by its length beside the usual time between scans."""
+        yield f"{count(skipped, 'scan')} of those asked for missing"
     steps = np.diff(log.stamps)
     usual_s = float(np.median(steps)) if len(steps) else 0.0
-    pauses = np.flatnonzero(steps > usual_s + max(_PAUSE_OF_STEP * usual_s, _SHORTEST_PAUSE_S))
-    if len(pauses):
-        longest = int(pauses[np.argmax(steps[pauses])])
+    gaps = np.flatnonzero(steps > usual_s + max(_GAP_INTERVALS * usual_s, _SHORTEST_GAP_S))
+    if len(gaps):
+        longest = int(gaps[np.argmax(steps[gaps])])
         yield (
-            f"{len(pauses)} gaps in the stamps, where scans are missing or a clock was set; the longest:"
+            f"{count(len(gaps), 'gap')} in the stamps, where scans are missing or a clock was set; the longest:"
             f" {steps[longest]:.1f} s after scan {longest}"
+        )
+    if log.points_dropped:
+        share = log.points_dropped / max(1, len(log))
+        points = count(log.points_dropped, "invalid point")
+        yield f"{points} dropped (NaN, at the origin or out of range), {share:.0f} a scan"
+    if degraded := log.statuses.count(Status.DEGRADED):
+        yield f"tracking was degraded on {count(degraded, 'scan')}; {SCANS_CSV} gives the reasons"
+    if contradictions:
+        clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)
+        more = f"; {len(contradictions) - 1} more such stretches" if len(contradictions) > 1 else ""
+        direction = "ahead of" if clearest.shift_m > 0.0 else "behind"
+        yield (
+            f"the map contradicts itself between scans {clearest.first} and {clearest.last}: the scans fit one another"
+            f" {abs(clearest.shift_m):.1f} m {direction} their poses, which indicates a slip of registration{more}"
         )
 
 

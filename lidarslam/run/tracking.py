@@ -1,23 +1,28 @@
-"""How a recording goes through the pipeline: its scans taken in, everyone told of each, the state kept."""
+"""A recording through the pipeline: every scan is logged and shown, the state saved."""
 
-from collections.abc import Iterator
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import inverse
+from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.resume.run_state import begin, keeper_of, restore
+from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.resume.checkpoints import Checkpoints
 from lidarslam.resume.unfinished import Unfinished
 from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.trajectory_files import ground_truth
-from lidarslam.run.watch import Progress, Watch, process, reason
 from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.global_map import GlobalMap
 from mapping.global_map.moved_points import Views
@@ -27,19 +32,22 @@ from odometry.interface import Odometry
 if TYPE_CHECKING:
     from mapping.pose_graph.slam_graph import SlamGraph
 
+T = TypeVar("T")
+Progress = Callable[[int, int, ScanResult], None]
+"""Called after every scan with its number from 1, how many there are, and its result."""
+
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A recording that went through the pipeline.
+    """A recording after the pipeline.
 
     Attributes:
-        recording, truth, log: what it was, its ground truth, what came of it.
-        asked: how many scans were asked for.
+        recording, truth, log: the recording, its ground truth, its scans.
+        asked: number of scans that were asked for.
         faults: what was left out of them, and what is wrong with them.
-        total_ms: wall time of each scan.
-        global_map: of the poses as they were found; None when no scan could be believed.
-        views: of some of its scans, for what moved.
-        slides: pairs of its scans, held against one another.
+        global_map: of the poses before loop closure; None when no scan was added.
+        views: range images of some scans, for the removal of moving objects.
+        slides: pairs of scans, for the detection of slips.
         error: what ended it before its last scan, None when nothing did.
     """
 
@@ -48,7 +56,6 @@ class Tracked:
     log: ScanLog
     asked: int
     faults: Faults
-    total_ms: list[float]
     global_map: GlobalMap | None
     views: Views
     slides: PairTests
@@ -57,7 +64,7 @@ class Tracked:
     @property
     def stopped(self) -> str | None:
         """Why it ended before its last scan."""
-        return None if self.error is None else reason(self.error)
+        return None if self.error is None else _reason(self.error)
 
 
 class NoScanError(InputError):
@@ -79,45 +86,88 @@ def track(
     progress: Progress,
     unfinished: Unfinished | None = None,
 ) -> Tracked:
-    """Take the chosen scans of a recording through the pipeline, and log them; a graph follows.
+    """Take the chosen scans of a recording through the pipeline.
 
     Args:
-        request: what is run.
-        recording, chosen: its source, and which scans of that.
-        odometry, log, graph: for the pipeline; log and graph as they were saved, where the run is resumed.
-        viewer, progress: told of every scan.
-        unfinished: where the state is saved, and was; None: nowhere.
+        request: of the run.
+        recording, chosen: the source, and the indices of the scans.
+        odometry, log, graph: new, but for a graph that is resumed.
+        viewer, progress: called for every scan.
+        unfinished: where checkpoints are saved; None: nowhere.
 
     Raises:
-        NoScanError: none could be used.
+        NoScanError: no scan could be used.
         InputError: the recording is not the one that the run was begun with.
     """
-    config, truth = request.config, ground_truth(recording, log)
-    with suppress(InputError):  # it is told when the scans are read
+    config, faults = request.config, Faults()
+    scans = take_in(recording, chosen, faults)
+    checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
+    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, checkpoints)
+    if checkpoints is not None:
+        scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
+    truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
+    with suppress(InputError):  # raised again when the scans are read
         for warning in recording.warnings:
             log.warn(warning)
-    faults = Faults()
-    scans = take_in(recording, chosen, faults)
-    watch = Watch(log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
-    keeper = None if unfinished is None else keeper_of(config, unfinished, watch, graph)
-    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, keeper)
-    if unfinished is not None:
-        if unfinished.saved is not None:
-            scans = restore(unfinished.saved, pipeline, watch, scans, odometry)
-        begin(unfinished, log, request.out, request.resume, request.rerun != "off")
-    error = process(pipeline, scans, watch)
+    error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     if not log.points_read:
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", isinstance(error, KeyboardInterrupt))
-    slides = pipeline.slides.tests
-    return Tracked(
-        recording, truth, log, len(chosen), faults, watch.total_ms, pipeline.global_map, pipeline.views, slides, error
-    )
+    built = pipeline.map
+    return Tracked(recording, truth, log, len(chosen), faults, built.global_map, built.views, built.slides.tests, error)
+
+
+def _process(
+    pipeline: Pipeline,
+    scans: Iterable[Scan],
+    log: ScanLog,
+    viewer: Viewer,
+    truth: Trajectory | None,
+    progress: Callable[[int, ScanResult], None],
+) -> InputError | KeyboardInterrupt | None:
+    """Take every scan through the pipeline; what ended it early, None when nothing did."""
+    finished = time.perf_counter()
+    try:
+        with closing(pipeline.run(prefetch(scans))) as results:
+            for result in results:
+                before, finished = finished, time.perf_counter()
+                log.add(result, 1e3 * (finished - before))
+                if truth is not None:
+                    _show_reference(viewer, truth, log.stamps[0])
+                    truth = None
+                viewer.show_scan(len(log) - 1, result)
+                if pipeline.map.global_map is not None and viewer.wants_map(len(log) - 1):
+                    viewer.show_map(pipeline.map.global_map.points())
+                progress(len(log), result)
+    except (InputError, KeyboardInterrupt) as error:
+        log.warn(f"stopped after {len(log)} scans: {_reason(error)}")
+        return error
+    return None
+
+
+def _show_reference(viewer: Viewer, truth: Trajectory, first_stamp: float) -> None:
+    """Show the ground truth in the run's world: they coincide at the first scan."""
+    if len(truth) >= 2:
+        nearest = np.clip(first_stamp, truth.stamps[0], truth.stamps[-1])
+        viewer.show_reference(truth.transformed(inverse(truth.at(np.array([nearest]))[0])))
+
+
+def unless_damaged(read: Callable[[], T], log: ScanLog, consequence: str) -> T | None:
+    """Something that came with the recording; None and a warning where it is damaged."""
+    try:
+        return read()
+    except InputError as error:
+        log.warn(f"{consequence}: {error}")
+        return None
+
+
+def _reason(error: InputError | KeyboardInterrupt) -> str:
+    return str(error) or "interrupted"
 
 
 def _why_none(log: ScanLog, faults: Faults, error: InputError | KeyboardInterrupt | None) -> Iterator[str]:
     if error is not None:
-        yield reason(error)
+        yield _reason(error)
     yield from faults.warnings()
     if len(log):
         yield f"{len(log)} scans without a valid point, {log.points_dropped} invalid ones (NaN, at the origin, too far)"

@@ -1,9 +1,9 @@
-"""What a network is trained on: recordings and simulations, made ready once and kept on disk."""
+"""The data of a training: recordings and simulations, prepared once and kept on disk."""
 
 import hashlib
 import json
 import random
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,33 +15,36 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.scan_order import in_order
-from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Ingredients, ingredients_of, mixture
-from lidarslam.train.config import SimulatedConfig
+from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredients_of, mixture
 from lidarslam.train.teacher import MapTeacher
 from odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
+from odometry.training.config import SimulatedConfig, TrainingConfig
 from odometry.training.preparation import PreparedRecording, prepare
 from odometry.training.torch_images import RecordedImages
-from odometry.training.training_config import TrainingConfig
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
 PIECE = 500
+# Of the pairs, those from recordings where there are simulated ones beside.
+RECORDED_SHARE = 0.3
+# Draws the simulated recordings.
+_SIMULATION_SEED = 0
 # To be raised whenever preparation, or the simulation, computes something else than before.
-_KIND = Kind("a recording prepared for training", version=2)
-_SWEEP = ("points", "normals", "offsets", "low", "high")
-_MOTIONS = ("interval_s", "T_prev_curr", "believed", "explained")
+_KIND = Kind("a recording prepared for training", version=3)
+_IMAGES, _MOTIONS = ("points", "normals", "offsets"), ("interval_s", "T_prev_curr", "valid")
 
 Counter = Callable[[int], None]
-"""Told of scans that are ready, how many more."""
+"""Called with the number of scans that were prepared since the last call."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Some consecutive scans of a recording that is opened when it is needed.
+    """Consecutive scans of a recording that is opened when it is needed.
 
     Attributes:
         name: of the recording.
-        identity: what tells it from any other, and from itself before it was changed; values that JSON can hold.
+        identity: differs from that of any other recording, and of itself before it was changed; values that JSON can
+            hold.
         open: gives its scans.
         first, stop: which of them, as in `range`.
     """
@@ -57,7 +60,7 @@ class Stretch:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether it is of the mixture that training draws, and not a recording that was named."""
+        """Whether it is simulated for the training, and not a source."""
         return "simulated" in self.identity
 
     def pieces(self) -> Iterator["Stretch"]:
@@ -77,9 +80,11 @@ def recorded(source: Path, reader: ReaderConfig) -> Stretch:
     recording = open_recording(source, reader)
     if len(recording) < 2:
         raise InputError(f"{source}: training needs pairs of scans, this recording has {len(recording)}")
+    stats = [entry.stat() for entry in (source.rglob("*") if source.is_dir() else [source]) if entry.is_file()]
+    newest_ns = max((stat.st_mtime_ns for stat in stats), default=0)
     identity = {
         "source": str(source.resolve()),
-        "files": _fingerprint(source),
+        "files": [len(stats), sum(stat.st_size for stat in stats), newest_ns],
         "reader": reader.model_dump(mode="json"),
     }
     return Stretch(recording.name, identity, lambda: recording, 0, len(recording))
@@ -89,40 +94,36 @@ def simulated(config: SimulatedConfig) -> list[Stretch]:
     """The simulated recordings; their worlds are built when they are needed.
 
     Raises:
-        ConfigError: a world or sensor that they are to be of is not in the mixture, or there is none of that kind.
+        ConfigError: a world or sensor is not in the mixture, or no recording is of that kind.
     """
-    _require_known("simulated.worlds", config.worlds, MIXED_WORLDS)
-    _require_known("simulated.sensors", config.sensors, SENSOR_WEIGHTS)
-    chosen = [number for number in range(config.recordings) if _is_wanted(ingredients_of(number, config.seed), config)]
+    for key, names, known in (("worlds", config.worlds, MIXED_WORLDS), ("sensors", config.sensors, SENSOR_WEIGHTS)):
+        for name in names or ():
+            if name not in known:
+                raise ConfigError(f"simulated.{key}: there is no {name!r}; choose from {', '.join(known)}")
+    kinds = [ingredients_of(number, _SIMULATION_SEED) for number in range(config.recordings)]
+    chosen = [
+        number
+        for number, kind in enumerate(kinds)
+        if kind.world in (config.worlds or MIXED_WORLDS) and kind.sensor in (config.sensors or SENSOR_WEIGHTS)
+    ]
     if config.recordings and not chosen:
         raise ConfigError(
             f"simulated.recordings={config.recordings}: none is of the worlds and sensors asked for; ask for more"
         )
-    return [_simulation(number, config) for number in chosen]
+    return [_simulation(number, config.scans) for number in chosen]
 
 
-def _require_known(key: str, names: Iterable[str] | None, known: Iterable[str]) -> None:
-    for name in names or ():
-        if name not in known:
-            raise ConfigError(f"{key}: there is no {name!r}; choose from {', '.join(known)}")
-
-
-def _is_wanted(of: Ingredients, config: SimulatedConfig) -> bool:
-    in_world = config.worlds is None or of.world in config.worlds
-    return in_world and (config.sensors is None or of.sensor in config.sensors)
-
-
-def _simulation(number: int, config: SimulatedConfig) -> Stretch:
-    identity = {"simulated": number, "seed": config.seed, "scans": config.scans}
+def _simulation(number: int, scans: int) -> Stretch:
+    identity = {"simulated": number, "seed": _SIMULATION_SEED, "scans": scans}
 
     def build() -> ScanSequence:
-        return next(mixture(1, config.scans, config.seed, number))
+        return next(mixture(1, scans, _SIMULATION_SEED, number))
 
-    return Stretch(f"simulation {number}", identity, build, 0, config.scans)
+    return Stretch(f"simulation {number}", identity, build, 0, scans)
 
 
 def hold_out(stretches: Sequence[Stretch], share: float, seed: int) -> tuple[list[Stretch], list[Stretch]]:
-    """What is learned from, and what is kept for validation: whole recordings, or the end of the only one.
+    """Those to train on, and those kept for validation: whole recordings, or the end of the only one.
 
     Raises:
         InputError: the only recording is too short to be divided.
@@ -143,10 +144,10 @@ def hold_out(stretches: Sequence[Stretch], share: float, seed: int) -> tuple[lis
     return [replace(only, stop=border)], [replace(only, first=border)]
 
 
-def draw_weights(stretches: Sequence[Stretch], recorded_share: float) -> list[float]:
+def draw_weights(stretches: Sequence[Stretch]) -> list[float]:
     """How often each prepared recording is drawn, relative to the others, in the order of `prepared`.
 
-    Where there are simulated recordings beside, the others have the given share together, by their numbers of scans.
+    Where there are simulated recordings beside, the others have `RECORDED_SHARE` together, by their numbers of scans.
     """
     pieces = [piece for stretch in stretches for piece in stretch.pieces()]
     recorded_scans = sum(len(piece) for piece in pieces if not piece.is_simulated)
@@ -154,7 +155,7 @@ def draw_weights(stretches: Sequence[Stretch], recorded_share: float) -> list[fl
     if not recorded_scans or not simulated_count:
         return [1.0] * len(pieces)
     return [
-        (1.0 - recorded_share) / simulated_count if piece.is_simulated else recorded_share * len(piece) / recorded_scans
+        (1.0 - RECORDED_SHARE) / simulated_count if piece.is_simulated else RECORDED_SHARE * len(piece) / recorded_scans
         for piece in pieces
     ]
 
@@ -162,7 +163,7 @@ def draw_weights(stretches: Sequence[Stretch], recorded_share: float) -> list[fl
 def prepared(
     stretches: Sequence[Stretch], config: TrainingConfig, cache: Path, count: Counter
 ) -> list[PreparedRecording]:
-    """The stretches made ready for training, from the cache where they lie in it already.
+    """The stretches prepared for training, from the cache where they are in it already.
 
     Raises:
         InputError: a recording turns out unreadable.
@@ -177,15 +178,17 @@ def _prepared(piece: Stretch, config: TrainingConfig, cache: Path, count: Counte
         key["teacher"] = config.teacher
     path = cache / f"{_digest(key)}.safetensors"
     try:
-        kept = _read(path)
-    except InputError:  # not there yet, or damaged: made anew
-        made = _compact(_prepare(piece, config, count))
-    else:
-        count(len(piece))
-        return kept
-    tensors = {name: getattr(made.images, name) for name in _SWEEP} | {name: getattr(made, name) for name in _MOTIONS}
-    write_tensor_file(path, _KIND, tensors, {"name": piece.name, **key})
-    return made
+        tensors = read_tensor_file(path, _KIND).tensors
+        images = RecordedImages(*(tensors[name] for name in _IMAGES))
+        kept = PreparedRecording(images, *(tensors[name] for name in _MOTIONS))
+    except (InputError, KeyError):  # not there yet, or damaged: made anew
+        made = _prepare(piece, config, count)
+        tensors = {name: getattr(made.images, name) for name in _IMAGES}
+        tensors |= {name: getattr(made, name) for name in _MOTIONS}
+        write_tensor_file(path, _KIND, tensors, {"name": piece.name, **key})
+        return made
+    count(len(piece))
+    return kept
 
 
 def _prepare(piece: Stretch, config: TrainingConfig, count: Counter) -> PreparedRecording:
@@ -200,34 +203,16 @@ def _prepare(piece: Stretch, config: TrainingConfig, count: Counter) -> Prepared
 
     try:
         made = prepare(scans(), config.images)
-        return made if teacher is None else teacher.taught(made)
     except ValueError as error:
         raise InputError(f"{piece.name}: scans {piece.first} to {piece.stop} cannot be trained on: {error}") from error
-
-
-def _compact(made: PreparedRecording) -> PreparedRecording:
-    """Normals and offsets in half the memory; neither is known better than that."""
-    images = made.images
-    return replace(made, images=replace(images, normals=images.normals.half(), offsets=images.offsets.half()))
-
-
-def _read(path: Path) -> PreparedRecording:
-    tensors = read_tensor_file(path, _KIND).tensors
-    if set(tensors) != {*_SWEEP, *_MOTIONS}:
-        raise InputError(f"{path}: is incomplete")
-    images = RecordedImages(*(tensors[name] for name in _SWEEP))
-    return PreparedRecording(images, *(tensors[name] for name in _MOTIONS))
-
-
-def _fingerprint(source: Path) -> list[int]:
-    """How many files, their bytes, and when the last of them was changed, nanoseconds."""
-    entries = source.rglob("*") if source.is_dir() else [source]
-    stats = [entry.stat() for entry in entries if entry.is_file()]
-    return [len(stats), sum(stat.st_size for stat in stats), max((stat.st_mtime_ns for stat in stats), default=0)]
+    # Half precision is enough for normals and offsets.
+    images = replace(made.images, normals=made.images.normals.half(), offsets=made.images.offsets.half())
+    made = replace(made, images=images)
+    return made if teacher is None else teacher.relabelled(made)
 
 
 def digest(stretches: Sequence[Stretch]) -> str:
-    """A short text that tells these recordings from any others."""
+    """A short text that differs for any other recordings."""
     return _digest([[stretch.identity, stretch.first, stretch.stop] for stretch in stretches])
 
 
@@ -235,7 +220,6 @@ def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def believed_share(recordings: Sequence[PreparedRecording]) -> float:
-    """Of all pairs of consecutive scans, how many lie well on one another."""
-    believed = torch.cat([recording.believed for recording in recordings])
-    return float(believed.float().mean())
+def valid_share(recordings: Sequence[PreparedRecording]) -> float:
+    """Share of the consecutive scans with a valid pseudo-label."""
+    return float(torch.cat([recording.valid for recording in recordings]).float().mean())

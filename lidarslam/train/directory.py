@@ -1,4 +1,4 @@
-"""One training on disk: names every file of it, and says whether an earlier one may be gone on with or replaced."""
+"""The directory of a training: the names of its files, and whether an earlier one may be resumed or replaced."""
 
 import shutil
 from collections.abc import Iterable
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lidarslam.core.errors import OutputError
 
-# The section of config.yaml that says what was trained on, not how; its first.
+# The section of config.yaml that names the recordings; its first.
 SOURCES_SECTION = "trained_on"
 
 CONFIG = "config.yaml"
@@ -23,11 +23,11 @@ RESULTS = (CONFIG, WEIGHTS, LAST_WEIGHTS, STATE, LOSSES, VALIDATION, CURVES)
 
 
 def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
-    """The files of a training that lies in the directory already, if it may be gone on with or replaced.
+    """The files of a training in the directory, if it may be resumed or replaced.
 
     Raises:
         OutputError: it holds a training and neither is asked for, holds other files of these names, or there is none
-            to go on with.
+            to resume.
     """
     present = [name for name in RESULTS if (path / name).exists()]
     listed = f"{', '.join(present[:3])}{', ...' if len(present) > 3 else ''}"
@@ -43,20 +43,6 @@ def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
     return present
 
 
-def make_directory(path: Path) -> None:
-    """Make the directory, unless it is there.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise OutputError(f"{path}: a file is in the way; name another directory") from error
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
 def remove_results(path: Path, names: Iterable[str]) -> None:
     """Make room for another training."""
     for name in names:
@@ -67,7 +53,7 @@ def remove_results(path: Path, names: Iterable[str]) -> None:
 
 
 def is_training(path: Path) -> bool:
-    """Whether a training's own description lies there: its first section says what was trained on."""
+    """Whether the directory is of a training: the first section of its configuration names the recordings."""
     try:
         return (path / CONFIG).read_text(encoding="utf-8").startswith(f"{SOURCES_SECTION}:")
     except (OSError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""What a training leaves to look at: tables of its losses and validations, and curves and pictures for TensorBoard."""
+"""The log of a training: tables of losses and validations, and curves and pictures for TensorBoard."""
 
 import csv
 from collections.abc import Mapping
@@ -29,18 +29,14 @@ class TrainingLog:
 
     def losses(self, step: int, row: Mapping[str, float]) -> None:
         """Means since the last line."""
-        _append(self._out / files.LOSSES, {"step": step, **row})
-        for name, value in row.items():
-            self._curves.add_scalar(f"training/{name}", value, step)
+        self._write(files.LOSSES, "training", step, row)
 
     def validation(self, step: int, result: Validation) -> None:
-        """Errors on what is not learned from."""
+        """Errors on held-out recordings."""
         values = vars(result).copy()
         for k, percent in enumerate(values.pop("covered_percent"), start=1):
             values[f"covered_{k}_sigma_percent"] = percent
-        _append(self._out / files.VALIDATION, {"step": step, **values})
-        for name, value in values.items():
-            self._curves.add_scalar(f"validation/{name}", value, step)
+        self._write(files.VALIDATION, "validation", step, values)
         self._curves.flush()
 
     def inputs(self, step: int, recording: PreparedRecording) -> None:
@@ -56,8 +52,11 @@ class TrainingLog:
         """Probabilities of turns: a row for each pair, zero turn in the middle."""
         if not isinstance(network, CorrelationNetwork):
             return
-        images = recording.images.select(slice(0, _SHOWN_PAIRS + 1))
-        features = network.columns(images.points.to(device), images.normals.float().to(device))
+        points, normals = (
+            images[: _SHOWN_PAIRS + 1].float().to(device)
+            for images in (recording.images.points, recording.images.normals)
+        )
+        features = network.columns(points, normals)
         likely = network.turn_scores(features[:-1], features[1:]).softmax(dim=1)
         likely = (likely / likely.amax(dim=1, keepdim=True)).roll(likely.shape[1] // 2, dims=1)
         self._curves.add_image("pairs/turn_probability", likely.repeat_interleave(_TALL, dim=0)[None].cpu(), step)
@@ -66,13 +65,18 @@ class TrainingLog:
         """Write what is left."""
         self._curves.close()
 
+    def _write(self, table: str, curves: str, step: int, row: Mapping[str, float]) -> None:
+        _append(self._out / table, {"step": step, **row})
+        for name, value in row.items():
+            self._curves.add_scalar(f"{curves}/{name}", value, step)
+
 
 def _stacked(images: Tensor) -> Tensor:
     """Images (B, C, H, W) above one another, each row several times: (C, B H _TALL, W)."""
     return torch.cat(list(images.repeat_interleave(_TALL, dim=2)), dim=1)
 
 
-def _append(path: Path, row: Mapping[str, float]) -> None:
+def _append(path: Path, row: Mapping[str, object]) -> None:
     is_new = not path.exists()
     with path.open("a", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(row))
@@ -89,4 +93,4 @@ def _cut(path: Path, step: int) -> None:
         rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
     path.unlink()
     for row in rows:
-        _append(path, row)  # type: ignore[arg-type]
+        _append(path, row)

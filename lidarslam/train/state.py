@@ -1,8 +1,7 @@
-"""All that a training needs to go on exactly as if it had never stopped, in a file; no pickle."""
+"""The state of a training in a file, from which it goes on exactly as if it had never stopped; no pickle."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,27 +14,25 @@ _NETWORK, _OPTIMIZER = "network/", "optimizer/"
 
 
 @dataclass
-class Standing:
-    """How far a training has come, next to weights and moments.
+class Progress:
+    """The state beside weights and moments.
 
     Attributes:
         step: how many steps are done.
         best: the lowest score of a validation so far, None before the first.
         sums: of each part of the loss since the last line of the log.
         counted: over how many steps.
-        loss_scale: see `Devices.loss_scale`.
-        data: names what is trained on.
+        data: digest of the recordings.
     """
 
     step: int = 0
     best: float | None = None
     sums: dict[str, float] = field(default_factory=dict)
     counted: int = 0
-    loss_scale: dict[str, float] = field(default_factory=dict)
     data: str = ""
 
 
-def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, standing: Standing) -> None:
+def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
     """Write the file, whole or not at all.
 
     Raises:
@@ -44,11 +41,11 @@ def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer,
     tensors: dict[str, Tensor] = {_NETWORK + name: value for name, value in network.state_dict().items()}
     for number, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"{_OPTIMIZER}{number}/{name}": torch.as_tensor(value) for name, value in moments.items()}
-    write_tensor_file(path, _KIND, tensors, vars(standing))
+    write_tensor_file(path, _KIND, tensors, vars(progress))
 
 
-def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer) -> Standing:
-    """Put weights and moments back; the network and the optimizer must be as they were made.
+def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
+    """Restore weights and moments; the network and the optimizer must be as they were made.
 
     Raises:
         InputError: the file is not usable, or belongs to another network.
@@ -63,15 +60,10 @@ def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer)
             moments.setdefault(int(number), {})[key] = tensor
     try:
         network.load_state_dict(weights)
-        standing = Standing(**_known(file.content))
-    except (RuntimeError, TypeError) as error:
+    except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"{path}: does not belong to this network; go on with the configuration it was begun with ({reason[:200]})"
         ) from error
     optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-    return standing
-
-
-def _known(content: dict[str, Any]) -> dict[str, Any]:
-    return {name: content[name] for name in vars(Standing()) if name in content}
+    return Progress(**{name: file.content[name] for name in vars(Progress()) if name in file.content})

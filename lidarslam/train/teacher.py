@@ -1,4 +1,4 @@
-"""Self-training: the trajectory that scan-to-map registration finds without any network teaches the network."""
+"""Self-training: pseudo-labels from scan-to-map registration without a network."""
 
 from dataclasses import replace
 
@@ -16,27 +16,27 @@ from odometry.training.preparation import PreparedRecording
 
 
 class MapTeacher:
-    """Follows a recording by mapping at constant velocity, scan after scan."""
+    """Registers a recording at constant velocity, scan after scan."""
 
     def __init__(self) -> None:
         self._mapper = Mapper(MappingConfig())
         self._T_world_middle: list[FloatArray] = []
-        self._sure: list[bool] = []
+        self._is_ok: list[bool] = []
 
     def follow(self, scan: Scan) -> None:
-        """Register the next scan; empty ones are not taught."""
+        """Register the next scan."""
         mapped = self._mapper.process(scan, Prior())
         state = mapped.state
         self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * middle_offset_s(scan)))
         # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.
-        self._sure.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
+        self._is_ok.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
 
-    def taught(self, recording: PreparedRecording) -> PreparedRecording:
-        """The recording of the scans that were followed, with the motions between the middles of sweeps on the map.
+    def relabelled(self, recording: PreparedRecording) -> PreparedRecording:
+        """The recording of these scans with the motions between the middles of sweeps on the map.
 
-        A motion is taught where both poses have the status ok.
+        A motion is valid where both poses have the status ok.
         """
         T = np.stack(self._T_world_middle)
         T_prev_curr = inverse(T[:-1]) @ T[1:]
-        sure = torch.tensor(self._sure)
-        return replace(recording, T_prev_curr=torch.from_numpy(T_prev_curr).float(), believed=sure[:-1] & sure[1:])
+        is_ok = torch.tensor(self._is_ok)
+        return replace(recording, T_prev_curr=torch.from_numpy(T_prev_curr).float(), valid=is_ok[:-1] & is_ok[1:])

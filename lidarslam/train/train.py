@@ -3,43 +3,61 @@
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from lidarslam.core.directory_lock import only_writer
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.files import make_directory, only_writer
 from lidarslam.run.directory import RunDirectory
+from lidarslam.run.progress import show_count
 from lidarslam.train import directory as files
-from lidarslam.train.config import TrainConfig, dump_train_yaml
-from lidarslam.train.data import (
-    Counter,
-    Stretch,
-    believed_share,
-    digest,
-    draw_weights,
-    hold_out,
-    prepared,
-    recorded,
-    simulated,
-)
-from lidarslam.train.devices import Devices
+from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated, valid_share
+from lidarslam.train.devices import DeviceName, Devices
 from lidarslam.train.loop import Recordings, TrainingLoop
-from lidarslam.train.request import Interrupted, Material, TrainNarrator, TrainOutcome, TrainRequest
-from lidarslam.train.state import Standing, load_state
+from lidarslam.train.settings import TrainConfig, dump_train_yaml
+from lidarslam.train.state import Progress, load_state
+from lidarslam.train.text import format_outcome
 from odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
 from odometry.network.networks import make_network
+from odometry.training.config import TrainingConfig
 from odometry.training.training import Validation, make_optimizer
-from odometry.training.training_config import TrainingConfig
 
 
-def execute(request: TrainRequest, narrator: TrainNarrator) -> TrainOutcome:
-    """Train, and write the directory.
+@dataclass(frozen=True)
+class TrainRequest:
+    """A training.
 
-    Ctrl-C ends the training after the step at work, and it can be gone on with.
+    Attributes:
+        sources: recordings; may be none where the configuration names simulated ones.
+        out: the directory of the training.
+        config: how it is trained.
+        start_from: weights to begin with instead of random ones.
+        device: where to compute.
+        prepared: where prepared recordings are kept; None: in `out`.
+        resume: go on with the training in `out`.
+        overwrite: replace it.
+    """
+
+    sources: tuple[Path, ...]
+    out: Path
+    config: TrainConfig
+    start_from: Path | None = None
+    device: DeviceName = "auto"
+    prepared: Path | None = None
+    resume: bool = False
+    overwrite: bool = False
+
+
+def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
+    """Train and write the directory; whether all steps were done.
+
+    Ctrl-C ends the training after the step at work, and it can be resumed.
 
     Raises:
         LidarSlamError: sources, configuration, weights or output directory are not usable.
@@ -50,21 +68,23 @@ def execute(request: TrainRequest, narrator: TrainNarrator) -> TrainOutcome:
     stretches = [*(recorded(source, config.reader) for source in request.sources), *simulated(config.simulated)]
     if not stretches:
         raise ConfigError("there is nothing to train on; name a SOURCE, or set simulated.recordings=100")
-    devices = Devices(request.device, config.training.precision)
-    files.make_directory(request.out)
-    about = _about(request, stretches)
-    alone = only_writer(request.out) if devices.is_first else contextlib.nullcontext()
-    with alone, _interruption() as interrupted:
-        recordings = _recordings(request, config.training, stretches, devices, _Count(stretches, narrator, interrupted))
+    with contextlib.closing(Devices(request.device)) as devices, _interruption() as is_interrupted:
+        make_directory(request.out)
+        with only_writer(request.out) if devices.is_first else contextlib.nullcontext():
+            recordings = _recordings(request, config.training, stretches, devices, is_interrupted)
+            if devices.is_first:
+                files.remove_results(request.out, [] if request.resume else earlier)
+                about = _about(request, stretches)
+                RunDirectory(request.out).write_text(files.CONFIG, dump_train_yaml(config, about))
+                say(_summary(recordings, stretches, devices))
+            loop, progress = _loop(request, config.training, start, devices, stretches, say)
+            if progress.step and devices.is_first:
+                say(f"going on after step {progress.step:,}")
+            is_complete = loop.run(recordings, is_interrupted)
         if devices.is_first:
-            files.remove_results(request.out, [] if request.resume else earlier)
-            RunDirectory(request.out).write_text(files.CONFIG, dump_train_yaml(config, about))
-            narrator.material(_material(recordings, stretches, devices))
-        standing, loop = _loop(request, config.training, start, devices, about)
-        if standing.step and devices.is_first:
-            narrator.going_on(standing.step)
-        is_complete = loop.run(recordings, narrator, interrupted)
-    return TrainOutcome(standing.step, not is_complete, request.out / files.WEIGHTS, _best(request), devices.is_first)
+            weights, best = request.out / files.WEIGHTS, _best(request.out / files.WEIGHTS)
+            say(format_outcome(request.out, weights, progress.step, best, not is_complete))
+    return is_complete
 
 
 def with_network_of(start: Checkpoint | None, config: TrainConfig) -> TrainConfig:
@@ -84,54 +104,58 @@ def with_network_of(start: Checkpoint | None, config: TrainConfig) -> TrainConfi
     return config.model_copy(update={"training": training})
 
 
-class _Count:
-    """Counts the scans that are ready; an interruption ends the preparation, and what is ready is kept."""
-
-    def __init__(self, stretches: Sequence[Stretch], narrator: TrainNarrator, interrupted: Interrupted) -> None:
-        self._done, self._total = 0, sum(len(stretch) for stretch in stretches)
-        self._narrator, self._interrupted = narrator, interrupted
-
-    def __call__(self, more: int) -> None:
-        if self._interrupted():
-            raise KeyboardInterrupt
-        self._done += more
-        self._narrator.preparing(self._done, self._total)
-
-
 def _recordings(
-    request: TrainRequest, config: TrainingConfig, stretches: Sequence[Stretch], devices: Devices, count: Counter
-) -> Recordings:
-    """All recordings, ready; the first process makes them, and the others find them in the cache."""
+    request: TrainRequest, config: TrainingConfig, stretches: Sequence[Stretch], devices: Devices,
+    is_interrupted: Callable[[], bool],
+) -> Recordings:  # fmt: skip
+    """All recordings, prepared; the first process does that, and the others find them in the cache."""
     cache = request.prepared or request.out / files.PREPARED
     learned, held_out = hold_out(stretches, config.hold_out, config.seed)
+    done, total = 0, sum(len(stretch) for stretch in stretches)
     if not devices.is_first:
         devices.wait()
-    recordings = Recordings(
-        learned=prepared(learned, config, cache, count),
-        held_out=prepared(held_out, config, cache, count),
-        weights=draw_weights(learned, config.recorded_share),
-    )
+    with show_count("preparing recordings") as show:
+
+        def count(more: int) -> None:
+            """An interruption ends the preparation; prepared recordings stay in the cache."""
+            nonlocal done
+            if is_interrupted():
+                raise KeyboardInterrupt
+            done += more
+            show(done, total)
+
+        recordings = Recordings(
+            learned=prepared(learned, config, cache, count),
+            held_out=prepared(held_out, config, cache, count),
+            weights=draw_weights(learned),
+        )
     if devices.is_first:
         devices.wait()
     return recordings
 
 
 def _loop(
-    request: TrainRequest, config: TrainingConfig, start: Checkpoint | None, devices: Devices, about: dict[str, Any]
-) -> tuple[Standing, TrainingLoop]:
+    request: TrainRequest, config: TrainingConfig, start: Checkpoint | None, devices: Devices,
+    stretches: Sequence[Stretch], say: Callable[[str], None],
+) -> tuple[TrainingLoop, Progress]:  # fmt: skip
     """The training, at its beginning or where it was left."""
-    network = _first_network(config, start)
+    network = _first_network(config, start).to(devices.device)
     optimizer = make_optimizer(network, config)
-    standing = Standing(data=about["digest"])
+    progress = Progress(data=digest(stretches))
     state = request.out / files.STATE
     if request.resume and state.exists():
-        standing = load_state(state, network, optimizer)
-        if standing.data != about["digest"]:
+        progress = load_state(state, network, optimizer)
+        if progress.data != digest(stretches):
             raise ConfigError(
                 f"{request.out}: the recordings are not those that this training was begun with, or have changed;"
                 f" to train the network on these, begin another with --from {request.out / files.LAST_WEIGHTS}"
             )
-    return standing, TrainingLoop(config, network, optimizer, standing, devices, request.out, about)
+    about = _about(request, stretches)
+    # Weights are passed on: with the names of their recordings, not the folders.
+    about["sources"] = [Path(source).name for source in about["sources"]]
+    if "from" in about:
+        about["from"] = Path(about["from"]).name
+    return TrainingLoop(config, network, optimizer, progress, devices, request.out, about, say), progress
 
 
 def _first_network(config: TrainingConfig, start: Checkpoint | None) -> nn.Module:
@@ -153,30 +177,28 @@ def _about(request: TrainRequest, stretches: Sequence[Stretch]) -> dict[str, Any
     return about if request.start_from is None else {**about, "from": str(request.start_from)}
 
 
-def _material(recordings: Recordings, stretches: Sequence[Stretch], devices: Devices) -> Material:
-    held_out = recordings.held_out
-    return Material(
-        recordings=len(stretches),
-        simulated=sum(stretch.is_simulated for stretch in stretches),
-        scans=sum(len(recording) for recording in recordings.learned),
-        held_out_scans=sum(len(recording) for recording in held_out),
-        believed_percent=100.0 * believed_share(recordings.learned),
-        device=str(devices.device),
-        processes=devices.processes,
+def _summary(recordings: Recordings, stretches: Sequence[Stretch], devices: Devices) -> str:
+    drawn = sum(stretch.is_simulated for stretch in stretches)
+    of_them = f", {drawn:,} of them simulated" if drawn else ""
+    held = sum(len(recording) for recording in recordings.held_out)
+    held_out = f"{held:,} more are held out for validation" if held else "none is held out for validation"
+    scans = sum(len(recording) for recording in recordings.learned)
+    processes = f" in {devices.processes} processes" if devices.processes > 1 else ""
+    return (
+        f"training on {len(stretches):,} recording{'s' if len(stretches) > 1 else ''}{of_them}: {scans:,} scans to"
+        f" learn from, {held_out}; {100.0 * valid_share(recordings.learned):.0f} % of consecutive scans could be"
+        f" aligned. Computing on {devices.device}{processes}"
     )
 
 
-def _best(request: TrainRequest) -> Validation | None:
-    """What the weights that are kept say of themselves."""
-    values = load_checkpoint(request.out / files.WEIGHTS).about.get("validation")
-    if values is None:
-        return None
-    first, second, third = values.pop("covered_percent")
-    return Validation(**values, covered_percent=(first, second, third))
+def _best(weights: Path) -> Validation | None:
+    """The validation of the weights that are kept."""
+    values = load_checkpoint(weights).about.get("validation")
+    return None if values is None else Validation(**{**values, "covered_percent": tuple(values["covered_percent"])})
 
 
 @contextlib.contextmanager
-def _interruption() -> Iterator[Interrupted]:
+def _interruption() -> Iterator[Callable[[], bool]]:
     """For the time of a training, Ctrl-C and a request to end are noted; Ctrl-C once more ends it at once."""
     asked = threading.Event()
 

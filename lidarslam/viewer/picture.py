@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from evaluation.report.error_colours import viridis
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.geometry import FloatArray
-from lidarslam.run.directory import RunDirectory
 
 _BACKGROUND = (255, 255, 255)
 # How far away the camera stands, in diameters of the cloud: near enough for perspective.
@@ -19,9 +19,7 @@ _FRAMED_PERCENT = (0.2, 99.8)
 _FILLED = 0.92
 # Eye-dome lighting (Boucheny, 2009): how strongly a pixel behind its neighbours is darkened.
 _EDGE_STRENGTH = 12.0
-# The last chunk of a .png file with its checksum, the end marker of a .jpg file.
-_ENDINGS, _ENDING_BYTES = (b"IEND\xaeB`\x82", b"\xff\xd9"), 8
-_PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -83,23 +81,17 @@ def save_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write a picture (height, width, 3) as .png, .jpg or .jpeg.
 
     Raises:
-        OutputError: it could not be written.
+        OutputError: it cannot be written.
     """
-    import open3d as o3d
+    from PIL import Image
 
-    if path.suffix.lower() not in _PICTURE_SUFFIXES:
-        raise OutputError(f"{path}: the picture could not be written; it must end in .png or .jpg")
-    image = o3d.geometry.Image(np.ascontiguousarray(picture).data)
-    with RunDirectory(path.parent).replacing(path.name) as partial:
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            written = o3d.io.write_image(partial, image)
-        if not (written and _is_whole(partial)):
-            raise OutputError(f"{path}: cannot be written; does the folder exist, and is there room on the disk?")
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether a picture ends as pictures do; Open3D 0.20 may say it was written when the disk is full."""
-    return path.read_bytes()[-_ENDING_BYTES:].endswith(_ENDINGS)
+    if path.suffix.lower() not in _SUFFIXES:
+        raise OutputError(f"{path}: a picture must end in .png or .jpg")
+    try:
+        with replacing(path) as partial:
+            Image.fromarray(picture).save(partial)
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def _to_camera(points: FloatArray, camera: Camera) -> FloatArray:

@@ -1,17 +1,17 @@
-"""What Rerun is told through the environment; it must stand there before the library is loaded."""
+"""Environment variables for Rerun, which must be set before it is imported."""
 
 import os
 import sys
 
-# Whether a recording was given up: at the end of the program Rerun 0.41 waits without end for a writer that died.
+# Whether a writer died; at the end of the program Rerun 0.41 waits for it without end.
 abandoned = False
 
 
 def keep_rerun_to_itself() -> None:
-    """No reports to its makers, and no words on standard error.
+    """No telemetry, and no log on standard error.
 
-    The viewer reports its use unless it runs in continuous integration. The library's log stops the program for good
-    where standard error is a file on a full disk; whether its files are whole is seen without it.
+    The viewer sends telemetry unless it runs in continuous integration. Its log blocks the program where standard error
+    is a file on a full disk.
     """
     os.environ.setdefault("CI", "1")
     os.environ.pop("FORCE_RERUN_ANALYTICS", None)
@@ -19,7 +19,7 @@ def keep_rerun_to_itself() -> None:
 
 
 def leave_if_abandoned(status: int) -> None:
-    """End the program here, once everything is said and written, where it could not end by itself."""
+    """End the program at once where Rerun would keep it from ending."""
     if abandoned:
         sys.stdout.flush()
         sys.stderr.flush()

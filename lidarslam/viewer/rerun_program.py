@@ -1,68 +1,67 @@
-"""Rerun's program: its window, and its page for browsers. Both listen on this machine alone.
+"""Rerun's program: its window, and its page for browsers.
 
-Started by Rerun's library they would be open to the network. `python -m lidarslam.viewer.rerun_program COMMAND...`
-runs a command until standard input ends, which it does with the process that holds its other end, however that ends.
+Both listen on this machine alone; started by Rerun's library they would be open to the network.
 """
 
+import contextlib
 import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.core.errors import OutputError
 
 LOCAL = "127.0.0.1"
+# Rerun's own defaults.
+GRPC_PORT, WEB_PORT = 9876, 9090
 
-# No module is taken from the current folder, where anything may lie, and nobody is asked anything.
-_ENVIRONMENT = {"PYTHONSAFEPATH": "1", "RERUN_APP_ONLY": "true"}
-_START_S = 30.0
-_LOOK_S = 0.05
+_START_S, _POLL_S = 30.0, 0.05
 
 
 def is_taken(port: int) -> bool:
-    """Whether somebody listens on a port of this machine."""
+    """Whether a program listens on a port of this machine."""
     with socket.socket() as probe:
         return probe.connect_ex((LOCAL, port)) == 0
 
 
 def open_window(port: int) -> None:
-    """Open the viewer, which takes recordings at a port; one that listens there already is taken.
+    """Open the viewer, which takes recordings at a port, unless it is open already.
 
     Raises:
         OutputError: it cannot be opened.
     """
-    if is_taken(port):
-        return
-    command = [_program(), "--bind", LOCAL, "--port", str(port), "--memory-limit", "75%"]
-    process = _start([*command, "--expect-data-soon", "--hide-welcome-screen"], subprocess.DEVNULL)
-    if not _listens(process, port):
+    options = ("--port", str(port), "--memory-limit", "75%", "--expect-data-soon", "--hide-welcome-screen")
+    if not is_taken(port) and _start(port, *options) is None:
         raise OutputError("the Rerun window cannot be opened; write a file instead")
 
 
-def serve_page(port: int, server: str) -> "subprocess.Popen[bytes]":
-    """Serve the page that shows what a server has; it ends when its standard input is closed.
+@contextlib.contextmanager
+def page_served(port: int, server: str) -> Iterator[None]:
+    """Serve the page that shows a recording's server, for the time of the block.
 
     Args:
-        port: where the page is.
+        port: of the page.
         server: address of the recording's server.
 
     Raises:
         OutputError: it cannot be served.
     """
-    command = [_program(), "--serve-web", "--bind", LOCAL, "--web-viewer-port", str(port), server]
-    process = _start([sys.executable, "-m", "lidarslam.viewer.rerun_program", *command], subprocess.PIPE)
-    if not _listens(process, port):
+    process = _start(port, "--serve-web", "--web-viewer-port", str(port), server)
+    if process is None:
         raise OutputError("the browser cannot be served; write a file with --save FILE.rrd instead")
-    return process
+    try:
+        yield
+    finally:
+        _end(process)
 
 
 def _program() -> str:
-    """The program that came with the library, which stands beside this Python and perhaps not on the path."""
+    """The program that came with the library, beside this Python if not on the path."""
     beside = Path(sys.executable).with_name("rerun")
     found = str(beside) if beside.is_file() else shutil.which("rerun")
     if found is None:
@@ -70,42 +69,28 @@ def _program() -> str:
     return found
 
 
-def _start(command: list[str], stdin: int) -> "subprocess.Popen[bytes]":
-    """In a session of its own, which no Ctrl-C meant for this program reaches."""
-    return subprocess.Popen(
-        command,
-        stdin=stdin,
+def _start(port: int, *options: str) -> "subprocess.Popen[bytes] | None":
+    """Start the program and wait until it listens; None where it does not."""
+    process = subprocess.Popen(
+        [_program(), "--bind", LOCAL, *options],
+        stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        env=os.environ | _ENVIRONMENT,
-        start_new_session=True,
+        # No module from the current folder, no questions.
+        env=os.environ | {"PYTHONSAFEPATH": "1", "RERUN_APP_ONLY": "true"},
+        start_new_session=True,  # Ctrl-C is not meant for it
     )
-
-
-def _listens(process: "subprocess.Popen[bytes]", port: int) -> bool:
-    """Wait until it listens; it is ended where it does not."""
     begun = time.monotonic()
     while process.poll() is None and time.monotonic() - begun < _START_S:
         if is_taken(port):
-            return True
-        time.sleep(_LOOK_S)
+            return process
+        time.sleep(_POLL_S)
+    _end(process)
+    return None
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """With whatever it started."""
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    return False
-
-
-def _end_with_input() -> None:
-    sys.stdin.buffer.read()
-    os.killpg(0, signal.SIGTERM)  # what was started may have started others
-
-
-def main() -> int:
-    """Run the command of the arguments; its exit status."""
-    with subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL) as process:
-        threading.Thread(target=_end_with_input, daemon=True).start()
-        return process.wait()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

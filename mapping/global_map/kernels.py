@@ -1,4 +1,4 @@
-"""The loops over points and voxels behind `GlobalMap`, compiled.
+"""Compiled loops over points and voxels behind `GlobalMap`.
 
 A row of sums is (7,) float32: position within the voxel, direction it was seen from, number of points. Keys are those
 of `mapping.surfels.cell_kernels`.
@@ -50,37 +50,6 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, unique: Keys, totals
             totals[count] = sums[row]
             count += 1
         else:
-            _add(sums, row, totals, count - 1)
+            for column in range(7):
+                totals[count - 1, column] += sums[row, column]
     return count
-
-
-@compiled
-def merge(keys: Keys, sums: Sums, other_keys: Keys, other_sums: Sums, unique: Keys, totals: Sums) -> int:
-    """Write the keys (M,) and the sums (M, 7) of two tables, each sorted by keys that occur once.
-
-    Returns:
-        M.
-    """
-    count, i, j = 0, 0, 0
-    while i < len(keys) or j < len(other_keys):
-        here = i < len(keys) and (j == len(other_keys) or keys[i] <= other_keys[j])
-        there = j < len(other_keys) and (i == len(keys) or other_keys[j] <= keys[i])
-        if here:
-            unique[count] = keys[i]
-            totals[count] = sums[i]
-            i += 1
-        if there:
-            if here:
-                _add(other_sums, j, totals, count)
-            else:
-                unique[count] = other_keys[j]
-                totals[count] = other_sums[j]
-            j += 1
-        count += 1
-    return count
-
-
-@compiled
-def _add(sums: Sums, row: int, totals: Sums, total: int) -> None:
-    for column in range(7):
-        totals[total, column] += sums[row, column]

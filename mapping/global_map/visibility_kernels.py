@@ -1,4 +1,4 @@
-"""The loops over points and pixels behind `mapping.global_map.moved_points`, compiled.
+"""Compiled loops over points and pixels behind `mapping.global_map.moved_points`.
 
 An image is (rows, columns) of ranges in metres, 0 where nothing returned; row 0 is the lowest, centres of rows are at
 integers, and columns begin at integers, from azimuth 0 towards y. A grid is (3,): the elevation of the centre of row 0,
@@ -17,20 +17,20 @@ Ranges = NDArray[np.float32]
 TWO_PI = 2.0 * math.pi
 
 # Of the nine pixels around a point, its own and so many in all must hold a return: glass and the sky prove nothing.
-LEAST_RETURNS = 6
-# A return is at a point's range, within so much and a voxel: noise, errors of poses, and a surface seen at a slant.
-MARGIN_M = 0.1
-MARGIN_OF_RANGE = 0.01
-# A point is where something was while it passed when so many views see through it, and enough for those that do not. Of
-# lasers with gaps between them most pass a thin board, which single ones meet: it takes two of these for one that does.
-LEAST_THROUGH = 3
-WITH_GAPS = 0.5
-# Views whose beams pass so far from the centre of a row, in rows, have no gaps.
+_LEAST_RETURNS = 6
+# A return is at a point's range within this margin and a voxel: noise, errors of poses, and a surface seen at a slant.
+_MARGIN_M = 0.1
+_MARGIN_OF_RANGE = 0.01
+# A dynamic point is seen through by so many views, and by at least as many as support it. Of lasers with gaps between
+# them most pass a thin board, which single ones meet: such views count half.
+_LEAST_THROUGH = 3
+_WITH_GAPS = 0.5
+# Half the height of a row: views whose beams pass this far from its centre have no gaps.
 NO_GAPS = 0.5
-# So many views that say something are enough to judge a point by, where hundreds would.
-ENOUGH = 64
+# So many votes are enough to classify a point by, where hundreds would be cast.
+_ENOUGH = 64
 
-_SILENT, _SUPPORTS, _THROUGH = 0, 1, 2
+_UNKNOWN, _SUPPORTS, _THROUGH = 0, 1, 2
 
 
 @compiled
@@ -61,37 +61,37 @@ def judge(
     voxel_size_m: float,
     moved: NDArray[np.bool_],
 ) -> None:
-    """Write for each of the points (M, 3) whether what was there has moved.
+    """Classify the points (M, 3): dynamic or static.
 
     Args:
         points: in the world.
         T_lidar_world: (V, 4, 4) of the views.
-        images, grids: (V, rows, columns) and (V, 3), the views, in an order that has nothing to do with time.
-        reach_m: a view says nothing of points farther than this.
+        images, grids: (V, rows, columns) and (V, 3), the views, in random order.
+        reach_m: farther points get no vote.
         voxel_size_m: of the map that the points are of.
-        moved: (M,).
+        moved: (M,) written.
     """
     views = len(images)
     for m in range(len(points)):
         a, b, c = points[m, 0], points[m, 1], points[m, 2]
         through, support, weight = 0, 0, 0.0
         for v in range(views):
-            says = _testimony(a, b, c, v, T_lidar_world, images, grids, reach_m, voxel_size_m)
-            if says == _THROUGH:
+            vote = _vote(a, b, c, v, T_lidar_world, images, grids, reach_m, voxel_size_m)
+            if vote == _THROUGH:
                 through += 1
-                weight += 1.0 if grids[v, 2] >= NO_GAPS else WITH_GAPS
-            elif says == _SUPPORTS:
+                weight += 1.0 if grids[v, 2] >= NO_GAPS else _WITH_GAPS
+            elif vote == _SUPPORTS:
                 support += 1
-            # Most points are where they were: no need to hear all views once these cannot turn the balance.
+            # Most points are static: stop once the views that are left cannot turn the balance.
             left = views - 1 - v
-            outvoted = through + left < LEAST_THROUGH or weight + left < support
-            if outvoted or through + support >= ENOUGH:
+            outvoted = through + left < _LEAST_THROUGH or weight + left < support
+            if outvoted or through + support >= _ENOUGH:
                 break
-        moved[m] = through >= LEAST_THROUGH and weight >= support
+        moved[m] = through >= _LEAST_THROUGH and weight >= support
 
 
 @compiled
-def _testimony(
+def _vote(
     a: float,
     b: float,
     c: float,
@@ -102,21 +102,21 @@ def _testimony(
     reach_m: float,
     voxel_size_m: float,
 ) -> int:
-    """What view v says of the point (a, b, c); whole arrays, because to take a part of one costs more than all else."""
+    """The vote of view v on the point (a, b, c); whole arrays, because slicing one costs more than all else."""
     _, rows, columns = images.shape
     x = T[v, 0, 0] * a + T[v, 0, 1] * b + T[v, 0, 2] * c + T[v, 0, 3]
     y = T[v, 1, 0] * a + T[v, 1, 1] * b + T[v, 1, 2] * c + T[v, 1, 3]
     z = T[v, 2, 0] * a + T[v, 2, 1] * b + T[v, 2, 2] * c + T[v, 2, 3]
     squared = x * x + y * y + z * z
     if not (squared <= reach_m * reach_m):
-        return _SILENT
+        return _UNKNOWN
     height = (math.atan2(z, math.hypot(x, y)) - grids[v, 0]) * grids[v, 1]
     row = math.floor(height + 0.5)
     if row < 0 or row >= rows:
-        return _SILENT
+        return _UNKNOWN
     column = _column(x, y, columns)
     distance = math.sqrt(squared)
-    margin = MARGIN_M + MARGIN_OF_RANGE * distance + voxel_size_m
+    margin = _MARGIN_M + _MARGIN_OF_RANGE * distance + voxel_size_m
     returns, is_hidden = 0, False
     for i in range(max(row - 1, 0), min(row + 2, rows)):
         for j in range(column - 1, column + 2):
@@ -128,9 +128,9 @@ def _testimony(
                 return _SUPPORTS
             if seen < distance:
                 is_hidden = True
-    # Between lasers that are far apart a board lies unseen: only where one passes does it prove anything.
+    # Between lasers that are far apart a board lies unseen: only a view whose beam passes the point may see through.
     is_looked_at = images[v, row, column] > 0.0 and abs(height - row) <= grids[v, 2]
-    return _THROUGH if is_looked_at and returns >= LEAST_RETURNS and not is_hidden else _SILENT
+    return _THROUGH if is_looked_at and returns >= _LEAST_RETURNS and not is_hidden else _UNKNOWN
 
 
 @compiled

@@ -1,219 +1,214 @@
-"""Where a new keyframe may lie: beside earlier ones near its estimate, or where earlier ones look like it."""
+"""Loop candidates: earlier keyframes near the estimate, and earlier keyframes with a similar descriptor."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state import Saved, State
-from mapping.loops.consistency import Link, Track, beyond_drift
-from mapping.loops.descriptor import Drawing, Expected, Places, lay_over
-from mapping.loops.loop_config import LoopConfig
-from mapping.loops.place import Patch, make_patch
-from mapping.loops.registration import Place
+from lidarslam.core.state import Stateful
+from mapping.config import LoopConfig
+from mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from mapping.loops.closure import RelativePose
+from mapping.loops.drift import Track
+from mapping.loops.registration import SubmapCloud
+from mapping.loops.sparse_submap import SparseSubmap
 
-FoundBy = Literal["nearby", "appearance"]
-# Around a nearby keyframe's estimate its heading may be so wrong, in standard deviations and at least in radians.
+# Shorter ways back are no loops, in median ranges and in metres.
+_MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0
+# Candidates of either kind that are verified: each costs some 30 ms.
+_NEARBY_CANDIDATES = _APPEARANCE_CANDIDATES = 2
+# Least correlation of similar descriptors.
+_MIN_SIMILARITY = 0.35
+# Keyframes on either side whose points help in the registration.
+_NEIGHBOURS = 2
+# Descriptors reach so many median ranges of the first keyframe.
+_RADIUS_PER_RANGE = 4.0
+# The heading around a nearby keyframe's estimate that is searched, in standard deviations and at least in radians.
 _YAW_SIGMAS = 2.0
 _YAW_MIN = np.deg2rad(6.0)
 _YAW_TRIES = 5
-# Keyframes that are next to one another are one candidate.
+# Keyframes closer to one another than this count as one candidate.
 _APART = 3
-# A guess from two drawings may be so wrong: radians, and of the median range.
+# Standard deviation of a guess from two views: radians, and of the median range.
 _ROUGH_RAD = np.deg2rad(10.0)
 _ROUGH_RANGES = 0.3
-# A place that fits elsewhere nearly as well as this, beside where it fits best, is recognised nowhere.
+# A second place whose score comes so near to the best one's makes both ambiguous.
 _AMBIGUOUS = 0.9
-_RADIUS_PER_RANGE = 4.0
+# Standard deviations of drift that a closure may correct: a candidate by appearance may be anywhere.
+_MAX_SIGMAS, _MAX_SIGMAS_BY_APPEARANCE = 3.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An earlier keyframe that a new one may lie beside.
-
-    Attributes:
-        index: of the earlier keyframe.
-        found_by: by the estimate, or by how the place looks.
-        T_first_second: (4, 4) a rough guess of where the new one lies.
-    """
+    """An earlier keyframe, and a rough guess `T_first_second` (4, 4) of where the new one lies from it."""
 
     index: int
-    found_by: FoundBy
+    by_appearance: bool
     T_first_second: FloatArray
 
 
-def most_sigmas(found_by: FoundBy, config: LoopConfig) -> float:
-    """How many standard deviations of drift a closure may correct within a session."""
-    return config.max_drift_sigmas if found_by == "nearby" else config.max_drift_sigmas_by_appearance
+def objection_to_drift(link: RelativePose, by_appearance: bool, track: Track) -> str:
+    """Why drift does not explain a link; empty when it does, and between segments."""
+    sigmas = track.correction_sigmas(link)
+    if sigmas <= (_MAX_SIGMAS_BY_APPEARANCE if by_appearance else _MAX_SIGMAS):
+        return ""
+    way_m = track.way_m[link.second] - track.way_m[link.first]
+    return f"corrects {sigmas:.1f} standard deviations of the drift over {way_m:.0f} m"
 
 
-class Keyframes:
-    """What is kept of every keyframe, about 55 kB with the defaults, and the search among them.
+class KeyframeDatabase(Stateful):
+    """Sparse submaps and descriptors of all keyframes, and the search among them.
 
     Attributes:
-        patches: one a keyframe.
         track: the present estimates.
+        submaps: one a keyframe.
     """
+
+    track: Track
 
     def __init__(self, config: LoopConfig) -> None:
         self._config = config
-        self.patches: list[Patch] = []
-        self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64))
-        self._places = Places()
-        self._radius_m = config.radius_m
+        self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
+        self.submaps: list[SparseSubmap] = []
+        self._descriptors: list[NDArray[np.complex64]] = []
+        self._radius_m: float | None = None
 
     def __len__(self) -> int:
-        return len(self.patches)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of what is kept."""
-        return self._places.nbytes + sum(patch.nbytes for patch in self.patches)
+        return len(self.submaps)
 
     @property
     def radius_m(self) -> float:
-        """How far places are compared; known with the first keyframe that has points."""
+        """How far descriptors reach; known with the first keyframe that has points."""
         return self._radius_m or 1.0
 
-    def add(self, points: FloatArray, way_m: float, session: int, poses: FloatArray) -> None:
-        """Take the next keyframe: its submap (N, 3), way and session, and the present estimates (K, 4, 4) of all."""
+    def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> None:
+        """Take the next keyframe: its submap (N, 3), way and segment, and the present estimates (K, 4, 4) of all."""
         track = self.track
         self._keep(points)
-        self.track = Track(
-            np.asarray(poses, dtype=np.float64), np.append(track.way_m, way_m), np.append(track.session, session)
-        )
+        way_m_all, segments = np.append(track.way_m, way_m), np.append(track.segment, segment)
+        self.track = Track(poses, way_m_all, segments, track.drift_rates)
 
-    def state(self) -> State:
-        """The present estimates; what is kept of submaps follows from them."""
-        track = self.track
-        return {"T_world_lidar": track.T_world_lidar, "way_m": track.way_m, "session": track.session}
+    def rebuild(self, submaps: Iterable[FloatArray]) -> None:
+        """Go on, after the estimates were restored, with the points (N, 3) of all submaps.
 
-    def restore(self, saved: Saved, submaps: Iterable[FloatArray]) -> None:
-        """Go on from a state, and the points (N, 3) of all submaps there were."""
+        Raises:
+            ValueError: there are more or fewer than estimates.
+        """
         for points in submaps:
             self._keep(points)
-        count = len(self)
-        self.track = Track(
-            saved.array("T_world_lidar", (count, 4, 4)),
-            saved.array("way_m", (count,)),
-            saved.array("session", (count,), np.int64),
-        )
+        if len(self) != len(self.track.way_m):
+            raise ValueError(f"{len(self.track.way_m)} keyframes have {len(self)} submaps")
 
     def _keep(self, points: FloatArray) -> None:
-        config = self._config
-        patch = make_patch(points, config.min_range_m, config.max_range_m, config.cells_per_range, config.max_points)
-        if self._radius_m is None and len(patch):
-            self._radius_m = _RADIUS_PER_RANGE * patch.range_m
-        self._places.add(Drawing.of(patch).signature(self.radius_m))
-        self.patches.append(patch)
+        submap = SparseSubmap.of(points, self._config.max_range_m)
+        if self._radius_m is None and len(submap):
+            self._radius_m = _RADIUS_PER_RANGE * submap.range_m
+        self._descriptors.append(BirdEyeView.of(submap).descriptor(self.radius_m))
+        self.submaps.append(submap)
 
-    def place(self, index: int) -> Place:
-        """A keyframe with those before and after it."""
-        reach, session = self._config.neighbours, self.track.session
-        around = [
-            i
-            for i in range(max(0, index - reach), min(len(self.patches), index + reach + 1))
-            if i != index and session[i] == session[index]
-        ]
-        track = self.track
-        return Place.join(
-            self.patches[index],
-            [(track.between(index, i), self.patches[i]) for i in around],
+    def cloud(self, index: int) -> SubmapCloud:
+        """A keyframe with those before and after it in its segment."""
+        track, last = self.track, len(self) - 1
+        reach = range(max(0, index - _NEIGHBOURS), min(last, index + _NEIGHBOURS) + 1)
+        around = [i for i in reach if i != index and track.segment[i] == track.segment[index]]
+        return SubmapCloud.join(
+            self.submaps[index],
+            [(track.between(index, i), self.submaps[i]) for i in around],
             [float(track.way_m[i] - track.way_m[index]) for i in around],
-            self._config.drift_rates,
+            track.drift_rates,
         )
 
     def candidates(self, index: int) -> Iterator[Candidate]:
-        """Where the keyframe may lie, the likeliest first."""
-        track, config, patch = self.track, self._config, self.patches[index]
+        """Candidates for a keyframe, the likeliest first."""
+        track = self.track
+        min_way_m = self._config.min_way_m
+        if min_way_m is None:
+            min_way_m = max(_MIN_WAY_M, _MIN_WAY_RANGES * self.submaps[index].range_m)
         others = np.arange(index)
-        elsewhere = track.session[others] != track.session[index]
-        min_way_m = max(config.min_way_m, config.min_way_ranges * patch.range_m)
+        elsewhere = track.segment[others] != track.segment[index]
         others = others[elsewhere | (track.way_m[index] - track.way_m[others] > min_way_m)]
-        if not len(others):
-            return
-        yield from self._nearby(index, others)
-        yield from self._alike(index, others)
+        if len(others):
+            yield from self._nearby(index, others)
+            yield from self._alike(index, others)
+
+    def _compare(self, view: BirdEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        return compare(view.descriptor(self.radius_m), np.stack([self._descriptors[i] for i in others]))
 
     def _nearby(self, index: int, others: NDArray[np.intp]) -> Iterator[Candidate]:
-        """Earlier keyframes of the session within reach of the estimate."""
-        track, config, patch = self.track, self._config, self.patches[index]
-        others = others[track.session[others] == track.session[index]]
-        rotation, translation = track.drift(others, index, config)
+        """Earlier keyframes of the segment within reach of the estimate."""
+        track, submap = self.track, self.submaps[index]
+        others = others[track.segment[others] == track.segment[index]]
+        rotation, translation = track.drift(others, index)
         distance = np.linalg.norm(track.T_world_lidar[others, :3, 3] - track.T_world_lidar[index, :3, 3], axis=1)
-        within = distance < patch.range_m + 2.0 * translation
-        others = others[within]
-        rotation, translation, distance = (values[within] for values in (rotation, translation, distance))
-        if not len(others) or not config.nearby_candidates:
+        within = distance < submap.range_m + 2.0 * translation
+        if not within.any():
             return
-        source = Drawing.of(patch)
-        similarity, _ = self._places.compare(source.signature(self.radius_m), others)
-        # Near is what counts as long as drift is little, how it looks when it is much.
-        cost = distance / (patch.range_m + translation) - similarity
-        for k in _spread(others, cost, config.nearby_candidates):
+        others, rotation, translation, distance = (v[within] for v in (others, rotation, translation, distance))
+        source = BirdEyeView.of(submap)
+        similarity, _ = self._compare(source, others)
+        # The nearest as long as drift is little, the most similar when it is much.
+        cost = distance / (submap.range_m + translation) - similarity
+        for k in _spread(others, cost, _NEARBY_CANDIDATES):
             estimate = track.between(int(others[k]), index)
-            target = Drawing.of(self.patches[others[k]])
+            target = BirdEyeView.of(self.submaps[others[k]])
             level = target.R_level_lidar @ estimate[:3, :3] @ source.R_level_lidar.T
             half = max(_YAW_MIN, _YAW_SIGMAS * float(rotation[k]))
             yaws = np.arctan2(level[1, 0], level[0, 0]) + np.linspace(-half, half, _YAW_TRIES)
-            expected = Expected((target.R_level_lidar @ estimate[:3, 3])[:2], 2.0 * float(translation[k]))
-            guess, _ = lay_over(target, source, yaws, self.radius_m, expected)
-            yield Candidate(int(others[k]), "nearby", guess)
+            expected_xy = (target.R_level_lidar @ estimate[:3, 3])[:2]
+            guess, _ = align(target, source, yaws, self.radius_m, expected_xy, 2.0 * float(translation[k]))
+            yield Candidate(int(others[k]), False, guess)
 
     def _alike(self, index: int, others: NDArray[np.intp]) -> list[Candidate]:
-        """Earlier keyframes that look alike; those of other sessions may hang upside down."""
-        config, patch, session = self._config, self.patches[index], self.track.session
+        """Earlier keyframes with similar descriptors; those of other segments may hang upside down."""
+        submap, segment = self.submaps[index], self.track.segment
         found: list[tuple[float, Candidate]] = []
         for upside_down in (False, True):
-            chosen = others[session[others] != session[index]] if upside_down else others
-            if not len(chosen) or not config.appearance_candidates:
+            chosen = others[segment[others] != segment[index]] if upside_down else others
+            if not len(chosen):
                 continue
-            source = Drawing.of(patch, upside_down)
-            similarity, turn = self._places.compare(source.signature(self.radius_m), chosen)
-            for k in _spread(chosen, -similarity, 2 * config.appearance_candidates):
-                if similarity[k] < config.min_similarity:
+            source = BirdEyeView.of(submap, upside_down)
+            similarity, turn = self._compare(source, chosen)
+            for k in _spread(chosen, -similarity, 2 * _APPEARANCE_CANDIDATES):
+                if similarity[k] < _MIN_SIMILARITY:
                     break
-                yaws = turn[k] + np.array([0.0, np.pi])
-                guess, score = lay_over(Drawing.of(self.patches[chosen[k]]), source, yaws, self.radius_m)
-                found.append((score, Candidate(int(chosen[k]), "appearance", guess)))
+                target = BirdEyeView.of(self.submaps[chosen[k]])
+                guess, score = align(target, source, turn[k] + np.array([0.0, np.pi]), self.radius_m)
+                found.append((score, Candidate(int(chosen[k]), True, guess)))
         found.sort(key=lambda pair: -pair[0])
-        plausible = [(score, c) for score, c in found if not self._beyond_drift_at(c.index, index, c.T_first_second)]
+        plausible = [(score, candidate) for score, candidate in found if self._explained_by_drift(candidate, index)]
         if self._is_ambiguous(plausible, index):
             return []
-        return [candidate for _, candidate in plausible[: config.appearance_candidates]]
+        return [candidate for _, candidate in plausible[:_APPEARANCE_CANDIDATES]]
 
     def _is_ambiguous(self, found: list[tuple[float, Candidate]], index: int) -> bool:
-        """Whether a keyframe looks nearly as much like somewhere else as it does like the first of several."""
+        """Whether a second place in the segment of the best candidate has nearly its score."""
         if not found:
             return False
-        track, range_m = self.track, self.patches[index].range_m
+        track, range_m = self.track, self.submaps[index].range_m
         score, best = found[0]
         for other_score, other in found[1:]:
-            if track.session[other.index] != track.session[best.index]:
+            if track.segment[other.index] != track.segment[best.index] or other_score <= _AMBIGUOUS * score:
                 continue
             between = inverse(best.T_first_second) @ track.between(best.index, other.index) @ other.T_first_second
-            _, drift_m = track.drift(np.array([best.index]), other.index, self._config)
-            elsewhere = np.linalg.norm(between[:3, 3]) > 2.0 * _ROUGH_RANGES * range_m + 2.0 * drift_m[0]
-            if elsewhere and other_score > _AMBIGUOUS * score:
+            apart_m = 2.0 * _ROUGH_RANGES * range_m + 2.0 * track.drift_m(best.index, other.index)
+            if np.linalg.norm(between[:3, 3]) > apart_m:
                 return True
         return False
 
-    def _beyond_drift_at(self, first: int, second: int, T_first_second: FloatArray) -> bool:
-        """Whether drift does not explain even a rough guess."""
-        rough = np.diag(np.repeat([_ROUGH_RAD**2, self.patches[second].range_m ** 2 * _ROUGH_RANGES**2], 3))
-        link = Link(first, second, T_first_second, rough)
-        return bool(beyond_drift(link, self.track, most_sigmas("appearance", self._config), self._config))
+    def _explained_by_drift(self, candidate: Candidate, second: int) -> bool:
+        rough = np.repeat([_ROUGH_RAD**2, (_ROUGH_RANGES * self.submaps[second].range_m) ** 2], 3)
+        link = RelativePose(candidate.index, second, candidate.T_first_second, np.diag(rough))
+        return not objection_to_drift(link, True, self.track)
 
 
 def _spread(indices: NDArray[np.intp], cost: FloatArray, count: int) -> list[int]:
     """Which few cost least, no two of them next to one another."""
     chosen: list[int] = []
     for k in np.argsort(cost, kind="stable"):
+        if len(chosen) == count:
+            break
         if all(abs(int(indices[k]) - int(indices[c])) >= _APART for c in chosen):
             chosen.append(int(k))
-            if len(chosen) == count:
-                break
     return chosen

@@ -1,203 +1,109 @@
-"""Loop closures: each new keyframe is held against earlier ones near it or like it, and what fits is judged.
+"""Loop detection: candidates for each new keyframe, verified one by one, accepted when they are consistent.
 
-Precision comes before recall: a false closure tears a map apart, a missed one leaves it as good as it was. What drift
-cannot explain is not believed within a session; where tracking was lost, go on with a new session number.
+Precision comes before recall: a false closure tears a map apart, a missed one leaves it as good as it was. A closure
+that drift cannot explain is rejected within a segment; where tracking was lost, a new segment begins.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State, stack
-from mapping.loops.candidates import Candidate, FoundBy, Keyframes, most_sigmas
-from mapping.loops.consistency import Link, beyond_drift, close_circle
-from mapping.loops.loop_config import LoopConfig
-from mapping.loops.verification import Verification, verify
+from lidarslam.core.state import Stateful
+from mapping.config import LoopConfig
+from mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
+from mapping.loops.closure import CHI_SQUARED_99, LoopClosure
+from mapping.loops.verification import MIN_INLIERS, Verification, verify
 
-Verdict = Literal["accepted", "rejected"]
-
-# Circles that may be off by more than this, of the median range, tell nothing.
-_TELLING_RANGES = 0.25
-# Places found by how they look need so many times the agreement of what contradicts them, of which the last count.
+# Way after a closure before the next is looked for: another would repeat it.
+_SPACING_M = 2.0
+# A closure near the estimate needs no other while drift is less than this part of the median range.
+_ALONE_RANGES = 0.5
+# Any other needs so many consistent ones, spread over this way, in median ranges.
+_CONSISTENT, _SPAN_RANGES = 2, 1.0
+# Way after which a closure that no other is consistent with is rejected.
+_PENDING_M = 100.0
+# A cycle whose standard deviation exceeds this part of the median range closes whatever the links are.
+_SIGNIFICANT_RANGES = 0.25
+# A closure by appearance needs so many times the support of its rivals, of which the last count.
 _OUTVOTED = 3
 _RIVALS = 5
-# A closure is held against at most so many of those before it.
+# A closure is compared with at most so many of those before it.
 _MEMORY = 40
-# What is saved of a closure beside its arrays.
-_COLUMNS = (
-    "first", "second", "overlap", "residual_m", "inlier_ratio", "found_by", "consistent", "verdict", "reason",
-)  # fmt: skip
+_ALONE = "no other closure agrees"
 
 
-@dataclass(frozen=True, eq=False)
-class Submap:
-    """What was seen around a keyframe.
+class LoopDetector(Stateful):
+    """Keeps a sparse submap and a descriptor of every keyframe, and finds loop closures among them."""
 
-    Attributes:
-        index: of the keyframe, from 0 without gaps, over all sessions.
-        session: which recording; keyframes of one follow one another.
-        way_m: path length from the session's start.
-        points: (N, 3) in the keyframe's LiDAR frame, compensated and thinned.
-    """
-
-    index: int
-    session: int
-    way_m: float
-    points: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class LoopClosure:
-    """One place seen twice, or said to be.
-
-    Attributes:
-        first, second: the keyframes; the second is the later one.
-        T_first_second: (4, 4).
-        covariance: (6, 6) of xi in `T_true = T_first_second @ exp(xi)`, rotation first.
-        overlap: 0 to 1, share of what each sees of the other that fits; the worse side.
-        residual_m: root mean square distance of what fits.
-        inlier_ratio: share of the second's points that fit.
-        found_by: by the estimate, or by how the place looks.
-        consistent: how many other closures agree.
-        verdict, reason: whether to believe it; why not.
-    """
-
-    first: int
-    second: int
-    T_first_second: FloatArray
-    covariance: FloatArray
-    overlap: float
-    residual_m: float
-    inlier_ratio: float
-    found_by: FoundBy
-    consistent: int
-    verdict: Verdict
-    reason: str
-
-    @property
-    def link(self) -> Link:
-        """As consistency sees it."""
-        return Link(self.first, self.second, self.T_first_second, self.covariance)
-
-
-def closures_state(closures: Sequence[LoopClosure]) -> State:
-    """All of several closures, column by column: an array of them is written sooner than arrays of each."""
-    state: State = {name: [getattr(closure, name) for closure in closures] for name in _COLUMNS}
-    state["T_first_second"] = stack([closure.T_first_second for closure in closures], (4, 4))
-    state["covariance"] = stack([closure.covariance for closure in closures], (6, 6))
-    return state
-
-
-def restored_closures(saved: Saved) -> list[LoopClosure]:
-    """The closures with a state."""
-    firsts = saved.integers("first")
-    T_first_second = saved.array("T_first_second", (len(firsts), 4, 4))
-    covariance = saved.array("covariance", (len(firsts), 6, 6))
-    found_by, verdicts = saved.texts("found_by"), saved.texts("verdict")
-    if not (set(found_by) <= set(get_args(FoundBy)) and set(verdicts) <= set(get_args(Verdict))):
-        raise saved.refuse(f"closures found by {set(found_by)} were {set(verdicts)}")
-    columns = (
-        firsts, saved.integers("second"), T_first_second, covariance, saved.numbers("overlap"),
-        saved.numbers("residual_m"), saved.numbers("inlier_ratio"), found_by, saved.integers("consistent"), verdicts,
-        saved.texts("reason"),
-    )  # fmt: skip
-    if {len(column) for column in columns} != {len(firsts)}:
-        raise saved.refuse("closures have columns of several lengths")
-    return [LoopClosure(*values) for values in zip(*columns, strict=True)]
-
-
-class LoopDetector:
-    """Keeps what is needed of every keyframe, and finds closures among them."""
+    _database: KeyframeDatabase
+    _accepted: list[LoopClosure]
+    _pending: list[LoopClosure]
 
     def __init__(self, config: LoopConfig) -> None:
         self._config = config
-        self._kept = Keyframes(config)
-        self._accepted: list[LoopClosure] = []
-        self._pending: list[LoopClosure] = []
+        self._database = KeyframeDatabase(config)
+        self._accepted, self._pending = [], []
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of what is kept."""
-        return self._kept.nbytes
+    def rebuild(self, submaps: Iterable[FloatArray]) -> None:
+        """See `KeyframeDatabase.rebuild`."""
+        self._database.rebuild(submaps)
 
     def cell_m(self, index: int) -> float:
-        """The size of detail that suits what a keyframe saw."""
-        return self._kept.patches[index].cell_m
+        """The size of detail that suits a keyframe's submap."""
+        return self._database.submaps[index].cell_m
 
-    def state(self) -> State:
-        """The closures, and the estimates of keyframes; not what is kept of their submaps."""
-        return {
-            "keyframes": self._kept.state(),
-            "accepted": closures_state(self._accepted),
-            "pending": closures_state(self._pending),
-        }
-
-    def restore(self, saved: Saved, submaps: Iterable[FloatArray]) -> None:
-        """Go on from a state, and the points (N, 3) of all submaps there were."""
-        self._kept.restore(saved.part("keyframes"), submaps)
-        self._accepted = restored_closures(saved.part("accepted"))
-        self._pending = restored_closures(saved.part("pending"))
-
-    def add(self, submap: Submap, poses: FloatArray) -> list[LoopClosure]:
-        """Take the next keyframe, and say which closures are decided by now.
+    def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> list[LoopClosure]:
+        """Take the next keyframe, and return the closures that are accepted or rejected by now.
 
         Args:
-            submap: of the keyframe.
+            points: (N, 3) its submap, in its LiDAR frame, compensated and thinned.
+            way_m: path length from the recording's start.
+            segment: stretch of continuous tracking; keyframes of one follow one another.
             poses: (K, 4, 4) `T_world_lidar` of all keyframes, this one last, as they are estimated now.
-
-        Raises:
-            ValueError: keyframes do not come one by one, or the poses are not theirs.
         """
-        kept = self._kept
-        if submap.index != len(kept) or poses.shape != (submap.index + 1, 4, 4):
-            raise ValueError(f"expected keyframe {len(kept)} with as many poses, got {submap.index}")
-        kept.add(submap.points, submap.way_m, submap.session, poses)
-        decided = self._drop_old(submap)
-        if len(kept.patches[-1]) < self._config.min_inliers or self._is_soon(submap):
-            return decided
-        return decided + self._look(submap.index)
+        self._database.add(points, way_m, segment, poses)
+        decided = self._drop_old(way_m, segment)
+        if len(self._database.submaps[-1]) >= MIN_INLIERS and not self._is_soon(way_m, segment):
+            decided += self._look(len(self._database) - 1)
+        return decided
 
     def finish(self) -> list[LoopClosure]:
-        """Closures that nothing agreed with to the end, as rejected."""
-        left = [self._refused(closure, "no other closure agrees") for closure in self._pending]
-        self._pending = []
-        return left
+        """Closures that no other agreed with to the end, as rejected."""
+        left, self._pending = self._pending, []
+        return [replace(closure, reason=_ALONE) for closure in left]
 
-    def _is_soon(self, submap: Submap) -> bool:
-        """Whether the last closure is so recent that another would say the same."""
+    def _is_soon(self, way_m: float, segment: int) -> bool:
+        """Whether the last closure is so recent that another would repeat it."""
         if self._pending or not self._accepted:
             return False
-        last, track = self._accepted[-1].second, self._kept.track
-        return bool(track.session[last] == submap.session and submap.way_m - track.way_m[last] < self._config.spacing_m)
+        last, track = self._accepted[-1].second, self._database.track
+        return bool(track.segment[last] == segment and way_m - track.way_m[last] < _SPACING_M)
 
     def _look(self, index: int) -> list[LoopClosure]:
-        """Verify a keyframe's candidates, and decide on those that fit."""
+        """Verify a keyframe's candidates, and decide on those that pass."""
         decided: list[LoopClosure] = []
-        source = self._kept.place(index)
-        for candidate in self._kept.candidates(index):
-            found = verify(self._kept.place(candidate.index), source, candidate.T_first_second)
+        source = self._database.cloud(index)
+        for candidate in self._database.candidates(index):
+            found = verify(self._database.cloud(candidate.index), source, candidate.T_first_second)
             if found is None:
                 continue
             closure = _closure(candidate, index, found)
-            objection = found.objection(self._config) or self._beyond_drift(closure)
-            if objection:
-                decided.append(self._refused(closure, objection))
+            reason = found.objection(self._config.min_overlap)
+            reason = reason or objection_to_drift(closure, closure.by_appearance, self._database.track)
+            if reason:
+                decided.append(replace(closure, reason=reason))
                 continue
             self._pending.append(closure)
-            accepted = self._decide()
+            accepted = self._accept_supported()
             decided += accepted
             if any(one.second == index for one in accepted):
                 break
         return decided
 
-    def _beyond_drift(self, closure: LoopClosure) -> str:
-        return beyond_drift(closure.link, self._kept.track, most_sigmas(closure.found_by, self._config), self._config)
-
-    def _decide(self) -> list[LoopClosure]:
-        """Accept what enough others support, again and again until nothing changes."""
+    def _accept_supported(self) -> list[LoopClosure]:
+        """Accept pending closures that have enough support, until nothing changes."""
         accepted: list[LoopClosure] = []
         while True:
             for closure in self._pending:
@@ -211,53 +117,44 @@ class LoopDetector:
             self._accepted.append(accepted[-1])
 
     def _support(self, closure: LoopClosure) -> tuple[bool, int]:
-        """Whether to believe a closure, and how many others agree; those not decided upon count too."""
-        config, track = self._config, self._kept.track
-        range_m = self._kept.patches[closure.second].range_m
-        agreeing, against = self._judged_by_others(closure)
-        # What disagrees weighs as much as agrees with it in turn: a wrong closure mostly stands alone. Where places
-        # repeat, wrong ones agree among themselves; then the estimate is what to go by.
-        rival = max((len(self._judged_by_others(other)[0]) for other in against[-_RIVALS:]), default=0)
-        if against and rival * (1 if closure.found_by == "nearby" else _OUTVOTED) >= max(len(agreeing), 1):
+        """Whether a closure is accepted, and the number of others that agree, pending ones too."""
+        track, range_m = self._database.track, self._database.submaps[closure.second].range_m
+        agreeing, against = self._votes(closure)
+        # A rival has as much weight as it has support itself: a false closure mostly stands alone. Where places repeat,
+        # false ones agree among themselves; then the estimate decides.
+        rival = max((len(self._votes(other)[0]) for other in against[-_RIVALS:]), default=0)
+        if against and rival * (_OUTVOTED if closure.by_appearance else 1) >= max(len(agreeing), 1):
             return False, len(agreeing)
-        if track.session[closure.first] == track.session[closure.second]:
-            _, drift_m = track.drift(np.array([closure.first]), closure.second, config)
-            if closure.found_by == "nearby" and drift_m[0] < config.alone_ranges * range_m:
-                return True, len(agreeing)
-        places = track.way_m[[closure.second, *(other.second for other in agreeing)]]
-        spread = float(np.ptp(places)) >= config.agreeing_span_ranges * range_m
-        return len(agreeing) >= config.agreeing and (spread or not config.agreeing), len(agreeing)
+        if not closure.by_appearance and track.drift_m(closure.first, closure.second) < _ALONE_RANGES * range_m:
+            return True, len(agreeing)
+        ways_m = track.way_m[[closure.second, *(other.second for other in agreeing)]]
+        return len(agreeing) >= _CONSISTENT and float(np.ptp(ways_m)) >= _SPAN_RANGES * range_m, len(agreeing)
 
-    def _judged_by_others(self, closure: LoopClosure) -> tuple[list[LoopClosure], list[LoopClosure]]:
-        """Which others agree with a closure and which do not, of those near enough for that to tell."""
-        most_m = _TELLING_RANGES * self._kept.patches[closure.second].range_m
+    def _votes(self, closure: LoopClosure) -> tuple[list[LoopClosure], list[LoopClosure]]:
+        """Other closures that agree with one, and that contradict it, where their cycle is significant."""
+        track = self._database.track
+        most_m = _SIGNIFICANT_RANGES * self._database.submaps[closure.second].range_m
         agreeing: list[LoopClosure] = []
         against: list[LoopClosure] = []
         for other in [*self._accepted[-_MEMORY:], *self._pending[-_MEMORY:]]:
-            circle = (
-                None if other is closure else close_circle(closure.link, other.link, self._kept.track, self._config)
-            )
-            # A long way round closes whatever the links say.
-            if circle is not None and circle.sigma_m <= most_m:
-                (agreeing if circle.closes else against).append(other)
+            cycle = None if other is closure else track.close_cycle(closure, other)
+            if cycle is not None and cycle[1] <= most_m:
+                (agreeing if cycle[0] < CHI_SQUARED_99 else against).append(other)
         return agreeing, against
 
-    def _drop_old(self, submap: Submap) -> list[LoopClosure]:
-        """Closures that nothing agreed with for too long, as rejected."""
-        way_m, session = self._kept.track.way_m, self._kept.track.session
+    def _drop_old(self, way_m: float, segment: int) -> list[LoopClosure]:
+        """Closures that no other agreed with for too long, as rejected."""
+        track = self._database.track
         old = [
             c for c in self._pending
-            if session[c.second] != submap.session or submap.way_m - way_m[c.second] > self._config.pending_m
+            if track.segment[c.second] != segment or way_m - track.way_m[c.second] > _PENDING_M
         ]  # fmt: skip
         self._pending = [closure for closure in self._pending if closure not in old]
-        return [self._refused(closure, "no other closure agrees") for closure in old]
-
-    def _refused(self, closure: LoopClosure, reason: str) -> LoopClosure:
-        return replace(closure, verdict="rejected", reason=reason)
+        return [replace(closure, reason=_ALONE) for closure in old]
 
 
 def _closure(candidate: Candidate, second: int, found: Verification) -> LoopClosure:
     return LoopClosure(
         candidate.index, second, found.T_target_source, found.covariance, found.overlap, found.residual_m,
-        found.inlier_ratio, candidate.found_by, 0, "accepted", "",
+        found.inlier_ratio, candidate.by_appearance, 0, "",
     )  # fmt: skip

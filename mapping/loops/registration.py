@@ -1,108 +1,157 @@
-"""Lays one place on another: point-to-plane, and to lines what is thin, from coarse to fine."""
+"""Point-to-plane and point-to-line registration of sparse submaps, and the Gauss-Newton solver of refinement too."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, orthonormalize, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
-from mapping.loops.place import LINE, Patch
+from mapping.loops.sparse_submap import LINE, SparseSubmap
 
-# Reach of a pull and scale of its kernel, in cells, the share of the points, and the most steps, level after level.
+# Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.
 _LEVELS = ((12.0, 4.0, 4, 8), (6.0, 2.0, 2, 6), (4.0, 1.0, 1, 4), (3.0, 0.5, 1, 8))
 _SETTLED = 0.02  # of a cell
-_LEAST_AGREEMENT = 0.6  # cosine between normals of one surface
+# Cosine between normals of one surface.
+_LEAST_AGREEMENT = 0.6
 LINE_NOISE_M = 0.08
 _RANGE_NOISE_M = 0.02
-# Neighbouring points err together, and count for as much less.
+# Residuals of neighbouring points are correlated: so many count as one. Compared with true errors of simulated rounds.
 CORRELATION = 25.0
-# Where to start from is known this well at least; radians and metres.
+MIN_POINTS = 12
+# Standard deviations of a candidate's guess, radians and metres.
 GUESS_SIGMAS = np.array([0.2] * 3 + [2.0] * 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """A keyframe with its neighbours' points, in its LiDAR frame; what lies on no surface is left out.
+class NormalEquations:
+    """Hessian (6, 6) and gradient (6,) of half the squared residuals, for a motion from the right, rotation first."""
+
+    hessian: FloatArray
+    gradient: FloatArray
+
+    @classmethod
+    def of(cls, jacobian: FloatArray, residuals: FloatArray, information: FloatArray) -> "NormalEquations":
+        """Of residuals (M,) with their Jacobian (M, 6) and information (M,)."""
+        JW = jacobian * information[:, None]
+        return cls(JW.T @ jacobian, JW.T @ residuals)
+
+
+def geman_mcclure(residuals: FloatArray, scale: float) -> FloatArray:
+    """Weights of the robust kernel of Geman and McClure."""
+    return np.asarray((1.0 + (residuals / scale) ** 2) ** -2, dtype=np.float64)
+
+
+def gauss_newton(
+    linearise: Callable[[FloatArray], NormalEquations | None],
+    T: FloatArray,
+    prior: FloatArray,
+    prior_information: FloatArray,
+    most_steps: int,
+    lever_m: float,
+    settled_m: float,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Minimise from T (4, 4), with a prior (4, 4) of the given information (6, 6).
+
+    Returns:
+        The pose, and the Hessian (6, 6) with the prior; None where the correspondences are too few.
+    """
+    hessian = prior_information
+    for _ in range(most_steps):
+        system = linearise(T)
+        if system is None:
+            return None
+        hessian = system.hessian + prior_information
+        away = log(inverse(prior) @ T)
+        xi = np.asarray(np.linalg.solve(hessian, -system.gradient - prior_information @ away), dtype=np.float64)
+        T = T @ exp(xi)
+        if displacement_m(xi, lever_m) < settled_m:
+            break
+    return T, hessian
+
+
+@dataclass(frozen=True, eq=False)
+class SubmapCloud:
+    """A sparse submap united with its neighbours, in its keyframe's LiDAR frame; only points on planes and lines.
 
     Attributes:
-        patch: the keyframe's own.
+        submap: the keyframe's own.
         points, axes: (N, 3).
         tilt: (N,).
         is_line: (N,).
-        ahead_m: (N,) way from the keyframe to that which a point is of: neighbours lie where drifting estimates have
-            them, the farther the less exactly.
-        bend: how much a metre of that way may turn and shift them, standard deviations in radians and metres.
+        ahead_m: (N,) way from the keyframe to that which a point is of, where the drifting estimates place it.
+        drift_rates: standard deviations of that drift for each metre, radians and metres.
         middle_m: way on which a submap is drawn after its keyframe, on average.
         tree: of the points.
     """
 
-    patch: Patch
+    submap: SparseSubmap
     points: FloatArray
     axes: FloatArray
     tilt: FloatArray
     is_line: NDArray[np.bool_]
     ahead_m: FloatArray
-    bend: tuple[float, float]
+    drift_rates: tuple[float, float]
     middle_m: float
     tree: cKDTree
 
     @classmethod
     def join(
         cls,
-        patch: Patch,
-        neighbours: Sequence[tuple[FloatArray, Patch]] = (),
+        submap: SparseSubmap,
+        neighbours: Sequence[tuple[FloatArray, SparseSubmap]] = (),
         ways_m: Sequence[float] = (),
-        bend: tuple[float, float] = (0.0, 0.0),
-    ) -> "Place":
-        """Unite a keyframe with others, each with `T_keyframe_neighbour` (4, 4) and the way there; back is negative."""
-        parts = [(np.eye(4), patch), *neighbours]
-        used = [part.kinds > 0 for _, part in parts]
-        points = [transform_points(T, part.points[u].astype(float)) for u, (T, part) in zip(used, parts, strict=True)]
-        axes = [part.axes[u].astype(float) @ T[:3, :3].T for u, (T, part) in zip(used, parts, strict=True)]
-        together = np.concatenate(points)
-        kept = one_per_cell(together, 1.5 * patch.cell_m)
-        tilt = np.concatenate([part.tilt[u] for u, (_, part) in zip(used, parts, strict=True)]).astype(float)
-        is_line = np.concatenate([part.kinds[u] == LINE for u, (_, part) in zip(used, parts, strict=True)])
-        ahead_m = np.repeat([0.0, *(ways_m or [0.0] * len(neighbours))], [int(u.sum()) for u in used])
-        middle_m = 0.5 * min((abs(way_m) for way_m in ways_m), default=0.0)
-        together = together[kept]
-        unit = np.concatenate(axes)[kept]
+        drift_rates: tuple[float, float] = (0.0, 0.0),
+    ) -> "SubmapCloud":
+        """Unite with neighbours, each with `T_keyframe_neighbour` (4, 4) and the way there; back is negative."""
+        points, axes, tilt, is_line, ahead_m = [], [], [], [], []
+        for (T, part), way_m in zip([(np.eye(4), submap), *neighbours], [0.0, *ways_m], strict=True):
+            used = part.kinds > 0
+            points.append(transform_points(T, part.points[used].astype(float)))
+            axes.append(part.axes[used].astype(float) @ T[:3, :3].T)
+            tilt.append(part.tilt[used].astype(float))
+            is_line.append(part.kinds[used] == LINE)
+            ahead_m.append(np.full(len(points[-1]), way_m))
+        together, unit = np.concatenate(points), np.concatenate(axes)
+        kept = one_per_cell(together, 1.5 * submap.cell_m)
+        together, unit = together[kept], unit[kept]
         unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-12)
+        middle_m = 0.5 * min((abs(way_m) for way_m in ways_m), default=0.0)
         return cls(
-            patch,
-            together,
-            unit,
-            tilt[kept],
-            is_line[kept],
-            ahead_m[kept],
-            bend,
-            middle_m,
-            cKDTree(together, balanced_tree=False),
-        )
+            submap, together, unit, np.concatenate(tilt)[kept], np.concatenate(is_line)[kept],
+            np.concatenate(ahead_m)[kept], drift_rates, middle_m, cKDTree(together, balanced_tree=False),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Pulls:
-    """Source points (M, 3), in the source's frame, each pulled along a unit vector (M, 3) there by a residual (M,).
+class Correspondences:
+    """Residuals of points to planes, one each, and to lines, two each.
 
-    Ahead (M, 2) is of the target's and the source's keyframes, `bend` as in `Place`.
+    Attributes:
+        points: (M, 3) of the source, in its frame.
+        normals: (M, 3) directions of the residuals, in the source's frame.
+        residuals: (M,).
+        tilt: (M,) of the target's axes.
+        noise_m: (M,).
+        ahead_m: (M, 2) of the target's and the source's points.
+        drift_rates: as in `SubmapCloud`.
     """
 
     points: FloatArray
-    along: FloatArray
+    normals: FloatArray
     residuals: FloatArray
     tilt: FloatArray
     noise_m: FloatArray
     ahead_m: FloatArray
-    bend: tuple[float, float]
+    drift_rates: tuple[float, float]
 
     @property
-    def trust(self) -> FloatArray:
-        """(M,) how much a pull counts, beside one that is of both keyframes themselves."""
-        turned, shifted = self.bend
+    def weights(self) -> FloatArray:
+        """(M,) relative to a correspondence of both keyframes' own submaps: drift displaces neighbours."""
+        turned, shifted = self.drift_rates
         squared = shifted**2 + turned**2 * np.einsum("ij,ij->i", self.points, self.points)
         squared *= np.einsum("ij,ij->i", self.ahead_m, self.ahead_m)
         return np.asarray(self.noise_m**2 / (self.noise_m**2 + squared))
@@ -110,30 +159,44 @@ class Pulls:
     @property
     def jacobian(self) -> FloatArray:
         """(M, 6) for a motion of the source from the right, rotation first."""
-        return np.concatenate([np.cross(self.points, self.along), self.along], axis=1)
+        return np.concatenate([np.cross(self.points, self.normals), self.normals], axis=1)
 
 
-def register(target: Place, source: Place, T_target_source: FloatArray) -> FloatArray | None:
-    """Refine a guess (4, 4); None when too few points meet a surface."""
-    cell_m = max(target.patch.cell_m, source.patch.cell_m)
-    guess = T = T_target_source
-    for reach, scale, step, most in _LEVELS:
-        chosen = np.arange(0, len(source.points), step)
-        for _ in range(most):
-            pulls = pull(target, source, T, chosen, reach * cell_m)
-            if len(pulls.points) < 12:
-                return None
-            xi = _solve(pulls, scale * cell_m, log(inverse(guess) @ T))
-            T = T @ exp(xi)
-            if np.linalg.norm(xi[3:]) + source.patch.range_m * np.linalg.norm(xi[:3]) < _SETTLED * scale * cell_m:
-                break
+def register(target: SubmapCloud, source: SubmapCloud, guess: FloatArray) -> FloatArray | None:
+    """`T_target_source` (4, 4) from a guess, coarse to fine; None when too few points have correspondences."""
+    cell_m = max(target.submap.cell_m, source.submap.cell_m)
+    T, prior_information = guess, np.diag(GUESS_SIGMAS**-2)
+    for reach, kernel, step, most in _LEVELS:
+        scale_m = kernel * cell_m
+        linearise = partial(_linearise, target, source, np.arange(0, len(source.points), step), reach * cell_m, scale_m)
+        settled_m = _SETTLED * scale_m
+        found = gauss_newton(linearise, T, guess, prior_information, most, source.submap.range_m, settled_m)
+        if found is None:
+            return None
+        T, _ = found
     return orthonormalize(T)
 
 
-def nearest(
-    target: Place, source: Place, T: FloatArray, chosen: NDArray[np.intp], reach_m: float
+def _linearise(
+    target: SubmapCloud,
+    source: SubmapCloud,
+    chosen: NDArray[np.intp],
+    reach_m: float,
+    scale_m: float,
+    T_target_source: FloatArray,
+) -> NormalEquations | None:
+    found = correspondences(target, source, T_target_source, chosen, reach_m)
+    if len(found.points) < MIN_POINTS:
+        return None
+    information = found.weights * geman_mcclure(found.residuals, scale_m)
+    information /= CORRELATION * (found.noise_m**2 + (0.5 * scale_m) ** 2)
+    return NormalEquations.of(found.jacobian, found.residuals, information)
+
+
+def match(
+    target: SubmapCloud, source: SubmapCloud, T: FloatArray, chosen: NDArray[np.intp], reach_m: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs of source and target points within reach on what may be the same surface."""
+    """Pairs of source and target points within reach whose axes may be of the same surface."""
     distances, found = target.tree.query(
         transform_points(T, source.points[chosen]), distance_upper_bound=reach_m, workers=1
     )
@@ -146,27 +209,22 @@ def nearest(
     return s[alike], t[alike]
 
 
-def pull(target: Place, source: Place, T: FloatArray, chosen: NDArray[np.intp], reach_m: float) -> Pulls:
-    """One pull a plane, and two across each line."""
-    s, t = nearest(target, source, T, chosen, reach_m)
+def correspondences(
+    target: SubmapCloud, source: SubmapCloud, T: FloatArray, chosen: NDArray[np.intp], reach_m: float
+) -> Correspondences:
+    """Of the chosen source points within reach, at `T_target_source` (4, 4)."""
+    s, t = match(target, source, T, chosen, reach_m)
     is_line = target.is_line[t]
     line = target.axes[t[is_line]]
     least = np.eye(3)[np.abs(line).argmin(axis=1)]
     across = np.cross(line, least)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    along = np.concatenate([target.axes[t[~is_line]], across, np.cross(line, across)])
+    normals = np.concatenate([target.axes[t[~is_line]], across, np.cross(line, across)])
     s = np.concatenate([s[~is_line], s[is_line], s[is_line]])
     t = np.concatenate([t[~is_line], t[is_line], t[is_line]])
-    residuals = np.einsum("ij,ij->i", transform_points(T, source.points[s]) - target.points[t], along)
+    residuals = np.einsum("ij,ij->i", transform_points(T, source.points[s]) - target.points[t], normals)
     noise_m = np.where(target.is_line[t], LINE_NOISE_M, _RANGE_NOISE_M)
     ahead_m = np.stack([target.ahead_m[t], source.ahead_m[s]], axis=1)
-    return Pulls(source.points[s], along @ T[:3, :3], residuals, target.tilt[t], noise_m, ahead_m, source.bend)
-
-
-def _solve(pulls: Pulls, scale_m: float, away: FloatArray) -> FloatArray:
-    """A step (6,) of Gauss-Newton with the kernel of Geman and McClure, held a little to where it began."""
-    weights = pulls.trust / ((1.0 + (pulls.residuals / scale_m) ** 2) ** 2 * (pulls.noise_m**2 + (0.5 * scale_m) ** 2))
-    J = pulls.jacobian
-    JW = J * (weights / CORRELATION)[:, None]
-    held = np.diag(GUESS_SIGMAS**-2)
-    return np.asarray(np.linalg.solve(JW.T @ J + held, -(JW.T @ pulls.residuals) - held @ away), dtype=np.float64)
+    return Correspondences(
+        source.points[s], normals @ T[:3, :3], residuals, target.tilt[t], noise_m, ahead_m, source.drift_rates
+    )

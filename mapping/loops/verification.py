@@ -1,9 +1,7 @@
-"""Lays one place on another, and says whether they are the same.
+"""Geometric verification of a loop candidate: registration, then inliers among the points that either side sees.
 
-Registration is point-to-plane, and to lines what is thin, from coarse to fine. It is judged from both sides by what
-each could see of the other: in a row of like rooms, and along any corridor, most surfaces fit though the pose is wrong;
-what would tell does not. So of what all points say about each direction of translation, that which fits must be most at
-the worst direction too.
+In a row of like rooms, and along any corridor, most surfaces fit though the pose is wrong. So the inliers must carry
+most of the information on every direction of translation, the weakest too.
 """
 
 from dataclasses import dataclass
@@ -13,161 +11,167 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from mapping.degeneracy import find_degeneracy
-from mapping.loops.loop_config import LoopConfig
-from mapping.loops.place import sight_cells
-from mapping.loops.registration import CORRELATION, GUESS_SIGMAS, LINE_NOISE_M, Place, Pulls, nearest, pull, register
+from mapping.loops.registration import (
+    CORRELATION,
+    GUESS_SIGMAS,
+    LINE_NOISE_M,
+    MIN_POINTS,
+    Correspondences,
+    NormalEquations,
+    SubmapCloud,
+    correspondences,
+    match,
+    register,
+)
 
-# A point fits that lies so near its surface, in cells and at least in metres, and so near to what was seen of it.
-_FITS = 0.3
-_FITS_MIN_M = 0.06
+# Largest residual of an inlier, in cells and at least in metres, and largest distance of its correspondence.
+_GATE = 0.3
+_GATE_MIN_M = 0.06
 _REACH = 4.0
 _REACH_PER_RANGE = 0.06
-_FLOOR_SIGMAS = np.array([np.deg2rad(0.15)] * 3 + [0.015] * 3)
-# Points tell about a direction that face it by more than noise would make them; so many must, for it to count.
+# No closure is more precise than this: radians and metres.
+_LEAST_SIGMAS = np.array([np.deg2rad(0.15)] * 3 + [0.015] * 3)
+# Points inform about a direction that their normals face by more than noise would; so many must, for it to count.
 _FACING = 0.3
 _LEAST_FACING = 10
-# Where less than this share of what tells about a direction is in view, too little is known of it.
+# Where less than this share of a direction's information is in view, too little is known of it.
 _MUCH_IN_VIEW = 0.3
+# Limits of a closure, chosen on the simulated rounds of `benchmarks/loop_closures.py`, where none accepted was false.
+_MIN_INFORMATION = 0.55
+_MIN_INLIER_RATIO = 0.2
+MIN_INLIERS = 150
+_MAX_SIGMA_M = 0.25
+_MAX_SIGMA_DEG = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """How one place lies on another.
+    """A registered candidate.
 
     Attributes:
         T_target_source: (4, 4).
-        covariance: (6, 6) of xi in `T_true = T_target_source @ exp(xi)`; large along what nothing tells.
-        overlap: of what each side sees of the other, the share that fits; the worse side.
-        explained: the same of what tells about the direction of translation that fares worst.
-        residual_m: root mean square distance of what fits.
-        inlier_ratio: share of the source's points that fit.
-        inliers: how many they are.
-        undetermined: names of the directions of motion that nothing tells.
+        covariance: (6, 6) of xi in `T_true = T_target_source @ exp(xi)`; that of the guess along degenerate directions.
+        overlap: inliers among the points that either side sees of the other; the worse side.
+        information: the same, weighed by information on the direction of translation that fares worst.
+        residual_m: root mean square residual of the inliers.
+        inlier_ratio: inliers among the source's points.
+        inliers: their number.
+        degenerate: names of the degenerate directions of motion.
     """
 
     T_target_source: FloatArray
     covariance: FloatArray
     overlap: float
-    explained: float
+    information: float
     residual_m: float
     inlier_ratio: float
     inliers: int
-    undetermined: tuple[str, ...]
+    degenerate: tuple[str, ...]
 
-    def objection(self, config: LoopConfig) -> str:
-        """Why the two are not believed to be one place; empty when they are."""
-        sigmas = (
-            np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]),
-            np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]),
+    def objection(self, min_overlap: float) -> str:
+        """Why it is rejected; empty when it is not."""
+        sigma_m, sigma_rad = (
+            np.sqrt(np.linalg.eigvalsh(self.covariance[part, part])[-1]) for part in (slice(3, 6), slice(0, 3))
         )
-        if self.inliers < config.min_inliers:
-            return f"only {self.inliers} points fit"
-        if self.inlier_ratio < config.min_inlier_ratio:
-            return f"only {100.0 * self.inlier_ratio:.0f} % of the points fit"
-        if self.overlap < config.min_overlap:
-            return f"only {100.0 * self.overlap:.0f} % of what each sees of the other fits"
-        if self.explained < config.min_explained:
-            return f"only {100.0 * self.explained:.0f} % of what would tell fits"
-        if sigmas[0] > config.max_sigma_m or sigmas[1] > np.deg2rad(config.max_sigma_deg):
-            names = ", ".join(self.undetermined) or "the pose"
-            return f"too little tells {names}: {sigmas[0]:.2f} m and {np.rad2deg(sigmas[1]):.1f} degrees unsure"
+        if self.inliers < MIN_INLIERS:
+            return f"only {self.inliers} inliers"
+        if self.inlier_ratio < _MIN_INLIER_RATIO:
+            return f"only {100.0 * self.inlier_ratio:.0f} % of the points are inliers"
+        if self.overlap < min_overlap:
+            return f"only {100.0 * self.overlap:.0f} % of the points in view are inliers"
+        if self.information < _MIN_INFORMATION:
+            return f"inliers have only {100.0 * self.information:.0f} % of the information on the weakest direction"
+        if sigma_m > _MAX_SIGMA_M or sigma_rad > np.deg2rad(_MAX_SIGMA_DEG):
+            names = ", ".join(self.degenerate) or "the pose"
+            return f"degenerate in {names}: standard deviation {sigma_m:.2f} m, {np.rad2deg(sigma_rad):.1f} degrees"
         return ""
 
 
-def verify(target: Place, source: Place, T_target_source: FloatArray) -> Verification | None:
-    """Lay the source on the target from a guess (4, 4), and judge; None when nothing meets."""
-    if min(len(target.points), len(source.points)) < 12:
+def verify(target: SubmapCloud, source: SubmapCloud, guess: FloatArray) -> Verification | None:
+    """Register the source on the target from a guess (4, 4), and evaluate; None where correspondences are too few."""
+    if min(len(target.points), len(source.points)) < MIN_POINTS:
         return None
-    T = register(target, source, T_target_source)
-    return None if T is None else judge(target, source, T)
+    T = register(target, source, guess)
+    return None if T is None else evaluate(target, source, T)
 
 
-def judge(target: Place, source: Place, T_target_source: FloatArray) -> Verification:
-    """How well the source lies on the target."""
+def evaluate(target: SubmapCloud, source: SubmapCloud, T_target_source: FloatArray) -> Verification:
+    """Inliers and covariance at a pose (4, 4)."""
     T = T_target_source
     forward, backward = _Fit.of(target, source, T), _Fit.of(source, target, inverse(T))
-    cell_m = max(target.patch.cell_m, source.patch.cell_m)
-    pulls = pull(target, source, T, np.flatnonzero(forward.fits), _REACH * cell_m)
-    covariance, names = _covariance(pulls, np.array([target.middle_m, source.middle_m]))
-    # Both sides measure the same; what the nearer one of them makes of it is as good as any.
+    cell_m = max(target.submap.cell_m, source.submap.cell_m)
+    found = correspondences(target, source, T, np.flatnonzero(forward.inliers), _REACH * cell_m)
+    residual_m = float(np.sqrt(np.mean(found.residuals**2))) if len(found.residuals) else np.inf
+    covariance, names = _covariance(found, residual_m, np.array([target.middle_m, source.middle_m]))
     return Verification(
-        T, covariance, min(forward.overlap, backward.overlap), min(forward.explained, backward.explained),
-        float(np.sqrt(np.mean(pulls.residuals**2))) if len(pulls.residuals) else np.inf,
-        float(forward.fits.mean()), int(forward.fits.sum()), names,
+        T, covariance, min(forward.overlap, backward.overlap), min(forward.information, backward.information),
+        residual_m, float(forward.inliers.mean()), int(forward.inliers.sum()), names,
     )  # fmt: skip
 
 
-def _covariance(pulls: Pulls, middles_m: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """(6, 6) from the normal equations, and what they leave open; along that, nothing is said but the guess."""
-    variances = np.maximum(pulls.noise_m, np.sqrt(np.mean(pulls.residuals**2)) if len(pulls.points) else 1.0) ** 2
-    weights = pulls.trust / variances
-    lever_m = float(np.sqrt(np.mean(np.sum(pulls.points**2, axis=1)))) if len(pulls.points) else 1.0
-    open_ = find_degeneracy(pulls.jacobian, weights, pulls.tilt, lever_m)
-    scale = np.array([lever_m] * 3 + [1.0] * 3)
-    D = open_.directions
-    told = np.eye(6) - (D / scale).T @ (D * scale)
-    J = pulls.jacobian @ told
-    information = (J * (weights / CORRELATION)[:, None]).T @ J + np.diag(GUESS_SIGMAS**-2)
-    besides = _FLOOR_SIGMAS**2 + _bend_variances(pulls, weights, middles_m)
-    return np.linalg.inv(information) + np.diag(besides), open_.names
-
-
-def _bend_variances(pulls: Pulls, weights: FloatArray, middles_m: FloatArray) -> FloatArray:
-    """(6,) of where neighbours lie: what drift does along a stretch is alike, and does not average out but ahead.
+def _covariance(found: Correspondences, residual_m: float, middles_m: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+    """(6, 6) from the normal equations without their degenerate directions, and the names of these.
 
     Middles (2,) are of the target's and the source's submaps.
     """
-    if not len(weights):
-        return np.zeros(6)
-    ways_m = np.average(pulls.ahead_m, axis=0, weights=weights) + middles_m
-    turned, shifted = pulls.bend
-    # Drift is told as the length of an error; each axis has a third of its square.
-    return np.repeat([turned**2, shifted**2], 3) * float(ways_m @ ways_m) / 3.0
+    weights = found.weights / np.maximum(found.noise_m, residual_m) ** 2
+    lever_m = float(np.sqrt(np.mean(np.sum(found.points**2, axis=1)))) if len(found.points) else 1.0
+    degeneracy = find_degeneracy(found.jacobian, weights, found.tilt, lever_m)
+    J = found.jacobian @ (np.eye(6) - degeneracy.part_along())
+    information = NormalEquations.of(J, found.residuals, weights / CORRELATION).hessian + np.diag(GUESS_SIGMAS**-2)
+    variances = _LEAST_SIGMAS**2
+    if len(weights):
+        # Drift between a keyframe and its neighbours is common to all their points, and does not average out. It is
+        # the length of an error; each axis has a third of its square.
+        ways_m = np.average(found.ahead_m, axis=0, weights=weights) + middles_m
+        turned, shifted = found.drift_rates
+        variances = variances + np.repeat([turned**2, shifted**2], 3) * float(ways_m @ ways_m) / 3.0
+    return np.asarray(np.linalg.inv(information) + np.diag(variances), dtype=np.float64), degeneracy.names
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Which points (N,) of one side fit the other, the share of what it sees, and the worst direction's."""
+    """Inliers (N,) of one side, and their share of its points that the other side sees, plainly and by information."""
 
-    fits: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]
     overlap: float
-    explained: float
+    information: float
 
     @classmethod
-    def of(cls, target: Place, source: Place, T: FloatArray) -> "_Fit":
-        cell_m = max(target.patch.cell_m, source.patch.cell_m)
-        gate_m = max(_FITS * cell_m, _FITS_MIN_M)
+    def of(cls, target: SubmapCloud, source: SubmapCloud, T: FloatArray) -> "_Fit":
+        cell_m = max(target.submap.cell_m, source.submap.cell_m)
+        gate_m = max(_GATE * cell_m, _GATE_MIN_M)
         there = transform_points(T, source.points)
         ranges = np.linalg.norm(there, axis=1)
         reach_m = np.maximum(_REACH * cell_m, _REACH_PER_RANGE * ranges)
-        s, t = nearest(target, source, T, np.arange(len(there)), float(reach_m.max(initial=0.0)))
+        s, t = match(target, source, T, np.arange(len(there)), float(reach_m.max(initial=0.0)))
         apart = there[s] - target.points[t]
         along = np.einsum("ij,ij->i", apart, target.axes[t])
         squared = np.einsum("ij,ij->i", apart, apart)
         off = np.where(target.is_line[t], np.sqrt(np.maximum(squared - along**2, 0.0)) - LINE_NOISE_M, np.abs(along))
-        fits = np.zeros(len(there), dtype=bool)
-        fits[s[(off < gate_m) & (squared < reach_m[s] ** 2)]] = True
-        # In front of all that the other saw that way, where it looked, it should have seen this.
-        seen = target.patch.sight.ravel()[sight_cells(there, ranges)].astype(np.float64)
-        in_view = fits | ((seen > 0.0) & (ranges < seen + gate_m))
-        return cls(fits, float(fits.sum() / max(in_view.sum(), 1)), _explained(source, fits, in_view))
+        inliers = np.zeros(len(there), dtype=bool)
+        inliers[s[(off < gate_m) & (squared < reach_m[s] ** 2)]] = True
+        # The other side should have seen a point that is nearer than the nearest range that it saw in its direction.
+        seen = target.submap.nearest_ranges(there)
+        in_view = inliers | ((seen > 0.0) & (ranges < seen + gate_m))
+        overlap = float(inliers.sum() / max(in_view.sum(), 1))
+        return cls(inliers, overlap, _information_share(source, inliers, in_view))
 
 
-def _explained(source: Place, fits: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> float:
-    """The least ratio, over directions, of what fitting points tell about translation to what all in view do.
+def _information_share(source: SubmapCloud, inliers: NDArray[np.bool_], in_view: NDArray[np.bool_]) -> float:
+    """The least ratio, over directions, of the inliers' information on translation to that of all points in view.
 
-    Directions are those that the points in view, and those among them that do not fit, tell most and least of.
+    Directions are the eigenvectors of the information of the points in view, and of the outliers among them.
     """
-    planes, lines = source.axes[~source.is_line], source.axes[source.is_line]
+    normals, lines = source.axes[~source.is_line], source.axes[source.is_line]
     order = np.concatenate([np.flatnonzero(~source.is_line), np.flatnonzero(source.is_line)])
     ratios = [1.0]
-    for chosen in (in_view, in_view & ~fits):
+    for chosen in (in_view, in_view & ~inliers):
         p, d = source.axes[chosen & ~source.is_line], source.axes[chosen & source.is_line]
         _, directions = np.linalg.eigh(p.T @ p + len(d) * np.eye(3) - d.T @ d)
-        told = np.concatenate([(planes @ directions) ** 2, 1.0 - (lines @ directions) ** 2])
-        told[told < _FACING**2] = 0.0
-        everything, seen, matched = told.sum(axis=0), in_view[order] @ told, fits[order] @ told
+        squares = np.concatenate([(normals @ directions) ** 2, 1.0 - (lines @ directions) ** 2])
+        squares[squares < _FACING**2] = 0.0
+        everything, seen, matched = squares.sum(axis=0), in_view[order] @ squares, inliers[order] @ squares
         much = np.minimum(1.0, seen / (_MUCH_IN_VIEW * np.maximum(everything, 1e-9)))
-        counts = everything > _LEAST_FACING
-        ratios += list((much * matched / np.maximum(seen, 1e-9))[counts])
+        ratios += list((much * matched / np.maximum(seen, 1e-9))[everything > _LEAST_FACING])
     return float(min(ratios))

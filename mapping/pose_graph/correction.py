@@ -1,26 +1,65 @@
-"""A whole trajectory corrected where some of its poses, the keyframes, were."""
+"""The optimised graph, and the scans between keyframes corrected by it."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, interpolate, inverse
+from mapping.loops.closure import LoopClosure, RelativePose
 
-# Over a shorter way the sensor is taken to have stood still, and scans are counted instead.
+# Over a shorter way the sensor stood still, and scans are counted instead.
 _STILL_M = 0.01
 
 
-def corrected(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyframe_poses: FloatArray) -> FloatArray:
-    """Correct all scans (M, 4, 4) so that the keyframes (N,) of them get their new poses (N, 4, 4).
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """The optimised graph.
 
-    A scan between two keyframes would be at one place if it kept its motion since the first, and at another if it kept
-    that up to the second. It goes from the one to the other in proportion to the path behind it, or to the scans where
-    the sensor stood still. Both places are near the scan, so no lever arm from a far origin comes in. Scans before the
-    first keyframe keep their motion up to it, those after the last their motion since it.
+    Attributes:
+        T_world_lidar: (M, 4, 4) of all scans, one recording's after the other's.
+        keyframe_scans: (K,) the scans that are keyframes.
+        keyframe_poses: (K, 4, 4) T_world_lidar.
+        closures: loop closures, rejected ones too.
+        inliers: for each closure, whether the optimiser kept it.
+        edges: between keyframes, outlier closures left out.
+        first_scans: (R,) where the scans of each recording begin.
+        frames: (R,) the first recording of each one's connected component, in whose world it is.
+    """
+
+    T_world_lidar: FloatArray
+    keyframe_scans: NDArray[np.intp]
+    keyframe_poses: FloatArray
+    closures: tuple[LoopClosure, ...]
+    inliers: tuple[bool, ...]
+    edges: tuple[RelativePose, ...]
+    first_scans: NDArray[np.intp]
+    frames: NDArray[np.intp]
+
+    @property
+    def keyframe_recordings(self) -> NDArray[np.intp]:
+        """(K,) the recording of each keyframe."""
+        return recordings_of(self.keyframe_scans, self.first_scans)
+
+
+def recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(N,) the recording of each scan (N,), given where recordings (R,) begin."""
+    return np.searchsorted(first_scans, scans, side="right") - 1
+
+
+def corrected(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyframe_poses: FloatArray) -> FloatArray:
+    """All scans (M, 4, 4), the keyframes (N,) among them at their new poses (N, 4, 4).
+
+    A scan between two keyframes is interpolated between the pose that its motion since the one gives, and the pose
+    that its motion up to the other gives, in proportion to the path, or to the scans where the sensor stood still.
+    Both poses are near the scan, so there is no lever arm from the origin. Scans before the first keyframe keep their
+    motion up to it, those after the last their motion since it.
 
     Raises:
-        ValueError: there is no keyframe, they do not increase, or shapes do not fit.
+        ValueError: there is no keyframe, or they do not increase.
     """
-    _check(T_world_lidar, keyframe_scans, keyframe_poses)
+    if not len(keyframe_scans) or (np.diff(keyframe_scans) <= 0).any():
+        raise ValueError(f"expected increasing keyframe_scans, one or more, got {keyframe_scans}")
     scans = np.arange(len(T_world_lidar))
     after = np.searchsorted(keyframe_scans, scans, side="right")
     left = np.clip(after - 1, 0, None)
@@ -37,22 +76,8 @@ def _shares(
     positions: FloatArray, scans: NDArray[np.intp], left: NDArray[np.intp], right: NDArray[np.intp]
 ) -> FloatArray:
     """How much (M,) of the way from its keyframe on the left to that on the right lies behind each scan."""
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    path = np.concatenate([[0.0], np.cumsum(steps)])
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     still = path[right] - path[left] < _STILL_M
     behind = np.where(still, scans - left, path - path[left])
     whole = np.where(still, right - left, path[right] - path[left])
     return np.asarray(np.clip(behind / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0), dtype=np.float64)
-
-
-def _check(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyframe_poses: FloatArray) -> None:
-    if T_world_lidar.shape[1:] != (4, 4) or keyframe_poses.shape != (len(keyframe_scans), 4, 4):
-        raise ValueError(
-            f"expected poses (M, 4, 4) and one (4, 4) for each of {len(keyframe_scans)} keyframes,"
-            f" got {T_world_lidar.shape} and {keyframe_poses.shape}"
-        )
-    if not len(keyframe_scans):
-        raise ValueError("expected a keyframe or more, got none")
-    inside = (keyframe_scans >= 0) & (keyframe_scans < len(T_world_lidar))
-    if not inside.all() or (np.diff(keyframe_scans) <= 0).any():
-        raise ValueError(f"keyframe_scans must increase within 0 to {len(T_world_lidar) - 1}, got {keyframe_scans}")

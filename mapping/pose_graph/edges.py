@@ -1,77 +1,101 @@
-"""What the way from one keyframe to the next says in the pose graph: edges of the trajectory and of the odometry."""
+"""Edges between consecutive keyframes: scan-to-map registration, and the odometry beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
-from lidarslam.core.state import Saved
-from mapping.pose_graph.g2o import Edge
-from mapping.pose_graph.graph_config import TrajectoryEdgeConfig
+from mapping.loops.closure import RelativePose
 from mapping.pose_graph.graph_scan import GraphScan
 
+# Drift of scan-to-map registration between keyframes, one standard deviation: a floor, and growth with the way.
+# Compared with true errors of simulated recordings.
+_LEAST_RAD, _LEAST_M = np.deg2rad(0.03), 0.005
+_RAD_PER_M, _M_PER_M = np.deg2rad(0.02), 0.003
+# An odometry without a map drifts faster by about this factor.
+_UNMAPPED = 5.0
+# Where tracking was lost the edge only keeps the graph in one piece.
+_LOST_RAD, _LOST_M, _LOST_M_PER_M = np.deg2rad(20.0), 1.0, 0.5
+# Odometry covariances assume independent errors, but errors repeat from scan to scan: factor on standard deviations.
+_ODOMETRY_CAUTION = 10.0
 
-class Way:
-    """What happened since the last keyframe: the odometry's motion, how far it went, and whether tracking was lost."""
 
-    def __init__(self) -> None:
-        self.T_keyframe_lidar: FloatArray | None = np.eye(4)  # the odometry's; None once it failed
-        self.covariance: FloatArray = np.zeros((6, 6))
-        self.length_m = 0.0
-        self.lost = False
+@dataclass(frozen=True, eq=False)
+class MotionSinceKeyframe:
+    """The odometry's motion composed since the last keyframe.
 
-    def restore(self, saved: Saved) -> None:
-        """Go on from what was saved, which is all of it."""
-        self.T_keyframe_lidar = saved.optional_array("T_keyframe_lidar", (4, 4))
-        self.covariance = saved.array("covariance", (6, 6))
-        self.length_m, self.lost = saved.number("length_m"), saved.flag("lost")
+    Attributes:
+        T_keyframe_lidar: (4, 4); None once a scan had none.
+        covariance: (6, 6) of it, rotation first.
+        length_m: path length.
+        lost: whether tracking was lost on the way.
+    """
 
-    def go(self, scan: GraphScan, step_m: float) -> None:
-        """One scan further."""
-        self.length_m += step_m
-        self.lost |= scan.lost
+    T_keyframe_lidar: FloatArray | None
+    covariance: FloatArray
+    length_m: float = 0.0
+    lost: bool = False
+
+    @classmethod
+    def none(cls) -> "MotionSinceKeyframe":
+        """At the keyframe itself."""
+        return cls(np.eye(4), np.zeros((6, 6)))
+
+    def then(self, scan: GraphScan, step_m: float) -> "MotionSinceKeyframe":
+        """One scan further: first-order propagation of the covariance."""
+        length_m, lost = self.length_m + step_m, self.lost or scan.lost
         if self.T_keyframe_lidar is None or scan.T_prev_curr is None or scan.motion_covariance is None:
-            self.T_keyframe_lidar = None
-            return
-        self.T_keyframe_lidar = self.T_keyframe_lidar @ scan.T_prev_curr
+            return MotionSinceKeyframe(None, self.covariance, length_m, lost)
         A = adjoint(inverse(scan.T_prev_curr))
-        self.covariance = A @ self.covariance @ A.T + scan.motion_covariance
+        covariance = A @ self.covariance @ A.T + scan.motion_covariance
+        return MotionSinceKeyframe(self.T_keyframe_lidar @ scan.T_prev_curr, covariance, length_m, lost)
 
 
 def trajectory_edges(
     key: int,
     T_first_second: FloatArray,
-    way: Way,
+    motion: MotionSinceKeyframe,
     before: FloatArray | None,
     now: FloatArray | None,
-    config: TrajectoryEdgeConfig,
-) -> list[Edge]:
-    """From the keyframe before to this one: what the trajectory says, and what the odometry says beside it.
+) -> list[RelativePose]:
+    """Edges from the previous keyframe: one from the registered trajectory, one from the odometry where it has one.
 
     Args:
-        key: of this keyframe; the one before has the key below.
-        T_first_second: (4, 4) from this keyframe to the one before, as the trajectory has it.
-        way: between them.
-        before, now: (6, 6) covariance of either pose, rotation first, in the LiDAR frame; None of one that was not
-            laid on the map.
-        config: how far each is believed.
+        key: of this keyframe; the previous one is `key - 1`.
+        T_first_second: (4, 4) from this keyframe to the previous one, along the trajectory.
+        motion: the odometry between them.
+        before, now: (6, 6) covariance of either pose, rotation first, in the LiDAR frame; None for a pose that was not
+            registered to a map.
     """
-    mapped = now is not None
-    covariance = trajectory_covariance(way.length_m, mapped, way.lost, config)
-    if now is not None and before is not None and not way.lost:
+    registered = now is not None
+    covariance = drift_covariance(motion.length_m, registered, motion.lost)
+    if now is not None and before is not None and not motion.lost:
         A = adjoint(inverse(T_first_second))
         covariance = covariance + now + A @ before @ A.T
-    edges = [Edge(key - 1, key, T_first_second, covariance, "refinement" if mapped else "odometry")]
-    if mapped and way.T_keyframe_lidar is not None:
-        doubted = config.odometry_caution**2 * way.covariance
-        edges.append(Edge(key - 1, key, way.T_keyframe_lidar, doubted, "odometry"))
+    edges = [RelativePose(key - 1, key, T_first_second, covariance)]
+    if registered and motion.T_keyframe_lidar is not None:
+        edges.append(RelativePose(key - 1, key, motion.T_keyframe_lidar, _ODOMETRY_CAUTION**2 * motion.covariance))
     return edges
 
 
-def trajectory_covariance(length_m: float, mapped: bool, lost: bool, config: TrajectoryEdgeConfig) -> FloatArray:
-    """(6, 6) of the motion from one keyframe to the next, as far as drift goes; rotation first."""
+def drift_covariance(length_m: float, registered: bool = True, lost: bool = False) -> FloatArray:
+    """(6, 6) of the drift along a way, rotation first."""
     if lost:
-        sigma_deg, sigma_m = config.lost_rotation_deg, config.lost_translation_m + 0.5 * length_m
+        sigma_rad, sigma_m = _LOST_RAD, _LOST_M + _LOST_M_PER_M * length_m
     else:
-        factor = 1.0 if mapped else config.unmapped_factor
-        sigma_deg = factor * (config.rotation_deg + config.drift_deg_per_m * length_m)
-        sigma_m = factor * (config.translation_m + 0.01 * config.drift_percent * length_m)
-    return np.diag(np.array([np.deg2rad(sigma_deg)] * 3 + [sigma_m] * 3) ** 2)
+        factor = 1.0 if registered else _UNMAPPED
+        sigma_rad, sigma_m = factor * (_LEAST_RAD + _RAD_PER_M * length_m), factor * (_LEAST_M + _M_PER_M * length_m)
+    return np.diag(np.array([sigma_rad] * 3 + [sigma_m] * 3) ** 2)
+
+
+def first_connected(count: int, pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
+    """For each of so many nodes the first one of its connected component, given the pairs that are joined."""
+    ends = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, labels = connected_components(adjacency, directed=False)
+    _, firsts = np.unique(labels, return_index=True)
+    return np.asarray(firsts[labels], dtype=np.intp)

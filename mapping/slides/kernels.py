@@ -1,4 +1,4 @@
-"""Loops of the check for slides: normals from a spherical image of a scan, and votes for shifts between two scans."""
+"""Compiled loops: local moments from a spherical image of a scan, and votes for shifts between two scans."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ from lidarslam.core.geometry import FloatArray
 
 # Pixels of one degree.
 ROWS, COLUMNS = 180, 360
-# The neighbourhood of a pixel, in rows and columns to either side; beams are farther apart than points of a ring.
+# Neighbourhood of a pixel, in rows and columns to either side; rings are farther apart than points of a ring.
 _NEAR_ROWS, _NEAR_COLUMNS = 2, 1
-# Neighbours are no farther from a point than this share of its range.
+# Largest distance of a neighbour, as a share of the range.
 _REACH = 0.1
-# Normals of one surface, seen in two scans, have at least this cosine.
+# Least cosine between normals of one surface in two scans.
 _SAME_NORMAL = 0.9
 
 
@@ -36,9 +36,10 @@ def write_moments(
     covariances: FloatArray, counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Write the mean (M, 3), covariance (M, 3, 3) and number (M,) of the points around pixels (M, 2) of an image."""
+    offset = np.empty(3)
     for m in range(len(pixels)):
-        centre = image[pixels[m, 0], pixels[m, 1]]
-        squared_range = points[centre, 0] ** 2 + points[centre, 1] ** 2 + points[centre, 2] ** 2
+        centre = points[image[pixels[m, 0], pixels[m, 1]]]
+        reach2 = _REACH * _REACH * (centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
         count = 0
         means[m, :] = 0.0
         covariances[m, :, :] = 0.0
@@ -47,31 +48,22 @@ def write_moments(
                 n = image[row, (pixels[m, 1] + step) % COLUMNS]
                 if n < 0:
                     continue
-                x, y, z = (
-                    points[n, 0] - points[centre, 0],
-                    points[n, 1] - points[centre, 1],
-                    points[n, 2] - points[centre, 2],
-                )
-                if x * x + y * y + z * z > _REACH * _REACH * squared_range:
+                for i in range(3):
+                    offset[i] = points[n, i] - centre[i]
+                if offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2 > reach2:
                     continue
                 count += 1
-                means[m, 0] += x
-                means[m, 1] += y
-                means[m, 2] += z
-                covariances[m, 0, 0] += x * x
-                covariances[m, 1, 0] += x * y
-                covariances[m, 1, 1] += y * y
-                covariances[m, 2, 0] += x * z
-                covariances[m, 2, 1] += y * z
-                covariances[m, 2, 2] += z * z
+                for i in range(3):
+                    means[m, i] += offset[i]
+                    for j in range(i + 1):
+                        covariances[m, i, j] += offset[i] * offset[j]
         counts[m] = count
         for i in range(3):
             for j in range(i + 1):
                 value = covariances[m, i, j] / count - means[m, i] * means[m, j] / (count * count)
-                covariances[m, i, j] = value
-                covariances[m, j, i] = value
+                covariances[m, i, j] = covariances[m, j, i] = value
         for i in range(3):
-            means[m, i] = points[centre, i] + means[m, i] / count
+            means[m, i] = centre[i] + means[m, i] / count
 
 
 @compiled
@@ -80,10 +72,10 @@ def vote(
     held_normals: FloatArray, held_radii: FloatArray, direction: FloatArray, gate_m: float, bin_m: float,
     votes: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Add up which shifts of a scan along a direction lay its surfels on those of another.
+    """Add up votes for the shifts of a scan along a direction that lay its surfels on those of another.
 
-    A surfel p with a normal like that n of a held surfel a lies in its plane after the shift n.(a - p) / n.d, and votes
-    for it if it then lies within a's radius; the vote falls off to zero where it is `gate_m` off the plane. A surfel
+    A surfel p is in the plane of a held surfel a with a similar normal n after the shift n.(a - p) / n.d, and votes for
+    it if it is then within a's radius; the vote falls off to zero at a distance of `gate_m` from the plane. A surfel
     has at most one vote for each shift.
 
     Args:
@@ -95,32 +87,38 @@ def vote(
         votes: (B, S) written, of each block; the shift of zero is in the middle.
     """
     votes[:, :] = 0.0
-    size = votes.shape[1]
-    middle = size // 2
-    own = np.empty(size, dtype=np.float32)
+    middle = votes.shape[1] // 2
+    own = np.empty(votes.shape[1], dtype=np.float32)
     for m in range(len(points)):
         own[:] = 0.0
         for k in range(len(held_points)):
-            cosine, along, gap = 0.0, 0.0, 0.0
-            for i in range(3):
-                cosine += held_normals[k, i] * normals[m, i]
-                along += held_normals[k, i] * direction[i]
-                gap += held_normals[k, i] * (held_points[k, i] - points[m, i])
-            if cosine < _SAME_NORMAL:
+            if _dot(held_normals[k], normals[m]) < _SAME_NORMAL:
                 continue
+            along, gap, squared = _dot(held_normals[k], direction), 0.0, 0.0
+            for i in range(3):
+                gap += held_normals[k, i] * (held_points[k, i] - points[m, i])
             shift = gap / along
             if not abs(shift) < middle * bin_m:
                 continue
-            squared = 0.0
             for i in range(3):
                 squared += (points[m, i] + shift * direction[i] - held_points[k, i]) ** 2
-            if squared > held_radii[k] * held_radii[k]:
-                continue
-            half = gate_m / abs(along)
-            first = max(int(np.ceil((shift - half) / bin_m)) + middle, 0)
-            last = min(int(np.floor((shift + half) / bin_m)) + middle, size - 1)
-            for s in range(first, last + 1):
-                weight = np.float32(1.0 - abs((s - middle) * bin_m - shift) / half)
-                own[s] = max(own[s], weight)
-        for s in range(size):
+            if squared <= held_radii[k] * held_radii[k]:
+                _vote_once(shift, gate_m / abs(along), bin_m, own)
+        for s in range(len(own)):
             votes[blocks[m], s] += own[s]
+
+
+@compiled
+def _vote_once(shift: float, half: float, bin_m: float, votes: NDArray[np.float32]) -> None:
+    """Raise the votes (S,) around a shift to a triangle of half-width `half`."""
+    middle = len(votes) // 2
+    first = max(int(np.ceil((shift - half) / bin_m)) + middle, 0)
+    last = min(int(np.floor((shift + half) / bin_m)) + middle, len(votes) - 1)
+    for s in range(first, last + 1):
+        weight = np.float32(1.0 - abs((s - middle) * bin_m - shift) / half)
+        votes[s] = max(votes[s], weight)
+
+
+@compiled
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -1,9 +1,9 @@
-"""The loops over points and cells behind `VoxelTable` and `SurfelGrid`, compiled.
+"""Hash of voxels and moments of cells: the compiled loops of `VoxelHash` and `SurfelGrid`.
 
-Tables are open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows` (2^bits,)
-int32. A cell's sums are (15,) float32: points, first and second moments about the cell's centre in units of the cell
-(x, y, z, xx, xy, xz, yy, yz, zz), first and second moment of the elevation they were seen at, and the sum of the
-directions (x, y, z) that they were seen from.
+The hash has open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows`
+(2^bits,) int32. A cell's sums are (15,) float32: number of points, first and second moments about the cell's centre in
+units of the cell (x, y, z, xx, xy, xz, yy, yz, zz), first and second moment of the elevation, and the sum of the view
+directions (x, y, z).
 """
 
 import math
@@ -21,9 +21,9 @@ Floats = NDArray[np.float32]
 
 ABSENT = -1
 EMPTY = -1
-# Three signed cell coordinates share one 64-bit key. It is linear in them: a neighbour's key is the cell's plus a
-# constant. 21 bits reach 52 km at cells of 5 cm; what is farther counts as lying there.
-# The 64th bit, the sign, says that it is the cell's other side: of a thin wall, what is seen from behind.
+# A key holds three signed cell coordinates in 63 bits and is linear in them, so that a neighbour's key is the cell's
+# plus a constant. 21 bits reach 52 km at cells of 5 cm; farther points are clipped. The sign bit marks a cell's other
+# side, with the points of a thin wall that were seen from behind.
 BITS = 21
 OFFSET = 1 << (BITS - 1)
 STRIDE_X, STRIDE_Y = 1 << (2 * BITS), 1 << BITS
@@ -33,7 +33,7 @@ _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
 _ABOVE_BITS = 3
 OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 
-# A cell that has seen so many points knows its surface; it is left as it is, and drift does not smear it.
+# A cell with so many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
 
@@ -42,11 +42,11 @@ class Cells(NamedTuple):
 
     Attributes:
         cell_m: edge of a cell.
-        bits: the table has two to the power of these slots.
-        table_keys, table_rows: the hash table.
+        bits: binary logarithm of the number of slots.
+        table_keys, table_rows: of the hash.
         keys: (M,) of the cells, by row.
-        others: (M,) the row of each cell's other side, or `ABSENT`.
-        sums: (M, 15) of their points' moments.
+        others: (M,) row of each cell's other side, or `ABSENT`.
+        sums: (M, 15) moments.
     """
 
     cell_m: float
@@ -60,7 +60,7 @@ class Cells(NamedTuple):
 
 @compiled
 def cell_of(coordinate: float) -> int:
-    """The cell along one axis; never the last one, so that no key is `EMPTY`."""
+    """Cell along one axis; never the last one, so that no key is `EMPTY`."""
     return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 2))
 
 
@@ -71,13 +71,13 @@ def key_of(i: int, j: int, k: int) -> int:
 
 @compiled
 def neighbour_key(key: int, i: int, j: int, k: int) -> int:
-    """The key of the cell so many cells away from a cell, or from its other side."""
+    """Key of the cell at an offset of (i, j, k) cells from a cell or from its other side."""
     return int((key & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k)
 
 
 @compiled
 def _home(key: int, bits: int) -> int:
-    """The slot where the search for a key begins; cells above one another share a line of the processor's cache."""
+    """First slot of a key; cells above one another share a cache line."""
     column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
     return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
 
@@ -103,10 +103,10 @@ def find(keys: Keys, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows) 
 def insert(
     keys: Keys, begin: int, count: int, most: int, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows
 ) -> tuple[int, int]:
-    """Write the rows of keys (N,) from `begin` on, of new keys the next ones, until the table holds `most`.
+    """Write the rows of keys (N,) from `begin` on, the next ones for new keys, until the hash holds `most`.
 
     Returns:
-        How far it got, and how many rows there are now.
+        Number of keys done, and of rows.
     """
     for n in range(begin, len(keys)):
         slot = _home(keys[n], bits)
@@ -123,17 +123,6 @@ def insert(
 
 
 @compiled
-def place(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows) -> None:
-    """Put unique new keys (N,) with their rows (N,) into a table that has room for them."""
-    for n in range(len(keys)):
-        slot = _home(keys[n], bits)
-        while table_keys[slot] != EMPTY:
-            slot = (slot + 1) & ((1 << bits) - 1)
-        table_keys[slot] = keys[n]
-        table_rows[slot] = rows[n]
-
-
-@compiled
 def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
     """Write the keys (N,) of the cells that points (N, 3) lie in."""
     scale = 1.0 / cell_m
@@ -143,7 +132,7 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
 
 @compiled
 def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows, others: Rows) -> None:
-    """Write, for those of the keys (N,) in rows (N,) that are other sides, which rows belong together, (M,)."""
+    """Write the links (M,) between both sides of cells, for the keys (N,) in rows (N,) that are other sides."""
     for n in range(len(keys)):
         if keys[n] < 0 and others[rows[n]] == ABSENT:
             first = find_one(keys[n] & FIRST_SIDE, bits, table_keys, table_rows)
@@ -154,7 +143,7 @@ def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: 
 
 @compiled
 def write_views(points: FloatArray, sensor: FloatArray, views: Floats) -> None:
-    """Write the unit directions (N, 3) from points (N, 3) to where they were seen from (3,)."""
+    """Write the unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
     for n in range(len(points)):
         x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
         scale = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
@@ -166,15 +155,14 @@ def add_moments(
     points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,
     grid_keys: Keys, sums: Floats,
 ) -> None:  # fmt: skip
-    """Add points (N, 3), seen at angles (N,) from directions (N, 3), to the sums of their cells, unless these have
-    seen enough before."""
+    """Add points (N, 3) with elevations (N,) and views (N, 3) to the sums of their cells, unless these are frozen."""
     scale = 1.0 / cell_m
-    growing = np.empty(len(rows), dtype=np.bool_)
+    is_growing = np.empty(len(rows), dtype=np.bool_)
     for n in range(len(rows)):
-        growing[n] = sums[rows[n], 0] < _MOST_POINTS
+        is_growing[n] = sums[rows[n], 0] < _MOST_POINTS
         grid_keys[rows[n]] = keys[n]
     for n in range(len(rows)):
-        if not growing[n]:
+        if not is_growing[n]:
             continue
         sx, sy, sz = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         # Within the cell's own frame single precision is enough.
@@ -202,7 +190,7 @@ def add_moments(
 
 @compiled
 def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
-    """Write the rows (N,) of the cells that points (N, 3) lie in, else of the nearest around; or `ABSENT`."""
+    """Write the rows (N,) of the cells of points (N, 3), else of the nearest around; or `ABSENT`."""
     scale = 1.0 / cells.cell_m
     for n in range(len(points)):
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
@@ -213,7 +201,7 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
 
 @compiled
 def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
-    """Of the occupied cells around an empty one, that whose mean is nearest to a point; all in units of cells."""
+    """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells."""
     nearest, least = ABSENT, np.inf
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
@@ -233,7 +221,7 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
 
 @compiled
 def middle_of(key: int) -> tuple[float, float, float]:
-    """The middle of a cell, in units of cells."""
+    """Centre of a cell, in units of cells."""
     mask = (1 << BITS) - 1
     i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
     return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5

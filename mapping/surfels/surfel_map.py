@@ -1,41 +1,39 @@
-"""The map around the sensor that scans are registered to: planes at several sizes of cells, and lines."""
+"""Local map of surfels in three sizes of cells, and the point-to-plane correspondences of a scan with it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import Shape, Stateful
 from mapping.surfels.cell_kernels import write_views
-from mapping.surfels.grid import SurfelGrid
-from mapping.surfels.match_kernels import Bodies, Pulls, pull_to_bodies, pull_to_planes
-from mapping.surfels.patches import PatchTable
-from mapping.surfels.voxel_hash import ABSENT
+from mapping.surfels.correspondence_kernels import Rows, match_compact, match_planes
+from mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
 
-# Sizes of the grids, in cells: the finest that shows a plane decides, the coarser reach farther.
+# Sizes of the grids, in cells. A point's correspondence is the plane of the finest grid that has one.
 LEVELS = (1, 2, 4)
-# A patch of three cells filled evenly has a standard deviation of 0.8 cells along each axis.
-_SHORT = 0.5
-# Memory is bounded by forgetting what is far away, now and then rather than at every scan.
+# Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
+_COMPACT = 0.5
+# Cells beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.1
-# After so many scans the grids are tidied.
+# Scans between two removals of stray cells.
 _TIDIED_AFTER = 500
-# A sensor is tilted by less than this from the vertical, as a cosine, when it first looks.
-_LEAST_COSINE_UP = 0.7
+# Surfaces within this cosine of the z axis are floors or ceilings.
+_LEVEL_COSINE = 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
-    """M pulls, each of one point towards a surface along one direction; a line pulls its point along two.
+class Correspondences:
+    """M residuals of points with surfaces, each along one direction.
 
     Attributes:
-        index: (M,) which point.
+        index: (M,) of the point.
         points: (M, 3) on the surface, in the world.
-        normals: (M, 3) unit, the direction.
-        thickness_m: (M,) standard deviation of the surface along it.
-        tilt: (M,) standard deviation of the direction itself, radians.
+        normals: (M, 3) unit, in the world.
+        thickness_m: (M,) standard deviation of the surface along the normal.
+        tilt: (M,) standard deviation of the normal, radians.
     """
 
     index: NDArray[np.intp]
@@ -48,167 +46,118 @@ class Matches:
         return len(self.index)
 
     def residuals(self, world: FloatArray) -> FloatArray:
-        """How far (M,) the matched points, at (M, 3) of the world, lie off their surfaces, signed."""
+        """Signed distances (M,) of the matched points, at (M, 3) of the world, from their surfaces."""
         return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
 
-    def one_each(self) -> "Matches":
-        """The first pull of every point, that across its surface."""
+    def first_of_each_point(self) -> "Correspondences":
+        """One residual for each point, the one across its surface."""
         index, first = np.unique(self.index, return_index=True)
-        return Matches(index, self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first])
-
-    @classmethod
-    def join(cls, parts: Sequence["Matches"]) -> "Matches":
-        """All of them after one another."""
-        return cls(
-            np.concatenate([part.index for part in parts]),
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.thickness_m for part in parts]),
-            np.concatenate([part.tilt for part in parts]),
+        return Correspondences(
+            index, self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first]
         )
 
 
-class LocalMap:
-    """Planes and lines within a radius of the sensor."""
+class SurfelMap(Stateful):
+    """Surfels within a radius of the sensor.
+
+    Attributes:
+        cell_m: edge of the finest cells.
+        scans: number of inserted scans.
+    """
+
+    cell_m: float
+    scans: int
+    _radius_m: float
+    _grids: list[SurfelGrid]
+    _centre: Annotated[FloatArray, Shape(3)] | None
 
     def __init__(self, cell_m: float, radius_m: float) -> None:
         self.cell_m = cell_m
+        self.scans = 0
         self._radius_m = radius_m
-        self._planes = [SurfelGrid(cell_m * level) for level in LEVELS]
-        self._lines = SurfelGrid(cell_m * LEVELS[1])
-        self._centre: FloatArray | None = None
-        self._scans = 0
+        self._grids = [SurfelGrid(cell_m * level) for level in LEVELS]
+        self._centre = None
+
+    def _after_restore(self) -> None:
+        if len(self._grids) != len(LEVELS):
+            raise ValueError(f"{len(self._grids)} grids instead of {len(LEVELS)}")
 
     def __len__(self) -> int:
-        """How many cells are held, all grids together."""
-        return sum(len(grid) for grid in (*self._planes, self._lines))
+        """Number of cells in all grids."""
+        return sum(len(grid) for grid in self._grids)
 
-    def state(self) -> State:
-        """All of it."""
-        return {
-            "cell_m": self.cell_m,
-            "radius_m": self._radius_m,
-            "planes": [grid.state() for grid in self._planes],
-            "lines": self._lines.state(),
-            "centre": self._centre,
-            "scans": self._scans,
-        }
-
-    @classmethod
-    def restored(cls, saved: Saved) -> "LocalMap":
-        """The map with a state."""
-        restored = cls(saved.number("cell_m"), saved.number("radius_m"))
-        restored._planes = [SurfelGrid.restored(grid) for grid in saved.parts("planes")]
-        if len(restored._planes) != len(LEVELS):
-            raise saved.refuse(f"{len(restored._planes)} grids of planes instead of {len(LEVELS)}")
-        restored._lines = SurfelGrid.restored(saved.part("lines"))
-        restored._centre = saved.optional_array("centre", (3,))
-        restored._scans = saved.integer("scans")
-        return restored
-
-    def add(self, planes: FloatArray, elevations: FloatArray, edges: FloatArray, sensor: FloatArray) -> None:
-        """Add a scan.
+    def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
+        """Insert a scan.
 
         Args:
-            planes: (N, 3) points, in the world.
-            elevations: (N,) the angles above the sensor's equator that they were seen at, radians.
-            edges: (E, 3) points on edges, in the world.
-            sensor: (3,) where they were seen from.
+            points: (N, 3) in the world.
+            elevations: (N,) their angles above the sensor's equator, radians.
+            sensor: (3,) position in the world.
         """
-        views = _views(planes, sensor)
-        for grid in self._planes:
-            grid.add(planes, elevations, views)
-        self._lines.add(edges, np.zeros(len(edges)), np.zeros((len(edges), 3)))  # both sides of an edge are the edge
+        views = np.empty((len(points), 3), dtype=np.float32)
+        write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
+        for grid in self._grids:
+            grid.insert(points, elevations, views)
         if self._centre is None:
             self._centre = sensor
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
             self._centre = sensor
-            for grid in (*self._planes, self._lines):
-                grid.forget_beyond(sensor, self._radius_m)
-        self._scans += 1
-        if self._scans % _TIDIED_AFTER == 0:
-            for grid in (*self._planes, self._lines):
+            for grid in self._grids:
+                grid.drop_beyond(sensor, self._radius_m)
+        self.scans += 1
+        if self.scans % _TIDIED_AFTER == 0:
+            for grid in self._grids:
                 grid.tidy()
 
-    def match_planes(self, points: FloatArray, T_world_lidar: FloatArray, first_level: int = 0) -> Matches:
-        """For points (N, 3) of the world, seen from a pose (4, 4), the plane in the finest grid that shows one.
+    def match(self, points: FloatArray, T_world_lidar: FloatArray, level: int = 0) -> Correspondences:
+        """Correspondences of points (N, 3) of the world, seen from a pose (4, 4).
 
-        Grids finer than `first_level` are left out, for points that are not yet where they belong.
+        A point corresponds to the plane of the finest grid that has one in its cell; where none has, to the middle of a
+        compact object in the finest grid, along the axes of small extent.
+
+        Args:
+            points: in the world.
+            T_world_lidar: pose of the sensor.
+            level: finest grid that is used, for points that may be off by more than a cell.
         """
-        points = np.ascontiguousarray(points)
-        pulls, count = _room_for(3 * len(points)), 0
-        waiting, bodies = np.arange(len(points)), None
-        sensor = np.array(T_world_lidar[:3, 3])
-        for grid in self._planes[first_level:]:
-            rows = grid.look_up(points.take(waiting, axis=0), sensor)
-            patches = grid.all_patches(rows)
-            room = Bodies(np.empty(len(waiting), dtype=np.intp), np.empty(len(waiting), dtype=np.int32))
-            count, left, others = pull_to_planes(points, waiting, rows, patches, sensor, pulls, count, room)
-            waiting = waiting[:left]
-            if bodies is None:  # what is no plane in the finest grid, and in no other
-                bodies, finest = Bodies(room.number[:others], room.rows[:others]), patches
-        if bodies is not None:
-            waits = np.zeros(len(points), dtype=np.bool_)
-            waits[waiting] = True
-            T, short_m = np.ascontiguousarray(T_world_lidar), _SHORT * self._planes[first_level].cell_m
-            count = pull_to_bodies(points, waits, bodies, finest, T, short_m, pulls, count)
-        index, towards, normals, thickness_m, tilt = pulls
-        return Matches(index[:count], towards[:count], normals[:count], thickness_m[:count], tilt[:count])
-
-    def match_lines(self, points: FloatArray) -> Matches:
-        """For edge points (N, 3) of the world the lines they lie on."""
-        rows = self._lines.look_up(points)
-        occupied = np.flatnonzero(rows != ABSENT)
-        patches = self._lines.patches(rows[occupied])
-        chosen = np.flatnonzero(patches.is_line)
-        return _pull_to_lines(occupied[chosen], patches.select(chosen))
+        points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
+        sensor, unmatched = np.array(T[:3, 3]), np.arange(len(points))
+        found, count, finest = Rows.empty(3 * len(points)), 0, None
+        for grid in self._grids[level:]:
+            rows = grid.find(points.take(unmatched, axis=0), sensor)
+            surfels = grid.refreshed(rows)
+            finest = finest or (rows, surfels)
+            count, left = match_planes(points, unmatched, rows, surfels, sensor, found, count)
+            unmatched = unmatched[:left]
+        assert finest is not None
+        largest_m = _COMPACT * self._grids[level].cell_m
+        count = match_compact(points, unmatched, *finest, T, largest_m, found, count)
+        return Correspondences(
+            found.number[:count], found.points[:count], found.normals[:count], found.thickness_m[:count],
+            found.tilt[:count],
+        )  # fmt: skip
 
     def vertical(self) -> FloatArray:
-        """The direction (3,) that floors and ceilings near the sensor face; the world's z axis when there are none."""
-        grid = self._planes[-1]
-        patches = grid.patches(np.arange(len(grid), dtype=np.int32))
-        normals = patches.normals[patches.is_plane & (np.abs(patches.normals[:, 2]) > _LEAST_COSINE_UP)]
+        """Unit normal (3,) of floors and ceilings near the sensor; the world's z axis when there are none."""
+        grid = self._grids[-1]
+        surfels = grid.surfels(np.arange(len(grid), dtype=np.int32))
+        normals = surfels[surfels[:, IS_PLANE] > 0.0, NORMAL]
+        normals = normals[np.abs(normals[:, 2]) > _LEVEL_COSINE]
         mean = (normals * np.sign(normals[:, 2:])).sum(axis=0)
         length = float(np.linalg.norm(mean))
         return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
 
-    def surface(self) -> FloatArray:
-        """Points (M, 3) of the world on what is held, one in each of the cells of the middle size."""
-        return self._planes[1].means()
+    def means(self) -> FloatArray:
+        """Mean points (M, 3) of the cells of the middle size, in the world."""
+        return self._grids[1].means()
 
-    def resized(self, cell_m: float) -> "LocalMap":
-        """The same map in cells of another size, made of the surfaces in the finest of these."""
-        other = LocalMap(cell_m, self._radius_m)
-        other._centre, other._scans = self._centre, self._scans
-        samples = self._planes[0].samples()
-        for grid in other._planes:
-            grid.add_samples(*samples)
-        other._lines.add(*self._lines.samples())
+    def resized(self, cell_m: float) -> "SurfelMap":
+        """The map in cells of another size, resampled from the finest cells; the map itself for its own size."""
+        if cell_m == self.cell_m:
+            return self
+        other = SurfelMap(cell_m, self._radius_m)
+        other._centre, other.scans = self._centre, self.scans
+        samples = self._grids[0].samples()
+        for grid in other._grids:
+            grid.insert_samples(*samples)
         return other
-
-
-def _views(points: FloatArray, sensor: FloatArray) -> NDArray[np.float32]:
-    """Unit directions (N, 3) from points (N, 3) to the sensor (3,)."""
-    views = np.empty((len(points), 3), dtype=np.float32)
-    write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
-    return views
-
-
-def _room_for(count: int) -> Pulls:
-    vectors = np.empty((2, count, 3))
-    numbers = np.empty((2, count))
-    return Pulls(np.empty(count, dtype=np.intp), *vectors, *numbers)
-
-
-def _pull_to_lines(index: NDArray[np.intp], patches: PatchTable) -> Matches:
-    """Two directions across each line: the one it is thinnest in, and the other."""
-    spreads = patches.spreads_m
-    tilt = spreads[:, 1] / (np.maximum(spreads[:, 2], 1e-9) * np.sqrt(patches.counts))
-    across = np.cross(patches.directions, patches.normals)
-    return Matches(
-        np.concatenate([index, index]),
-        np.concatenate([patches.points, patches.points]),
-        np.concatenate([patches.normals, across]),
-        np.concatenate([spreads[:, 0], spreads[:, 1]]),
-        np.concatenate([tilt, tilt]),
-    )

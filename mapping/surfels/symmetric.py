@@ -1,4 +1,4 @@
-"""Eigenvalues and vectors of symmetric 3x3 matrices in closed form, compiled."""
+"""Eigenvalues and eigenvectors of symmetric 3x3 matrices in closed form, compiled."""
 
 import math
 

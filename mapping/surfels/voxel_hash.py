@@ -1,4 +1,4 @@
-"""A hash table from cells of a grid to rows of arrays, whole arrays of keys at a time."""
+"""Spatial hash from voxels to rows of arrays, vectorised over keys."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from lidarslam.core.geometry import FloatArray
 from mapping.surfels import cell_kernels as kernels
 from mapping.surfels.cell_kernels import ABSENT, Keys, Rows
 
-__all__ = ["ABSENT", "Keys", "Rows", "VoxelTable", "cell_keys", "key_cells", "key_steps", "point_keys"]
+__all__ = ["ABSENT", "Keys", "Rows", "VoxelHash", "cell_keys", "key_cells", "key_steps", "point_keys"]
 
 _STRIDES = np.array([kernels.STRIDE_X, kernels.STRIDE_Y, 1], dtype=np.int64)
 
@@ -35,25 +35,27 @@ def point_keys(points: FloatArray, cell_m: float) -> Keys:
 
 
 def key_steps(offsets: NDArray[np.int64]) -> Keys:
-    """What to add to a cell's key to get that of the cell `offsets` (..., 3) away."""
+    """Differences (...) between the key of a cell and those of the cells at offsets (..., 3)."""
     return np.asarray(offsets @ _STRIDES, dtype=np.int64)
 
 
-class VoxelTable:
+class VoxelHash:
     """Open addressing with linear probing; rows are numbered in the order of their first insertion."""
 
+    _bits: int
+    _count: int
+    _keys: Keys
+    _rows: Rows
+
     def __init__(self) -> None:
-        self._bits = _FIRST_BITS
-        self._keys = np.full(1 << self._bits, kernels.EMPTY, dtype=np.int64)
-        self._rows = np.zeros(1 << self._bits, dtype=np.int32)
-        self._count = 0
+        self._clear(_FIRST_BITS)
 
     def __len__(self) -> int:
         return self._count
 
     @property
     def slots(self) -> tuple[int, Keys, Rows]:
-        """How many bits a slot's number has, and the keys and rows in the slots, as `cell_kernels` have them."""
+        """Binary logarithm of the number of slots, and the keys and rows in the slots."""
         return self._bits, self._keys, self._rows
 
     def find(self, keys: Keys) -> Rows:
@@ -63,7 +65,7 @@ class VoxelTable:
         return rows.reshape(keys.shape)
 
     def insert(self, keys: Keys) -> Rows:
-        """Rows (N,) of keys (N,), new ones for keys that are not there yet; keys may repeat."""
+        """Rows (N,) of keys (N,), the next ones for new keys; keys may repeat."""
         rows, done = np.empty(len(keys), dtype=np.int32), 0
         keys = np.ascontiguousarray(keys)
         while True:
@@ -71,22 +73,21 @@ class VoxelTable:
             done, self._count = kernels.insert(keys, done, self._count, most, *self.slots, rows)
             if done == len(keys):
                 return rows
-            self._grow()
+            used = np.flatnonzero(self._keys != kernels.EMPTY)
+            by_row = np.empty(len(used), dtype=np.int64)
+            by_row[self._rows[used]] = self._keys[used]
+            self._clear(self._bits + 1)
+            self.insert(by_row)
 
     def rebuild(self, keys: Keys) -> None:
-        """Hold these unique keys (N,) instead, in rows 0 to N-1."""
-        self._count = len(keys)
-        self._bits = _FIRST_BITS
-        while len(keys) > _LARGEST_LOAD * (1 << self._bits):
-            self._bits += 1
-        self._fill(np.ascontiguousarray(keys), np.arange(len(keys), dtype=np.int32))
+        """Replace the contents by unique keys (N,) in rows 0 to N-1."""
+        bits = _FIRST_BITS
+        while len(keys) > _LARGEST_LOAD * (1 << bits):
+            bits += 1
+        self._clear(bits)
+        self.insert(keys)
 
-    def _grow(self) -> None:
-        used = np.flatnonzero(self._keys != kernels.EMPTY)
-        self._bits += 1
-        self._fill(self._keys[used], self._rows[used])
-
-    def _fill(self, keys: Keys, rows: Rows) -> None:
-        self._keys = np.full(1 << self._bits, kernels.EMPTY, dtype=np.int64)
-        self._rows = np.zeros(1 << self._bits, dtype=np.int32)
-        kernels.place(keys, rows, *self.slots)
+    def _clear(self, bits: int) -> None:
+        self._bits, self._count = bits, 0
+        self._keys = np.full(1 << bits, kernels.EMPTY, dtype=np.int64)
+        self._rows = np.zeros(1 << bits, dtype=np.int32)

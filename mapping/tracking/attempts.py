@@ -1,281 +1,211 @@
-"""Laying one scan on the map: from its prediction, again and patiently, and at last from anywhere."""
+"""Registration attempts of one scan with one map: from the prediction, from displaced and turned starts, anywhere."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
-from mapping.prediction import Carrier, Prediction, Prior, State, predict
-from mapping.registration import Refined, Sweep, compensated, refine
+from mapping.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
+from mapping.registration import Registration, register, with_mean_velocity
 from mapping.sampling import SampledScan
-from mapping.surfels.surfel_map import LocalMap
-from mapping.tracking.fit import Fit, measure_fit
-from mapping.tracking.relocalisation import Floorplan
-from mapping.tracking.start_poses import best_starts, best_supported, best_velocity, positions_around, start_poses
+from mapping.surfels.surfel_map import SurfelMap
+from mapping.tracking.birds_eye_map import BirdsEyeMap
+from mapping.tracking.fit import NO_FIT, Fit, measure_fit
+from mapping.tracking.start_poses import best_starts, best_supported, best_velocity, positions_around, turned_poses
 
-# A sweep compensated with a motion that turns out to be this different is compensated again.
-_SAME_ROTATION = np.deg2rad(0.1)
-_SAME_TRANSLATION_M = 0.01
-# A search may end anywhere. After a scan was lost, most of what the next one sees must lie on the map for it to be
-# believed where it is expected.
+# Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)
-_SHARE_TO_RETURN = 0.5
-# With the whole map to choose from, what meets the map must lie on it much better than that, and clearly better than at
-# the next best place that is so far away, in cells. On simulated recordings 57 to 74 % of what met the map lay on it at
-# wrong places, at right ones 94 % and more; how much meets it depends on how much of the view is new.
-_RATIO_ANYWHERE = 0.85
-_SHARE_ANYWHERE = 0.4
-_SUPPORT_ANYWHERE = 0.6
-_CLEARLY = 1.2
-_ELSEWHERE_CELLS = 4.0
-# How far around the sensor a scan is drawn from above, in median ranges, and in cells of the map one of the drawing's.
-_DRAWN_RANGES = 3.0
-_DRAWN_CELLS = 4.0
-_PLACES = 24
-# Changes of the rate of turning that are tried on a scan that lies badly, rad/s: from full speed one way round to full
-# speed the other way between two sweeps.
-_TURNS = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
-# Displacements since the last scan that are tried where the velocity is not known: as far as a car drives, but no
-# farther than the median range; so many cells apart, within reach of the coarse ones.
+# A correction beyond so many standard deviations of the prediction, and beyond degrees and metres, is a jump.
+_MOST_SIGMAS = 5.0
+_LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
+# Share of inliers that a scan needs at its prediction after a lost one.
+_PLAUSIBLE_SHARE = 0.5
+# A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place so many
+# cells away. On simulated recordings the inlier ratio was 57 to 74 % at wrong places, at right ones 94 % and more; the
+# share of inliers depends on how much of the view is new.
+_RELIABLE_RATIO, _RELIABLE_SHARE, _RELIABLE_SUPPORT = 0.85, 0.4, 0.6
+_RIVAL_QUALITY, _RIVAL_CELLS = 1.2, 4.0
+# Radius of a scan's bird's-eye view in median ranges, its cell in cells of the map, and the places that are tried.
+_VIEW_RANGES, _VIEW_CELLS, _PLACES = 3.0, 4.0, 24
+# Changes of the yaw rate tried on a scan that fits poorly, rad/s: from full speed one way to full speed the other.
+_YAW_RATES = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
+_YAW_STEP_DEG = 15.0
+# Displacements tried where the velocity is unknown: the speed of a car, at most the median range, and their spacing in
+# cells, within reach of the coarse cells.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
-_PATIENCE = {"coarse_iterations": 10, "max_iterations": 40}
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A scan laid on the map, and how it lies; not registered when too little of it met a surface.
+class Attempt:
+    """A registration attempt.
 
-    `rivalled`: another displacement since the last scan fits nearly as well, and no velocity is known to decide.
+    Attributes:
+        prediction: that the result is compared with.
+        surfel_map: that the scan was registered to.
+        registration: None where there were too few correspondences.
+        fit: of the scan to the map.
+        status: by the fit.
+        relocalised: whether it began elsewhere than at the prediction.
+        ambiguous: whether another displacement fits nearly as well while the velocity is unknown.
     """
 
-    refined: Refined | None
+    prediction: Prediction
+    surfel_map: SurfelMap
+    registration: Registration | None
     fit: Fit
     status: Status
-    rivalled: bool = False
+    relocalised: bool = False
+    ambiguous: bool = False
 
     @property
-    def is_certain(self) -> bool:
-        """Whether it lies on the map so well that it need not have been near there before."""
-        return self.fit.inlier_share > _SHARE_TO_RETURN
+    def is_plausible(self) -> bool:
+        """Whether the fit suffices at the prediction after a lost scan."""
+        return self.fit.inlier_share > _PLAUSIBLE_SHARE
 
     @property
-    def is_beyond_doubt(self) -> bool:
-        """Whether it lies on the map so well that it need not have been anywhere before."""
+    def is_reliable(self) -> bool:
+        """Whether the fit suffices without a prediction."""
         ratio, share, support = self.fit.inlier_ratio or 0.0, self.fit.inlier_share, self.fit.support or 0.0
-        fits = ratio > _RATIO_ANYWHERE and share > _SHARE_ANYWHERE and support > _SUPPORT_ANYWHERE
+        fits = ratio > _RELIABLE_RATIO and share > _RELIABLE_SHARE and support > _RELIABLE_SUPPORT
         return self.status is Status.OK and fits
 
     @property
     def quality(self) -> float:
-        """To choose by among places: the share of the scan that lies on the map, and how well that holds it."""
+        """Score among attempts: share of inliers times directional support."""
         return self.fit.inlier_share * (self.fit.support or 0.0)
 
+    @property
+    def T_world_lidar(self) -> FloatArray:
+        """(4, 4) the registered pose; the predicted one without a registration."""
+        return (self.registration or self.prediction).T_world_lidar
 
-def place(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
-    coarse_first: bool,
-) -> Placed:  # fmt: skip
-    """Lay a scan on the map from where it is expected; where it does not fit there, by way of coarser cells.
+    @property
+    def correction(self) -> FloatArray:
+        """(6,) from the predicted pose to the registered one."""
+        return log(inverse(self.prediction.T_world_lidar) @ self.T_world_lidar)
 
-    Args:
-        sampled: the points.
-        prediction: where the scan is expected.
-        last: the scan before.
-        local_map: what is laid on.
-        config: how.
-        coarse_first: whether to begin with coarser cells at once.
-    """
-    placed = _place_once(sampled, prediction, last, local_map, config, coarse_first)
-    if coarse_first or placed.status is Status.OK:
-        return placed
-    again = _place_once(sampled, prediction, last, local_map, config, coarse_first=True)
-    return again if again.fit.inlier_share > placed.fit.inlier_share else placed
+    @property
+    def has_jumped(self) -> bool:
+        """Whether the correction exceeds every motion that the prediction allows for."""
+        sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
+        return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
 
-
-def place_surprised(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
-) -> Placed:
-    """Lay a scan on the map from where it is expected, though it may turn any way; patiently, by way of coarser cells.
-
-    Args:
-        sampled: the points.
-        prediction: where the scan is expected, of a carrier that anything is believed of.
-        last: the scan before.
-        local_map: what is laid on.
-        config: how.
-    """
-    sweep, T_world_lidar = sampled.sweep, prediction.T_world_lidar
-    starts = [prediction.velocity]
-    if config.continuous_time and sweep.plane_times is not None:
-        up = T_world_lidar[:3, :3].T @ local_map.vertical()
-        velocities = prediction.velocity + np.outer(_TURNS, np.concatenate([up, np.zeros(3)]))
-        turned = best_velocity(sweep.planes, sweep.plane_times, velocities, T_world_lidar, local_map)
-        starts += [] if np.array_equal(turned, prediction.velocity) else [turned]
-    tried = [
-        _place_patiently(sampled, replace(prediction, velocity=velocity), last, local_map, config)
-        for velocity in starts
-    ]
-    return max(tried, key=lambda placed: placed.quality)
+    def has_rivals(self, others: Iterable["Attempt"]) -> bool:
+        """Whether the scan fits nearly as well at another place."""
+        apart_m = _RIVAL_CELLS * self.surfel_map.cell_m
+        return any(
+            np.linalg.norm(other.T_world_lidar[:3, 3] - self.T_world_lidar[:3, 3]) > apart_m
+            and _RIVAL_QUALITY * other.quality > self.quality
+            for other in others
+        )
 
 
-def place_displaced(
-    sampled: SampledScan, rotations: Sequence[FloatArray], last: State, local_map: LocalMap, config: MappingConfig
-) -> list[tuple[Placed, Prediction]]:
-    """Register a scan from displacements since the last one in every horizontal direction; those that are ok, each with
-    what was expected there.
+def best_of(attempts: Iterable[Attempt]) -> Attempt | None:
+    """The attempt of highest quality; None of none."""
+    return max(attempts, key=lambda attempt: attempt.quality, default=None)
 
-    A sensor that was at speed when the recording began, or whose odometry is wrong, is out of reach of the expected
-    pose, and most of a street fits there too.
+
+class ScanMatcher:
+    """Registers one scan to one map.
 
     Args:
-        sampled: the points.
-        rotations: poses (4, 4) whose rotations are tried.
-        last: the scan before.
-        local_map: what is registered to.
-        config: how.
+        scan: sampled.
+        last: state of the scan before.
+        surfel_map: local map.
+        config: of the mapping.
     """
-    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
-    points = compensated(sweep.planes, sweep.plane_times, last.velocity)
-    if not len(points) or interval_s <= 0.0:
-        return []
-    radius_m, up = min(_FASTEST_M_S * interval_s, sampled.range_m), local_map.vertical()
-    step_m = _DISPLACED_CELLS * local_map.cell_m
-    starts = []
-    for rotation in rotations:
-        T = last.T_world_lidar.copy()
-        T[:3, :3] = rotation[:3, :3]
-        starts.append(positions_around(T, up, radius_m, step_m))
-    tried = []
-    for start in best_supported(points, np.concatenate(starts), local_map):
-        velocity = body_velocity(inverse(last.T_world_lidar) @ start, interval_s)
-        moving = State.moving(last, velocity)
-        prediction = predict(moving, sampled.stamp, Prior(), Carrier(), config, sampled.seen_from_s)
-        tried.append((_place_patiently(sampled, prediction, last, local_map, config), prediction))
-    return [found for found in tried if found[0].status is Status.OK]
 
+    def __init__(self, scan: SampledScan, last: MotionState, surfel_map: SurfelMap, config: MappingConfig) -> None:
+        self.scan = scan
+        self.last = last
+        self._map = surfel_map
+        self._config = config
 
-def _place_patiently(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
-) -> Placed:
-    refinement = config.refinement
-    patience = {name: max(steps, getattr(refinement, name)) for name, steps in _PATIENCE.items()}
-    patient = config.model_copy(update={"refinement": refinement.model_copy(update=patience)})
-    return _place_once(sampled, prediction, last, local_map, patient, coarse_first=True)
+    def register(self, prediction: Prediction, coarse_first: bool) -> Attempt:
+        """Register from the prediction; where that does not fit, by way of coarser cells."""
+        attempt = self._attempt(prediction, prediction, coarse_first)
+        if coarse_first or attempt.status is Status.OK:
+            return attempt
+        again = self._attempt(prediction, prediction, coarse_first=True)
+        return again if again.fit.inlier_share > attempt.fit.inlier_share else attempt
 
+    def register_turning(self, prediction: Prediction) -> Attempt:
+        """Register patiently from the prediction, and from that with the best of several yaw rates."""
+        keypoints, starts = self.scan.keypoints, [prediction]
+        if self._config.continuous_time and keypoints.times is not None:
+            up = prediction.T_world_lidar[:3, :3].T @ self._map.vertical()
+            velocities = prediction.velocity + np.outer(_YAW_RATES, np.concatenate([up, np.zeros(3)]))
+            velocity = best_velocity(keypoints, velocities, prediction.T_world_lidar, self._map)
+            if not np.array_equal(velocity, prediction.velocity):
+                starts.append(replace(prediction, velocity=velocity))
+        attempts = [self._attempt(prediction, start, patient=True) for start in starts]
+        return max(attempts, key=lambda attempt: attempt.quality)
 
-def search(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
-) -> Placed | None:
-    """Try a scan turned all around, where it is expected and where the last one was; None when nothing fits well."""
-    sweep = sampled.sweep
-    points = compensated(sweep.planes, sweep.plane_times, prediction.velocity)
-    if not len(points):
-        return None
-    up, step_deg = local_map.vertical(), config.tracking.search_yaw_step_deg
-    places = (prediction.T_world_lidar, last.T_world_lidar)
-    starts = np.concatenate([start_poses(T_world_lidar, up, step_deg) for T_world_lidar in places])
-    tried = _from_starts(best_starts(points, starts, local_map), sampled, prediction, last, local_map, config)
-    return max((placed for placed in tried if placed.is_beyond_doubt), key=lambda placed: placed.quality, default=None)
+    def register_displaced(self, rotations: Sequence[FloatArray]) -> list[Attempt]:
+        """Attempts with status ok from displacements since the last scan in every horizontal direction.
 
+        A sensor at speed at the first scan, or with a wrong odometry, is out of reach of the predicted pose, and most
+        of a street fits there too. The rotations are taken from the given poses (4, 4).
+        """
+        last, interval_s = self.last, self.scan.stamp - self.last.stamp
+        if interval_s <= 0.0:
+            return []
+        radius_m, up = min(_FASTEST_M_S * interval_s, self.scan.range_m), self._map.vertical()
+        starts = []
+        for rotation in rotations:
+            T = last.T_world_lidar.copy()
+            T[:3, :3] = rotation[:3, :3]
+            starts.append(positions_around(T, up, radius_m, _DISPLACED_CELLS * self._map.cell_m))
+        points, attempts = self.scan.keypoints.compensated(last.velocity), []
+        for start in best_supported(points, np.concatenate(starts), self._map):
+            velocity = body_velocity(inverse(last.T_world_lidar) @ start, interval_s)
+            moving = replace(last, velocity=velocity, covariance=UNKNOWN_VELOCITY)
+            prediction = predict(moving, self.scan.stamp, Prior(), ProcessNoise(), self._config, self.scan.seen_from_s)
+            attempts.append(self._attempt(prediction, prediction, patient=True))
+        return [attempt for attempt in attempts if attempt.status is Status.OK]
 
-def search_everywhere(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig
-) -> Placed | None:
-    """Try a scan all over the map, turned anyhow, leaning as the last one did.
+    def search_yaw(self, prediction: Prediction) -> Attempt | None:
+        """Relocalise by yaw search at the predicted and the last position; None where no result is reliable."""
+        up = self._map.vertical()
+        poses = (prediction.T_world_lidar, self.last.T_world_lidar)
+        starts = np.concatenate([turned_poses(T_world_lidar, up, _YAW_STEP_DEG) for T_world_lidar in poses])
+        return best_of(attempt for attempt in self._from(starts, prediction) if attempt.is_reliable)
 
-    None when it fits well nowhere, or at two places nearly alike: rooms in a row look the same.
-    """
-    sweep = sampled.sweep
-    points = compensated(sweep.planes, sweep.plane_times, prediction.velocity)
-    if not len(points):
-        return None
-    plan = Floorplan.of(local_map.surface(), local_map.vertical(), _DRAWN_CELLS * local_map.cell_m)
-    all_points = compensated(sampled.points, sampled.times, prediction.velocity)
-    starts = plan.find(all_points, last.T_world_lidar, _DRAWN_RANGES * sampled.range_m, _PLACES)
-    if not len(starts):
-        return None
-    tried = _from_starts(best_starts(points, starts, local_map), sampled, prediction, last, local_map, config)
-    best = max(tried, key=lambda placed: placed.quality, default=None)
-    if best is None or not best.is_beyond_doubt:
-        return None
-    return None if is_rivalled(best, tried, local_map) else best
+    def search_map(self, prediction: Prediction) -> Attempt | None:
+        """Relocalise anywhere in the map at any yaw; None where no result is reliable, or two places fit alike."""
+        view = BirdsEyeMap.of(self._map.means(), self._map.vertical(), _VIEW_CELLS * self._map.cell_m)
+        points = self.scan.sweep.compensated(prediction.velocity)
+        starts = view.find(points, self.last.T_world_lidar, _VIEW_RANGES * self.scan.range_m, _PLACES)
+        attempts = self._from(starts, prediction)
+        best = best_of(attempts)
+        return best if best is not None and best.is_reliable and not best.has_rivals(attempts) else None
 
+    def _from(self, starts: FloatArray, prediction: Prediction) -> list[Attempt]:
+        """Attempts with status ok from the best of the poses (K, 4, 4)."""
+        points = self.scan.keypoints.compensated(prediction.velocity)
+        covariance = np.zeros((12, 12))
+        covariance[:6, :6], covariance[6:, 6:] = _ANYWHERE, prediction.covariance[6:, 6:]
+        attempts = [
+            self._attempt(prediction, replace(prediction, T_world_lidar=start, covariance=covariance), patient=True)
+            for start in best_starts(points, starts, self._map)
+        ]
+        return [replace(attempt, relocalised=True) for attempt in attempts if attempt.status is Status.OK]
 
-def _from_starts(
-    starts: FloatArray, sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap,
-    config: MappingConfig,
-) -> list[Placed]:  # fmt: skip
-    """What a scan comes to from each of the poses (K, 4, 4), where it comes to something that is ok."""
-    tried = []
-    for start in starts:
-        free = replace(prediction, T_world_lidar=start, covariance=_anywhere(prediction))
-        tried.append(_place_patiently(sampled, free, last, local_map, config))
-    return [placed for placed in tried if placed.status is Status.OK]
-
-
-def _anywhere(prediction: Prediction) -> FloatArray:
-    covariance = np.zeros((12, 12))
-    covariance[:6, :6], covariance[6:, 6:] = _ANYWHERE, prediction.covariance[6:, 6:]
-    return covariance
-
-
-def is_rivalled(best: Placed, others: Sequence[Placed], local_map: LocalMap) -> bool:
-    """Whether a scan fits nearly as well at another place."""
-    rivals = [other for other in others if _apart_m(other, best) > _ELSEWHERE_CELLS * local_map.cell_m]
-    return any(_CLEARLY * rival.quality > best.quality for rival in rivals)
-
-
-def _apart_m(one: Placed, other: Placed) -> float:
-    assert one.refined is not None
-    assert other.refined is not None
-    return float(np.linalg.norm(one.refined.T_world_lidar[:3, 3] - other.refined.T_world_lidar[:3, 3]))
-
-
-def _place_once(
-    sampled: SampledScan, prediction: Prediction, last: State, local_map: LocalMap, config: MappingConfig,
-    coarse_first: bool,
-) -> Placed:  # fmt: skip
-    sweep, interval_s = sampled.sweep, sampled.stamp - last.stamp
-    refined = refine(sweep, prediction, local_map, config.refinement, coarse_first, config.continuous_time)
-    if refined is not None and not (config.continuous_time and sweep.is_rolling) and interval_s > 0.0:
-        refined = _with_own_motion(sweep, prediction, last, interval_s, local_map, config, refined)
-    if refined is None:
-        return Placed(None, Fit(0, 0.0, None, None), Status.LOST)
-    points = compensated(sweep.planes, sweep.plane_times, refined.velocity)
-    fit = measure_fit(points, refined.T_world_lidar, local_map, config.tracking)
-    return Placed(refined, fit, fit.status(config.tracking))
-
-
-def _with_own_motion(
-    sweep: Sweep, prediction: Prediction, last: State, interval_s: float, local_map: LocalMap, config: MappingConfig,
-    refined: Refined,
-) -> Refined | None:  # fmt: skip
-    """Without an estimate of its own, the velocity is that since the last scan.
-
-    A sweep that was compensated with another one is compensated again, and registered again.
-    """
-    velocity = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)
-    change = np.abs(velocity - prediction.velocity) * interval_s
-    same = np.linalg.norm(change[:3]) < _SAME_ROTATION and np.linalg.norm(change[3:]) < _SAME_TRANSLATION_M
-    if sweep.is_rolling and config.second_deskew and not same:
-        again = replace(prediction, T_world_lidar=refined.T_world_lidar, velocity=velocity)
-        second = refine(sweep, again, local_map, config.refinement, coarse_first=False, with_velocity=False)
-        if second is None:
-            return None
-        refined = second
-        velocity = body_velocity(inverse(last.T_world_lidar) @ refined.T_world_lidar, interval_s)
-    return replace(refined, velocity=velocity, covariance=_with_velocity(refined.covariance, last, interval_s))
-
-
-def _with_velocity(covariance: FloatArray, last: State, interval_s: float) -> FloatArray:
-    """The covariance of pose and velocity, the velocity being the difference of two poses over the time between."""
-    both = np.zeros((12, 12))
-    both[:6, :6] = covariance[:6, :6]
-    both[:6, 6:] = both[6:, :6] = covariance[:6, :6] / interval_s
-    both[6:, 6:] = (covariance[:6, :6] + last.covariance[:6, :6]) / interval_s**2
-    return both
+    def _attempt(
+        self, prediction: Prediction, start: Prediction, coarse_first: bool = True, patient: bool = False
+    ) -> Attempt:
+        keypoints, interval_s = self.scan.keypoints, self.scan.stamp - self.last.stamp
+        continuous = self._config.continuous_time
+        registration = register(keypoints, start, self._map, continuous, coarse_first, patient)
+        if registration is not None and not (continuous and keypoints.times is not None) and interval_s > 0.0:
+            registration = with_mean_velocity(registration, keypoints, start, self.last, self._map, patient)
+        if registration is None:
+            return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
+        points = keypoints.compensated(registration.velocity)
+        fit = measure_fit(points, registration.T_world_lidar, self._map)
+        return Attempt(prediction, self._map, registration, fit, fit.status(self._config.tracking))

@@ -1,209 +1,204 @@
-"""Laying one range image on another from a first guess: point-to-plane by projection.
+"""Projective point-to-plane alignment of two sweeps, with an initial estimate as a prior.
 
-The guess is a network's answer with its covariance, or none. Wherever the two images say nothing of a direction, the
-guess is kept: it enters as a measurement like any other.
+Gauss-Newton with robust weights. The initial estimate is a network's answer with its covariance, or none. Along
+directions that the images do not constrain it is kept: it enters as a measurement like any other.
 
-Sweeps take time, and a gait or a turn that begins bends them. The velocity is taken as changing evenly from the middle
-of one sweep to the middle of the other, and the change is estimated together with the motion: twelve unknowns, of which
+Sweeps take time, and a gait or the beginning of a turn bends them. Acceleration is taken as constant from the middle of
+one sweep to the middle of the other, and the change of velocity is estimated with the motion: twelve unknowns, of which
 the change is expected to go on as between the motions before.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment.alignment_config import AlignmentConfig
-from odometry.alignment.pair_sums import Movement, PairSums, Tally
-from odometry.images.sweeps import SweepPair
+from odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
+from odometry.alignment.sweep_motion import SweepPair
 
-# A pair whose motion changes by less than this in a step has arrived: rotation in radians, translation in metres.
-_ARRIVED = 1e-4
-# Part of the best known direction's information that counts as none.
-_NEXT_TO_NOTHING = 0.02
+# Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
+_COARSE_M = 0.5
+_ANNEALED = 0.5
+# A motion that changes by less than this in a step has converged, and no step is larger: radians and metres.
+_CONVERGED, _LARGEST_STEP = 1e-4, 0.3
+# Standard deviation of points about their planes, and the share of points with independent errors: neighbours share
+# theirs. Together the information of one point, 1/m^2.
+_RESIDUAL_M, _INDEPENDENT = 0.03, 0.05
+INFORMATION_PER_M2 = _INDEPENDENT / _RESIDUAL_M**2
+# Standard deviations of the change of velocity within a pair of sweeps about the expected one, rad/s and m/s.
+INNOVATION_RAD_S, INNOVATION_M_S = 0.3, 0.5
+# Part of the largest information that counts as none.
+_NEGLIGIBLE = 0.02
 # Part of a prior's information that stands for none, along directions that it leaves open.
-_NEXT_TO_NO_PRIOR = 1e-9
-# Part of a scan that another must have in view for the two to tell.
-_MUCH_IN_VIEW = 0.5
-# Information that keeps the normal equations solvable where neither the images nor a guess say anything.
-_LEAST_INFORMATION = 1e-3
+_NEGLIGIBLE_PRIOR = 1e-9
+# Part of a scan that another must have in view for what is not in view to be left out.
+_MOSTLY_IN_VIEW = 0.5
+# Information that keeps the normal equations solvable.
+_DAMPING = 1e-3
+
+
+class Effort(NamedTuple):
+    """How many Gauss-Newton steps at most, and every how-manieth column's points."""
+
+    iterations: int = 8
+    column_step: int = 3
+
+
+NORMAL = Effort()
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
-    """A first guess about a motion.
+class InitialEstimate:
+    """Where alignment begins.
 
     Attributes:
         T_prev_curr: (4, 4) between the middles of the sweeps.
-        information: (6, 6) its inverse covariance, for a change from the left; None: it is only where to start from.
-            It counts along the directions of which the images have less.
-        bend_information: (6, 6) what is known of the bend beyond that it mostly goes on as before; None: nothing.
-        odds: how much less likely it is than the first guess, as a number of standard deviations.
+        information: (6, 6) inverse covariance, for a change from the left; None: it is only where to start from. It
+            counts along the directions of which the images have less.
+        change_information: (6, 6) that holds the change of velocity at the expected one; None: no more than usual.
+        sigmas: how much less likely it is than the first initial estimate, in standard deviations.
     """
 
     T_prev_curr: FloatArray
     information: FloatArray | None = None
-    bend_information: FloatArray | None = None
-    odds: float = 0.0
+    change_information: FloatArray | None = None
+    sigmas: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class Aligned:
-    """Where an image lies on another.
+class Alignment:
+    """An image aligned with another.
 
     Attributes:
         T_prev_curr: (4, 4) from the middle of the current sweep to the middle of the previous one.
-        bend: (6,) velocity in the middle of the current sweep less the mean between the two middles, rotation first,
-            in radians and metres a second; in the middle of the previous sweep it is as much below the mean.
-        information: (6, 6) of the images alone, rotation first, for a change of `T_prev_curr` from the left, if
-            points scattered independently by 1 m about their planes; divide by their variance. What not knowing the
-            bend takes away is taken away.
-        guess_information: (6, 6) of the guess, along the directions in which it counts.
-        share: of the points with a normal that lie on the other image.
-        explained: of what the current scan's points in view of the other image say about the direction of
-            translation that fares worst, the part said by those that lie on it. Most of a street looks the same a
-            metre on, and lies well on itself; what would tell does not. 1 where nothing would tell.
+        velocity_change: (6,) velocity in the middle of the current sweep above the mean between the two middles,
+            rotation first, in radians and metres a second; in the middle of the previous sweep it is as much below.
+        information: (6, 6) of the images alone, for a change of `T_prev_curr` from the left, rotation first, if points
+            scattered independently by 1 m about their planes; the change of velocity is marginalised.
+        prior_information: (6, 6) of the initial estimate, along the directions in which it counts.
+        inlier_share: of the points with a normal.
+        explained: ratio of the information of inliers to that of all points in view, along the direction of
+            translation where it is least. Most of a street looks the same a metre on, and a wrong motion has many
+            inliers; the points that constrain the motion are not among them. 1 where no point constrains it.
         weakest: (3,) that direction, unit, in the previous frame.
-        residual_m: root mean square distance of those from the planes.
-        matched: how many they are.
+        residual_m: root mean square of the inliers.
+        inliers: how many.
     """
 
     T_prev_curr: FloatArray
-    bend: FloatArray
+    velocity_change: FloatArray
     information: FloatArray
-    guess_information: FloatArray
-    share: float
+    prior_information: FloatArray
+    inlier_share: float
     explained: float
     weakest: FloatArray
     residual_m: float
-    matched: int
+    inliers: int
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """The unknowns: the motion (4, 4), and the bend (6,) beyond the expected one."""
-
-    T_prev_curr: FloatArray
-    surprise: FloatArray
+def align(start: InitialEstimate, sweeps: SweepPair, effort: Effort = NORMAL) -> Alignment:
+    """Gauss-Newton on point-to-plane distances, with Geman-McClure weights whose scale shrinks from step to step."""
+    return align_each([start], sweeps, effort)[0]
 
 
-def align(guess: Guess, sweeps: SweepPair, config: AlignmentConfig) -> Aligned:
-    """Refine a motion so that the current image lies on the previous one.
-
-    Gauss-Newton on point-to-plane distances with Geman-McClure weights whose scale shrinks from step to step.
-    """
-    return align_each([guess], sweeps, config)[0]
+def align_each(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Effort = NORMAL) -> list[Alignment]:
+    """As `align`, from each of several initial estimates."""
+    cost = PointToPlane(sweeps, effort.column_step)
+    return [_align(start, sweeps, cost, effort.iterations) for start in starts]
 
 
-def align_each(guesses: Sequence[Guess], sweeps: SweepPair, config: AlignmentConfig) -> list[Aligned]:
-    """As `align`, from each of several guesses."""
-    sums = PairSums(sweeps, config)
-    return [_align(guess, sweeps, sums, config) for guess in guesses]
-
-
-def _align(guess: Guess, sweeps: SweepPair, sums: PairSums, config: AlignmentConfig) -> Aligned:
-    state, kept = _State(guess.T_prev_curr, np.zeros(6)), guess
-    for done in np.linspace(0.0, 1.0, config.iterations).tolist():
-        scale_m = config.coarse_m * (config.fine_m / config.coarse_m) ** min(1.0, done / config.anneal_share)
-        H, g = sums.normal_equations(_movement(state, sweeps), scale_m)
-        if done >= config.anneal_share and kept is guess and guess.information is not None:
-            seen = config.information_per_m2 * _information(H, config)
-            kept = replace(guess, information=_where_unseen(guess.information, seen))
-        state, moved = _step(state, H, g, kept, config)
-        if done >= config.anneal_share and moved < _ARRIVED:
+def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterations: int) -> Alignment:
+    T_prev_curr, innovation, prior = start.T_prev_curr, np.zeros(6), start
+    for done in np.linspace(0.0, 1.0, iterations).tolist():
+        scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
+        H, g = cost.normal_equations(T_prev_curr, *_velocities(T_prev_curr, innovation, sweeps), scale_m)
+        if done >= _ANNEALED and prior is start and start.information is not None:
+            seen = INFORMATION_PER_M2 * _marginal(H)
+            prior = replace(start, information=_where_unseen(start.information, seen))
+        step, change = _solve(T_prev_curr, innovation, H, g, prior)
+        T_prev_curr, innovation = exp(step) @ T_prev_curr, innovation + change
+        if done >= _ANNEALED and float(np.abs(step).max()) < _CONVERGED:
             break
-    movement = _movement(state, sweeps)
-    counted = np.zeros((6, 6)) if kept.information is None else kept.information
-    return _judge(movement, sums.tally(movement), counted, config)
+    velocity, change = _velocities(T_prev_curr, innovation, sweeps)
+    counted = np.zeros((6, 6)) if prior.information is None else prior.information
+    return _alignment(T_prev_curr, change, cost.fit(T_prev_curr, velocity, change), counted)
+
+
+def _velocities(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> tuple[FloatArray, FloatArray]:
+    """Mean velocity (6,) and its change (6,), which goes on as before but for the innovation."""
+    velocity, last = log(T_prev_curr) / sweeps.interval_s, sweeps.last
+    if last is None:
+        return velocity, innovation
+    share = sweeps.interval_s / (sweeps.interval_s + last.interval_s)
+    return velocity, innovation + share * (velocity - last.velocity)
+
+
+def _solve(
+    T_prev_curr: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, prior: InitialEstimate
+) -> tuple[FloatArray, FloatArray]:
+    """One Gauss-Newton step (6,) of the motion, from the left, and one (6,) of the innovation."""
+    H, g = INFORMATION_PER_M2 * H, INFORMATION_PER_M2 * g
+    expected = _innovation_information()
+    if prior.change_information is not None:
+        expected = expected + prior.change_information
+    H[6:, 6:] += expected
+    g[6:] += expected @ innovation
+    if prior.information is not None:
+        H[:6, :6] += prior.information
+        g[:6] += prior.information @ log(T_prev_curr @ inverse(prior.T_prev_curr))
+    H.flat[::13] += _DAMPING
+    delta = np.asarray(-np.linalg.solve(H, g), dtype=np.float64)
+    step = delta[:6] * (_LARGEST_STEP / max(float(np.abs(delta[:6]).max()), _LARGEST_STEP))
+    return step, delta[6:]
+
+
+def _innovation_information() -> FloatArray:
+    return np.diag([INNOVATION_RAD_S**-2.0] * 3 + [INNOVATION_M_S**-2.0] * 3)
 
 
 def _where_unseen(prior: FloatArray, seen: FloatArray) -> FloatArray:
-    """(6, 6) the part of a guess's information (6, 6) along directions in which the images' (6, 6) is less.
+    """(6, 6) the part of a prior's information (6, 6) along directions in which the images' (6, 6) is less.
 
     The network's errors are not independent from scan to scan: it takes small translations for smaller ones. Where the
     images decide, even a small share of it would add up to a drift.
     """
-    root, ratios, axes = _ratios(seen, prior + _NEXT_TO_NO_PRIOR * np.trace(prior) * np.eye(6))
-    kept = root @ axes[:, ratios < 1.0]
+    whole = prior + _NEGLIGIBLE_PRIOR * np.trace(prior) * np.eye(6)
+    ratios, axes = eigh(seen, whole)
+    kept = whole @ axes[:, ratios < 1.0]
     return np.asarray(kept @ kept.T)
 
 
-def _movement(state: _State, sweeps: SweepPair) -> Movement:
-    """The change of velocity goes on as before, but for the surprise."""
-    velocity, bend, last = log(state.T_prev_curr) / sweeps.interval_s, state.surprise, sweeps.last
-    if last is not None:
-        share = sweeps.interval_s / (sweeps.interval_s + last.interval_s)
-        bend = bend + share * (velocity - last.velocity)
-    return Movement(state.T_prev_curr, velocity, bend)
-
-
-def _step(state: _State, H: FloatArray, g: FloatArray, guess: Guess, config: AlignmentConfig) -> tuple[_State, float]:
-    """One Gauss-Newton step, and by how much it moved."""
-    H, g = config.information_per_m2 * H, config.information_per_m2 * g
-    expected = _expected(config)
-    if guess.bend_information is not None:
-        expected = expected + guess.bend_information
-    H[6:, 6:] += expected
-    g[6:] += expected @ state.surprise
-    if guess.information is not None:
-        away = log(state.T_prev_curr @ inverse(guess.T_prev_curr))
-        H[:6, :6] += guess.information
-        g[:6] += guess.information @ away
-    H.flat[::13] += _LEAST_INFORMATION
-    delta = -np.linalg.solve(H, g)
-    step, change = delta[:6], delta[6:]
-    step = step * (config.largest_step / max(float(np.abs(step).max()), config.largest_step))
-    return _State(exp(step) @ state.T_prev_curr, state.surprise + change), float(np.abs(step).max())
-
-
-def _expected(config: AlignmentConfig) -> FloatArray:
-    """(6, 6) inverse covariance of the surprise."""
-    return np.diag([config.surprise_rad_s**-2.0] * 3 + [config.surprise_m_s**-2.0] * 3)
-
-
-def _judge(movement: Movement, tally: Tally, guess_information: FloatArray, config: AlignmentConfig) -> Aligned:
-    """How well the images lie on one another in the end."""
-    explained, weakest = _explained(tally.in_view, tally.matched)
-    return Aligned(
-        T_prev_curr=movement.T_prev_curr,
-        bend=movement.bend,
-        information=_information(tally.H, config),
-        guess_information=guess_information,
-        share=tally.share,
-        # What leaves the other image's view on the way says nothing, unless it is most of the scan.
-        explained=explained * min(tally.share_in_view / _MUCH_IN_VIEW, 1.0),
+def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: FloatArray) -> Alignment:
+    explained, weakest = _explained(fit.in_view, fit.inlier)
+    return Alignment(
+        T_prev_curr=T_prev_curr,
+        velocity_change=change,
+        information=_marginal(fit.H),
+        prior_information=prior,
+        inlier_share=fit.inlier_share,
+        # What leaves the other image's view on the way does not count against it, unless it is most of the scan.
+        explained=explained * min(fit.share_in_view / _MOSTLY_IN_VIEW, 1.0),
         weakest=weakest,
-        residual_m=float(np.sqrt(tally.squares / max(tally.count, 1))),
-        matched=tally.count,
+        residual_m=float(np.sqrt(fit.squared_residuals / max(fit.inliers, 1))),
+        inliers=fit.inliers,
     )
 
 
-def _information(H: FloatArray, config: AlignmentConfig) -> FloatArray:
-    """(6, 6) about the motion: what is left of it when the bend is not known, by Schur's complement."""
-    across, bends = H[:6, 6:], H[6:, 6:] + _expected(config) / config.information_per_m2
-    return np.asarray(H[:6, :6] - across @ np.linalg.solve(bends, across.T), dtype=np.float64)
+def _marginal(H: FloatArray) -> FloatArray:
+    """(6, 6) information of the motion, with the change of velocity marginalised by Schur's complement."""
+    across, changes = H[:6, 6:], H[6:, 6:] + _innovation_information() / INFORMATION_PER_M2
+    return np.asarray(H[:6, :6] - across @ np.linalg.solve(changes, across.T), dtype=np.float64)
 
 
-def _explained(everything: FloatArray, matched: FloatArray) -> tuple[float, FloatArray]:
-    """The least ratio, over directions (3,), of the information of points that lie well to that of all in view.
+def _explained(in_view: FloatArray, inlier: FloatArray) -> tuple[float, FloatArray]:
+    """The least ratio, over directions (3,), of the information of inliers to that of all in view.
 
     The smallest generalised eigenvalue of the two sums (3, 3) of squared normals. To both a little is added, so that
-    directions of which hardly any point says anything do not count as missed.
+    directions that hardly any point constrains do not count as missed.
     """
-    little = _NEXT_TO_NOTHING * max(float(everything.diagonal().max()), 1.0) * np.eye(3)
-    root, ratio, vectors = _ratios(matched + little, everything + little)
-    weakest = np.linalg.solve(root.T, vectors[:, 0])
-    return float(ratio[0]), np.asarray(weakest / np.linalg.norm(weakest), dtype=np.float64)
-
-
-def _ratios(part: FloatArray, whole: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Generalised eigenvalues (N,), ascending, of two information matrices (N, N), the second positive definite.
-
-    Returns:
-        The Cholesky factor (N, N) of the second, the eigenvalues, and their axes (N, N) as columns, whitened by it.
-    """
-    root = np.linalg.cholesky(whole)
-    half = np.linalg.solve(root, part)
-    ratios, axes = np.linalg.eigh(np.linalg.solve(root, half.T))
-    return np.asarray(root, dtype=np.float64), np.asarray(ratios, dtype=np.float64), np.asarray(axes, dtype=np.float64)
+    little = _NEGLIGIBLE * max(float(in_view.diagonal().max()), 1.0) * np.eye(3)
+    ratios, axes = eigh(inlier + little, in_view + little)
+    return float(ratios[0]), np.asarray(axes[:, 0] / np.linalg.norm(axes[:, 0]), dtype=np.float64)

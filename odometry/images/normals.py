@@ -1,42 +1,221 @@
-"""Surface normals of range images: planes fitted to each pixel's neighbourhood."""
+"""Surface normals of range images: a plane fitted to the neighbourhood of each pixel.
+
+A principal component analysis of the points around each pixel whose ranges are close to its own, as in DeLORA (Nubert
+et al., ICRA 2021). Pixels that find no plane try again with a wider patch and gate.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from odometry.images import normal_kernels as kernels
-from odometry.images.normal_config import NormalConfig
-from odometry.images.normal_kernels import Floats
+from lidarslam.core.compiled import compiled
+
+Floats = NDArray[np.float32]
+
+# All in single precision, of which a processor does twice as many at once.
+_ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0))
+_TINY, _FAR = np.float32(1e-30), np.float32(np.inf)
+# A patch narrower than this share of its range is narrower than the rounding of its coordinates.
+_NARROWEST = np.float32(1e-5)
+# Range noise spreads the points of a single ring over a plane that holds the rays themselves. Such a plane, 2.3
+# degrees or less from the ray, is no surface, and which of its sides faces the sensor is chance.
+_MOST_GRAZING = np.float32(0.04)
+# Pixels of a row that are fitted together, so that the processor takes several at once.
+_BLOCK = 240
+# From one quantity of a block to the next. Were it a power of two, the processor would take a store for what the next
+# load needs, and wait.
+_STRIDE = _BLOCK + 32
 
 
-def surface_normals(image: Floats, config: NormalConfig) -> Floats:
-    """Unit normals (3, H, W) float32 that face the sensor, zero where the neighbourhood is no plane.
+class Patch(NamedTuple):
+    """The neighbourhood of a pixel, and when its points are a plane.
 
-    A principal component analysis of the points around each pixel whose ranges are close to its own, as in DeLORA
-    (Nubert et al. 2021). Neighbourhoods go on across the seam of azimuth; above and below the image nothing is.
+    Attributes:
+        rows, columns: how far it reaches up and down, and to the left and to the right.
+        gate_m: neighbours whose range differs by more are left out.
+        nearest_m: the nearest neighbour must be as close as this.
+        min_neighbours: points that are needed, the pixel's own included.
+        max_flatness: smallest eigenvalue of the scatter over the middle one, at most.
+        min_spread: middle eigenvalue over the largest one, at least.
+    """
+
+    rows: int
+    columns: int
+    gate_m: float
+    nearest_m: float = 1.0
+    min_neighbours: int = 6
+    max_flatness: float = 0.1
+    min_spread: float = 0.02
+
+
+PATCHES = (Patch(rows=1, columns=4, gate_m=0.5), Patch(rows=1, columns=8, gate_m=2.0))
+"""The first and the second try in images of 16 rows."""
+# A patch wider than high takes its tilt from the noise of a ring, and ground that seems tilted holds alignment back.
+FINE_PATCHES = (Patch(rows=2, columns=1, gate_m=0.5), Patch(rows=2, columns=2, gate_m=2.0))
+"""The same in finer images."""
+
+
+def surface_normals(image: Floats, patches: Sequence[Patch] = PATCHES) -> Floats:
+    """Unit normals (3, H, W) float32 that face the sensor, zero where no patch is a plane.
+
+    Patches go on across the seam of azimuth; above and below the image they are empty.
 
     Args:
-        image: (C, H, W) float32, C at least 4: x, y, z and range in metres in the sensor's frame, zero where empty.
-        config: which neighbours count, and which neighbourhoods are planes.
-
-    Raises:
-        ValueError: the image has another shape, or is narrower than the neighbourhood.
+        image: (4, H, W) float32 of x, y, z and range in metres in the sensor's frame, zero where empty; wider than the
+            patches.
+        patches: of the tries, in turn.
     """
-    if image.ndim != 3 or image.shape[0] < 4:
-        raise ValueError(f"an image must be (at least 4, H, W), got {image.shape}")
-    widest = max(config.columns, config.wide_columns)
-    if image.shape[2] < 2 * widest + 1:
-        raise ValueError(f"an image of {image.shape[2]} columns is narrower than the neighbourhood")
-    _, height, width = image.shape
-    padded = np.empty((4, height + 2 * config.rows, width + 2 * widest), dtype=np.float32)
-    kernels.pad(np.ascontiguousarray(image[:4], dtype=np.float32), config.rows, widest, padded)
-    normals = np.zeros((3, height, width), dtype=np.float32)
-    kernels.planes(padded, widest, _neighbourhood(config, config.gate_m, config.columns), normals)
-    if config.wide_gate_m is not None:
-        kernels.planes(padded, widest, _neighbourhood(config, config.wide_gate_m, config.wide_columns), normals)
+    normals = np.zeros((3, *image.shape[1:]), dtype=np.float32)
+    for patch in patches:
+        _fit_planes(_padded(image, patch), patch, normals)
     return normals
 
 
-def _neighbourhood(config: NormalConfig, gate_m: float, columns: int) -> kernels.Neighbourhood:
-    return kernels.Neighbourhood(
-        rows=config.rows, columns=columns, gate_m=gate_m, most_apart_m=2.0 * config.gate_m,
-        min_neighbours=config.min_neighbours, max_flatness=config.max_flatness, min_spread=config.min_spread,
-    )  # fmt: skip
+def _padded(image: Floats, patch: Patch) -> Floats:
+    """(4, H + 2 rows, W + 2 columns) columns that go round, empty rows above and below; empty is infinitely far."""
+    around = ((0, 0), (0, 0), (patch.columns, patch.columns))
+    padded = np.pad(np.pad(image, around, mode="wrap"), ((0, 0), (patch.rows, patch.rows), (0, 0)))
+    padded[3][padded[3] <= 0.0] = np.inf
+    return padded
+
+
+@compiled
+def _fit_planes(padded: Floats, patch: Patch, normals: Floats) -> None:
+    """Write the normals (3, H, W) of pixels that have none yet and lie on a plane, from an image as of `_padded`."""
+    height, width = normals.shape[1:]
+    work, found = np.empty(15 * _STRIDE, dtype=np.float32), np.empty(3 * _STRIDE, dtype=np.float32)
+    for i in range(height):
+        ranges = padded[3, i + patch.rows]
+        for begin in range(0, width, _BLOCK):
+            end, is_wanted = min(begin + _BLOCK, width), False
+            for j in range(begin, end):
+                missing = normals[0, i, j] == _ZERO and normals[1, i, j] == _ZERO and normals[2, i, j] == _ZERO
+                is_wanted |= missing and ranges[patch.columns + j] < _FAR
+            if not is_wanted:
+                continue
+            _scatter(padded, i, begin, end - begin, patch, work)
+            _fit(end - begin, work, patch, found)
+            for j in range(begin, end):
+                if normals[0, i, j] == _ZERO and normals[1, i, j] == _ZERO and normals[2, i, j] == _ZERO:
+                    for axis in range(3):
+                        normals[axis, i, j] = found[axis * _STRIDE + j - begin]
+
+
+@compiled
+def _scatter(padded: Floats, i: int, begin: int, size: int, patch: Patch, work: Floats) -> None:
+    """Write the moments of the neighbours of a block of pixels, all of row i, about each pixel itself.
+
+    Coordinates of tens of metres would leave no digits to float32.
+
+    Args:
+        padded, patch: as for `_fit_planes`.
+        i, begin, size: row, first column and number of the pixels.
+        work: (15 * STRIDE,), written: x, y, z and range of the pixels; of their neighbours the number, the squared
+            distance of the nearest, and sums of x, y, z, xx, yy, zz, xy, yz, xz.
+    """
+    work[:] = _ZERO
+    work[5 * _STRIDE : 6 * _STRIDE] = _FAR
+    middle, gate_m = begin + patch.columns, np.float32(patch.gate_m)
+    for channel in range(4):
+        row = padded[channel, i + patch.rows]
+        for k in range(size):
+            work[channel * _STRIDE + k] = row[middle + k]
+    for down in range(2 * patch.rows + 1):
+        # One by one: what is indexed by a slice in the middle is taken as not contiguous, and is not done at once.
+        x, y, z, ranges = padded[0, i + down], padded[1, i + down], padded[2, i + down], padded[3, i + down]
+        for first in range(begin, begin + 2 * patch.columns + 1):
+            itself = _FAR if down == patch.rows and first == middle else _ZERO
+            last = first + size
+            _add(size, gate_m, itself, x[first:last], y[first:last], z[first:last], ranges[first:last], work)
+
+
+@compiled
+def _add(
+    size: int, gate_m: np.float32, itself: np.float32, x: Floats, y: Floats, z: Floats, ranges: Floats, work: Floats
+) -> None:
+    """Add a neighbour of each pixel to the moments; `itself` is added to its distance."""
+    for k in range(size):
+        near = abs(ranges[k] - work[3 * _STRIDE + k]) <= gate_m
+        mask = _ONE if near else _ZERO
+        dx, dy, dz = (x[k] - work[k]) * mask, (y[k] - work[_STRIDE + k]) * mask, (z[k] - work[2 * _STRIDE + k]) * mask
+        xx, yy, zz = dx * dx, dy * dy, dz * dz
+        apart = xx + yy + zz + itself
+        apart = apart if near else _FAR
+        work[4 * _STRIDE + k] += mask
+        work[5 * _STRIDE + k] = apart if apart < work[5 * _STRIDE + k] else work[5 * _STRIDE + k]
+        work[6 * _STRIDE + k] += dx
+        work[7 * _STRIDE + k] += dy
+        work[8 * _STRIDE + k] += dz
+        work[9 * _STRIDE + k] += xx
+        work[10 * _STRIDE + k] += yy
+        work[11 * _STRIDE + k] += zz
+        work[12 * _STRIDE + k] += dx * dy
+        work[13 * _STRIDE + k] += dy * dz
+        work[14 * _STRIDE + k] += dx * dz
+
+
+@compiled
+def _fit(size: int, work: Floats, patch: Patch, found: Floats) -> None:
+    """Write the normals (3 * STRIDE,) of a block of pixels by the moments of their neighbours; zero without a plane.
+
+    Without branches, so that the processor takes several at once. The smallest eigenvalue is the root of the
+    characteristic polynomial that Newton's method finds from below; of a plane, in few steps. Where it is not small the
+    answer is too small, and still too large for a plane.
+    """
+    least_count, nearest_m2 = np.float32(patch.min_neighbours), np.float32(patch.nearest_m**2)
+    max_flatness, min_spread = np.float32(patch.max_flatness), np.float32(patch.min_spread)
+    for k in range(size):
+        x, y, z, distance = work[k], work[_STRIDE + k], work[2 * _STRIDE + k], work[3 * _STRIDE + k]
+        count, sx, sy, sz = work[4 * _STRIDE + k], work[6 * _STRIDE + k], work[7 * _STRIDE + k], work[8 * _STRIDE + k]
+        each = _ONE / (count if count > _ONE else _ONE)
+        mx, my, mz = sx * each, sy * each, sz * each
+        xx, yy, zz = work[9 * _STRIDE + k] - sx * mx, work[10 * _STRIDE + k] - sy * my, work[11 * _STRIDE + k] - sz * mz
+        xy, yz, xz = (
+            work[12 * _STRIDE + k] - sx * my, work[13 * _STRIDE + k] - sy * mz, work[14 * _STRIDE + k] - sx * mz
+        )  # fmt: skip
+        # Rounding may leave next to nothing, or less, of the scatter of points that are all but one.
+        size_m2 = xx + yy + zz
+        is_plane = count >= least_count and work[5 * _STRIDE + k] <= nearest_m2 and size_m2 > _TINY
+        scale = _ONE / (size_m2 if size_m2 > _TINY else _ONE)
+        xx, yy, zz, xy, yz, xz = xx * scale, yy * scale, zz * scale, xy * scale, yz * scale, xz * scale
+        # The characteristic polynomial is s^3 - s^2 + pairs s - determinant.
+        pairs = (xx * yy - xy * xy) + (yy * zz - yz * yz) + (zz * xx - xz * xz)
+        determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+        s = determinant / (pairs if pairs > _TINY else _ONE)
+        s = s - (((s - _ONE) * s + pairs) * s - determinant) / _slope(s, pairs)
+        s = s - (((s - _ONE) * s + pairs) * s - determinant) / _slope(s, pairs)
+        s = s - (((s - _ONE) * s + pairs) * s - determinant) / _slope(s, pairs)
+        # The other two have the sum 1 - s and this product.
+        product, half = pairs - s * (_ONE - s), _HALF * (_ONE - s)
+        left = half * half - product
+        largest = half + np.sqrt(left if left > _ZERO else _ZERO)
+        middle = product / (largest if largest > _TINY else _ONE)
+        narrowest = _NARROWEST * distance
+        is_plane = is_plane and s <= max_flatness * middle and middle >= min_spread * largest
+        is_plane = is_plane and middle * size_m2 > count * narrowest * narrowest
+        # The rows of A - s I are at right angles to the normal: the longest of their cross products is along it.
+        a, b, c = xx - s, yy - s, zz - s
+        first, second, third = b * c - yz * yz, a * c - xz * xz, a * b - xy * xy
+        off_xy, off_yz, off_xz = xz * yz - xy * c, xy * xz - a * yz, xy * yz - xz * b
+        by_first = first >= second and first >= third
+        by_second = second >= third
+        u = first if by_first else (off_xy if by_second else off_xz)
+        v = off_xy if by_first else (second if by_second else off_yz)
+        w = off_xz if by_first else (off_yz if by_second else third)
+        length = np.sqrt(u * u + v * v + w * w)
+        each = _ONE / (length if length > _TINY else _ONE)
+        away = (u * x + v * y + w * z) * each
+        is_plane = is_plane and abs(away) >= _MOST_GRAZING * distance
+        each = -each if away > _ZERO else each
+        found[k] = u * each if is_plane else _ZERO
+        found[_STRIDE + k] = v * each if is_plane else _ZERO
+        found[2 * _STRIDE + k] = w * each if is_plane else _ZERO
+
+
+@compiled
+def _slope(s: np.float32, pairs: np.float32) -> np.float32:
+    """The derivative of the characteristic polynomial, which is positive below the smallest eigenvalue."""
+    slope = (_THREE * s - _TWO) * s + pairs
+    return slope if slope > _TINY else _ONE

@@ -1,14 +1,14 @@
-"""Point clouds as range images: spherical projection."""
+"""Range images of point clouds by spherical projection."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from odometry.images import image_kernels as kernels
 
 Floats = NDArray[np.float32]
 Points = FloatArray | Floats
@@ -18,6 +18,14 @@ _STRAY_SHARE = 0.002
 # Rows of a scan with one ring only are this far apart in all: more than the noise of elevations.
 _LEAST_HEIGHT = math.radians(1.0)
 _HEIGHT_WITHOUT_POINTS = math.radians(15.0)
+# Nearer to the middle of a pixel than this, in pixels, no rounding of single precision leads out of it.
+_SURE = 0.499
+_TURN = 2.0 * math.pi
+_ZERO, _ONE, _HALF_PI, _PI, _QUARTER = (np.float32(x) for x in (0.0, 1.0, 0.5 * math.pi, math.pi, 0.25 * math.pi))
+_STEEP, _LEAST = np.float32(math.sqrt(2.0) - 1.0), np.float32(1e-30)
+_P0, _P1, _P2, _P3 = (
+    np.float32(x) for x in (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -25,10 +33,9 @@ class ImageGrid:
     """The pixels of a range image: rows by elevation from the lowest up, columns by azimuth, without a seam.
 
     Attributes:
-        rows: H.
+        rows: H, 2 or more.
         columns: W; column c covers azimuths from c to c + 1 times 2 pi / W.
-        elevation_low: elevation of the centre of row 0, rad.
-        elevation_high: elevation of the centre of row H - 1, rad. A single row covers all between the two.
+        elevation_low, elevation_high: elevations of the centres of rows 0 and H - 1, rad.
 
     Raises:
         ValueError: there are no pixels, or the elevations do not ascend.
@@ -40,7 +47,7 @@ class ImageGrid:
     elevation_high: float
 
     def __post_init__(self) -> None:
-        if self.rows < 1 or self.columns < 1:
+        if self.rows < 2 or self.columns < 1:
             raise ValueError(f"an ImageGrid needs pixels, got {self.rows} x {self.columns}")
         if not self.elevation_low < self.elevation_high:
             raise ValueError(f"elevations must ascend, got {self.elevation_low:g} to {self.elevation_high:g}")
@@ -51,36 +58,21 @@ class ImageGrid:
 
         It spans at least 1 degree, from the lowest point up; and -15 to 15 degrees if there are no points.
         """
-        elevations = elevations_of(points)
-        if not len(elevations):
+        # Coordinates of a float32 have squares that are in range, or else are no point.
+        squares = np.square(np.asarray(points, dtype=np.float32)).sum(axis=1)
+        x, y, z = np.asarray(points, dtype=np.float64)[np.isfinite(squares) & (squares > 0.0)].T
+        if not len(x):
             return cls(rows, columns, -_HEIGHT_WITHOUT_POINTS, _HEIGHT_WITHOUT_POINTS)
-        strays = int(_STRAY_SHARE * len(elevations))
-        last = len(elevations) - 1 - strays
-        ordered = np.partition(elevations, (strays, last))
+        strays = int(_STRAY_SHARE * len(x))
+        last = len(x) - 1 - strays
+        ordered = np.partition(np.arctan2(z, np.hypot(x, y)), (strays, last))
         low, high = float(ordered[strays]), float(ordered[last])
         return cls(rows, columns, low, max(high, low + _LEAST_HEIGHT))
 
     @property
     def rows_per_radian(self) -> float:
         """Of elevation."""
-        return max(self.rows - 1, 1) / (self.elevation_high - self.elevation_low)
-
-    def place(self, points: Points) -> tuple[FloatArray, FloatArray]:
-        """Where points (..., 3) lie in the image: row and column coordinates (...), continuous.
-
-        Centres of rows are at integers, and columns begin at integers: the pixel is (floor(row + 0.5),
-        floor(column)). Rows may lie outside the image; columns are in [0, W).
-        """
-        x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
-        row = (np.arctan2(z, np.hypot(x, y)) - self.centre_of_row_0) * self.rows_per_radian
-        column = np.mod(np.arctan2(y, x), 2.0 * math.pi) * (self.columns / (2.0 * math.pi))
-        # An azimuth just below 0 may be rounded to 2 pi, which is 0 again.
-        return row, np.where(column < self.columns, column, 0.0)
-
-    @property
-    def centre_of_row_0(self) -> float:
-        """Its elevation, rad: that of a single row lies in the middle of all it covers."""
-        return self.elevation_low if self.rows > 1 else 0.5 * (self.elevation_low + self.elevation_high)
+        return (self.rows - 1) / (self.elevation_high - self.elevation_low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,69 +81,110 @@ class Projection:
 
     Attributes:
         image: (4, H, W) float32 of x, y, z and range, metres; zero where no point is.
-        offsets: (H, W) float32 seconds from the middle of the sweep; zero where no point is, or no time is known.
         index: (H, W) int64, the point in each pixel; -1 where there is none.
     """
 
     image: Floats
-    offsets: Floats
     index: NDArray[np.int64]
 
 
-def project(points: Points, grid: ImageGrid, rings: NDArray[np.integer] | None = None) -> Projection:
-    """The nearest of the points (M, 3), metres, in each pixel; of equally near ones, the first.
+def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
+    """The nearest of the points (M, 3), metres, in each pixel of several images; of equally near ones, the first.
 
-    Left out are points that are not finite, at the origin, or above or below the grid. With rings (M,), 0 the lowest
-    laser and negative ones left out, the row is ring // k in place of the elevation, where k is the least with which
-    all rings fit into the H rows: the ring itself, if there are no more than H.
+    Points that are not finite, at the origin, or above or below a grid are left out.
     """
-    return project_sweep(points, None, 0.0, (grid,), rings)[0]
+    x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ranges = np.sqrt(x * x + y * y + z * z)
+    elevations, azimuths = np.empty_like(x), np.empty_like(x)
+    write_angles(x, y, z, elevations, azimuths)
+    projections = []
+    for grid in grids:
+        index = np.full(grid.rows * grid.columns, -1)
+        nearest = np.full(len(index), np.inf, dtype=np.float32)
+        low, per_radian = grid.elevation_low, grid.rows_per_radian
+        _keep_nearest(x, y, z, ranges, elevations, azimuths, grid.rows, grid.columns, low, per_radian, index, nearest)
+        image = np.zeros((4, len(index)), dtype=np.float32)
+        _write_pixels(x, y, z, ranges, index, image)
+        shape = (grid.rows, grid.columns)
+        projections.append(Projection(image.reshape(4, *shape), index.reshape(shape)))
+    return projections
 
 
-def project_sweep(
-    points: Points, times: FloatArray | None, middle: float, grids: tuple[ImageGrid] | tuple[ImageGrid, ImageGrid],
-    rings: NDArray[np.integer] | None = None,
-) -> list[Projection]:  # fmt: skip
-    """As `project`, on one grid or two at a time, with the points' times (M,), of which `middle` is that of the sweep.
+@compiled
+def _keep_nearest(
+    x: Floats, y: Floats, z: Floats, ranges: Floats, elevations: Floats, azimuths: Floats,
+    height: int, width: int, low: float, per_radian: float, index: NDArray[np.int64], nearest: Floats,
+) -> None:  # fmt: skip
+    """Write the index of the nearest point (H * W,) of each pixel, and its range.
 
-    Rings are for the first grid.
+    Angles of single precision decide the pixel of all points but those next to its border, whose angles are taken anew.
     """
-    rows = np.empty(0, dtype=np.int64) if rings is None else _rows_of_rings(rings, grids[0].rows)
-    rasters = [_raster(grid) for grid in grids]
-    points = cast(Points, np.ascontiguousarray(points))
-    kernels.nearest_in_pixels(points, rows, rasters[0], rasters[1] if len(rasters) > 1 else _NO_RASTER)
-    known = np.empty(0) if times is None else times
-    return [_projection(points, known, middle, grid, raster) for grid, raster in zip(grids, rasters, strict=True)]
+    for i in range(len(ranges)):
+        if not (ranges[i] > 0.0 and ranges[i] < np.inf):
+            continue
+        azimuth = np.float64(azimuths[i])
+        across = (azimuth + _TURN if azimuth < 0.0 else azimuth) * (width / _TURN)
+        up = (elevations[i] - low) * per_radian + 0.5
+        row, column = int(up), int(across)  # below 0 it is cut to more, and so is not sure
+        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+        if abs(up - row - 0.5) > _SURE:
+            row = int(row_of(math.atan2(pz, math.sqrt(px * px + py * py)), low, per_radian))
+        if abs(across - column - 0.5) > _SURE:
+            column = int(column_of(math.atan2(py, px), width))
+        if row >= 0 and row < height:
+            pixel = row * width + column
+            if ranges[i] < nearest[pixel]:
+                index[pixel], nearest[pixel] = i, ranges[i]
 
 
-_NO_RASTER = kernels.Raster(0, 1, 0.0, 1.0, np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32))
+@compiled
+def _write_pixels(x: Floats, y: Floats, z: Floats, ranges: Floats, index: NDArray[np.int64], image: Floats) -> None:
+    """Write the points of an image (4, H * W), zero before."""
+    for pixel in range(len(index)):
+        n = index[pixel]
+        if n >= 0:
+            image[0, pixel], image[1, pixel], image[2, pixel], image[3, pixel] = x[n], y[n], z[n], ranges[n]
 
 
-def _raster(grid: ImageGrid) -> kernels.Raster:
-    pixels = grid.rows * grid.columns
-    index, ranges = np.empty(pixels, dtype=np.int64), np.empty(pixels, dtype=np.float32)
-    return kernels.Raster(grid.rows, grid.columns, grid.centre_of_row_0, grid.rows_per_radian, index, ranges)
+@compiled
+def row_of(elevation: float, low: float, rows_per_radian: float) -> float:
+    """A whole number, which may lie outside of the image."""
+    return float(np.floor((elevation - low) * rows_per_radian + 0.5))
 
 
-def _projection(
-    points: Points, times: FloatArray, middle: float, grid: ImageGrid, raster: kernels.Raster
-) -> Projection:
-    shape = (grid.rows, grid.columns)
-    image, offsets = np.empty((4, *shape), dtype=np.float32), np.empty(shape, dtype=np.float32)
-    kernels.write_pixels(
-        points, times, middle, raster.shown, raster.ranges, image.reshape(4, -1), offsets.reshape(-1)
-    )  # fmt: skip
-    return Projection(image, offsets, raster.shown.reshape(shape))
+@compiled
+def column_of(azimuth: float, width: int) -> float:
+    """A whole number inside the image."""
+    azimuth = azimuth + _TURN if azimuth < 0.0 else azimuth
+    column = np.floor(azimuth * (width / _TURN))
+    return column if column < width - 1.0 else width - 1.0  # NaN lies in the last column
 
 
-def _rows_of_rings(rings: NDArray[np.integer], rows: int) -> NDArray[np.int64]:
-    lasers = np.asarray(rings, dtype=np.int64)
-    return lasers // (max(int(lasers.max()), 0) // rows + 1) if len(lasers) else lasers
+@compiled
+def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: Floats) -> None:
+    """Write the angles of points to single precision, in loops each of which takes several at once."""
+    for i in range(len(x)):
+        elevations[i] = _arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
+    for i in range(len(x)):
+        azimuths[i] = _arc_tangent(y[i], x[i])
 
 
-def elevations_of(points: Points) -> FloatArray:
-    """(N,) radians, of those of the points (M, 3) that are finite and not at the origin."""
-    # Coordinates of a float32 have squares that are in range, or else are no point.
-    squares = np.square(np.asarray(points, dtype=np.float32)).sum(axis=1)
-    x, y, z = np.asarray(points, dtype=np.float64)[np.isfinite(squares) & (squares > 0.0)].T
-    return np.asarray(np.arctan2(z, np.hypot(x, y)), dtype=np.float64)
+@compiled
+def _arc_tangent(y: np.float32, x: np.float32) -> np.float32:
+    """atan2 in single precision without branches, so that the processor takes several at once; NaN for NaN.
+
+    Cephes Mathematical Library, atanf.c (Moshier, 1989).
+    """
+    ax, ay = abs(x), abs(y)
+    large = ax if ax > ay else ay
+    small = ay if ax > ay else ax
+    t = small / (large if large > _LEAST else _LEAST)
+    steep = t > _STEEP
+    r = (t - _ONE if steep else t) / (t + _ONE if steep else _ONE)
+    z = r * r
+    angle = (((_P0 * z + _P1) * z + _P2) * z + _P3) * z * r + r
+    angle = angle + (_QUARTER if steep else _ZERO)
+    angle = _HALF_PI - angle if ay > ax else angle
+    angle = _PI - angle if x < _ZERO else angle
+    return -angle if y < _ZERO else angle

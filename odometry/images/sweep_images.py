@@ -1,104 +1,123 @@
-"""From scans to the images that network and alignment work on."""
+"""Scans as the range images that the network and alignment work on."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
-from odometry.images.image_config import ImageConfig
-from odometry.images.normal_config import NormalConfig
-from odometry.images.normals import surface_normals
-from odometry.images.projection import ImageGrid, Points, Projection, project_sweep
-from odometry.images.sweeps import SweepImages
+from lidarslam.core.state import Shape, Stateful
+from odometry.config import ImageConfig
+from odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals
+from odometry.images.projection import Floats, ImageGrid, Points, Projection, project
 
-# A scan of fewer points, as of a covered sensor, does not tell which elevations the sensor sees.
+# The grid of a scan of fewer points, as of a covered sensor, is replaced by that of a scan of more.
 _ENOUGH_POINTS = 200
-# What alignment gets at most. Finer sensors have rings closer together than their points scatter.
+# Finer sensors have rings closer together than their points scatter.
 _MOST_ROWS = 64
 # Numbers of rows that are tried where they are not known, the finest first.
 _ROWS = (64, 48, 32)
 # Pixels filled in as many rows, as a share of those filled in the network's, that make them the sensor's own.
 _FILLED, _FILLED_BY_RINGS = 0.8, 0.5
-# Part of the columns in which a sensor that turns sees something. The points of one that does not lie in no rows.
+# Columns that a rotating sensor fills at least. The points of others do not lie in rows.
 _SEEN_COLUMNS = 0.5
-# Where rows are close together a patch need not be wide; one that is wider than high takes its tilt from the noise of
-# a ring, and the ground that seems tilted holds alignment back.
-_FINE_PATCH = {"rows": 2, "columns": 1, "wide_columns": 2}
+
+
+@dataclass(frozen=True, eq=False)
+class SweepImages:
+    """A sweep as images, float32.
+
+    Attributes:
+        points: (3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
+        normals: (3, H, W) unit, zero where there is none.
+        offsets: (H, W) seconds from the middle of the sweep; all zero where unknown or already compensated.
+        low, high: elevation of the centres of the first and the last row, radians.
+    """
+
+    points: Annotated[Floats, Shape(3, None, None)]
+    normals: Annotated[Floats, Shape(3, None, None)]
+    offsets: Annotated[Floats, Shape(None, None)]
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if self.points.shape != self.normals.shape or self.points.shape[1:] != self.offsets.shape:
+            raise ValueError(
+                f"images of one sweep differ: {self.points.shape}, {self.normals.shape}, {self.offsets.shape}"
+            )
+
+    def median_range_m(self) -> float:
+        """Of all points, the lower of the two in the middle; 0 when there are none."""
+        x, y, z = self.points
+        squares = x * x + y * y + z * z
+        seen = squares[squares > 0.0]
+        return float(np.sqrt(np.partition(seen, (len(seen) - 1) // 2)[(len(seen) - 1) // 2])) if len(seen) else 0.0
+
+    def share_with_normal(self) -> float:
+        """Of the pixels that have a point; 0 when there are none."""
+        points, normals = (int(np.count_nonzero((part != 0.0).any(axis=0))) for part in (self.points, self.normals))
+        return normals / max(points, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ScanImages:
-    """A scan as it is shown to the network and to alignment; both may be shown the same."""
+    """A scan as the network and alignment see it; both may see the same."""
 
     network: SweepImages
     alignment: SweepImages
 
 
-class Imager:
-    """Makes images of one sensor's scans; the rows are those of the first scan with points enough.
+class Imager(Stateful):
+    """Makes images of one sensor's scans, on the grid of the first scan with points enough.
 
-    Until there is one, they are those of the scan that had most. The network's images are always of the same size;
-    alignment sees as many rows as the sensor has, because an image that shows the nearest point of several rings holds
-    it back along the way.
-
-    Args:
-        config: of the network's images.
-        alignment_rows: of alignment's; None: as many as the sensor has rings, from those of the network to 64.
+    The network's images are always of the same size. Alignment sees as many rows as the sensor has rings, from those of
+    the network to 64, because an image that shows the nearest point of several rings biases it along the way.
     """
 
-    def __init__(self, config: ImageConfig, alignment_rows: int | None = None) -> None:
+    _grid: ImageGrid | None
+    _grid_points: int  # of the scan that the grid is from
+    _alignment_rows: int
+
+    def __init__(self, config: ImageConfig) -> None:
         self._config = config
-        self._asked_rows = alignment_rows
-        self._grid: ImageGrid | None = None
+        self._grid = None
+        self._grid_points = 0
         self._alignment_rows = config.rows
-        self._grid_points = 0  # of the scan that the grid is from
 
-    def state(self) -> State:
-        """The elevations of the rows, how many alignment sees, and how many points they are from."""
-        grid = self._grid
-        limits = None if grid is None else {"low": grid.elevation_low, "high": grid.elevation_high}
-        return {"limits": limits, "alignment_rows": self._alignment_rows, "points": self._grid_points}
-
-    def restore(self, saved: Saved) -> None:
-        """Go on from a state."""
-        self._grid = saved.optional("limits", self._grid_between)
-        self._alignment_rows = saved.integer("alignment_rows")
-        self._grid_points = saved.integer("points")
-
-    def _grid_between(self, limits: Saved) -> ImageGrid:
-        low, high = limits.number("low"), limits.number("high")
-        return ImageGrid(self._config.rows, self._config.columns, low, high)
+    def _after_restore(self) -> None:
+        size = (self._config.rows, self._config.columns)
+        if self._grid is not None and (self._grid.rows, self._grid.columns) != size:
+            raise ValueError(f"the images are not {size[0]} x {size[1]}")
+        if not self._config.rows <= self._alignment_rows <= max(_MOST_ROWS, self._config.rows):
+            raise ValueError(f"{self._alignment_rows} rows are no image")
 
     def images(self, scan: Scan) -> ScanImages:
         """The scan as images, normals included."""
         grid = self._grid_of(scan)
-        rings = scan.rings if self._config.order == "ring" else None
-        times, middle = scan.time_offsets, middle_offset_s(scan)
         if self._alignment_rows == grid.rows:
-            (projection,) = project_sweep(scan.points, times, middle, (grid,), rings)
-            images = _with_normals(projection, grid, self._config.normals)
-            return ScanImages(images, images)
+            coarse = _images(project(scan.points, [grid])[0], grid, scan)
+            return ScanImages(coarse, coarse)
         fine = ImageGrid(self._alignment_rows, grid.columns, grid.elevation_low, grid.elevation_high)
-        shown = project_sweep(scan.points, times, middle, (grid, fine), rings)
-        normals = self._config.normals
-        fine_normals = normals.model_copy(update=_FINE_PATCH) if fine.rows > grid.rows else normals
-        return ScanImages(_with_normals(shown[0], grid, normals), _with_normals(shown[1], fine, fine_normals))
+        shown = project(scan.points, [grid, fine])
+        return ScanImages(_images(shown[0], grid, scan), _images(shown[1], fine, scan, is_fine=True))
 
     def _grid_of(self, scan: Scan) -> ImageGrid:
-        """The grid for a scan, which is that of an earlier one unless this one tells more."""
         if self._grid is None or self._grid_points < min(_ENOUGH_POINTS, len(scan)):
             points = scan.points.astype(np.float32)
             self._grid = ImageGrid.around(points, self._config.rows, self._config.columns)
             self._grid_points = len(scan)
-            self._alignment_rows = self._asked_rows or rows_of_sensor(points, scan.rings, self._grid)
+            self._alignment_rows = rows_of_sensor(points, scan.rings, self._grid)
         return self._grid
 
 
-def _with_normals(projection: Projection, grid: ImageGrid, config: NormalConfig) -> SweepImages:
-    normals = surface_normals(projection.image, config)
-    return SweepImages(projection.image[:3], normals, projection.offsets, grid.elevation_low, grid.elevation_high)
+def _images(projection: Projection, grid: ImageGrid, scan: Scan, is_fine: bool = False) -> SweepImages:
+    offsets = np.zeros(projection.index.shape, dtype=np.float32)
+    if scan.time_offsets is not None:
+        seen = projection.index >= 0
+        offsets[seen] = scan.time_offsets[projection.index[seen]] - middle_offset_s(scan)
+    normals = surface_normals(projection.image, FINE_PATCHES if is_fine else PATCHES)
+    return SweepImages(projection.image[:3], normals, offsets, grid.elevation_low, grid.elevation_high)
 
 
 def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageGrid) -> int:
@@ -118,7 +137,7 @@ def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageG
 def _shown(points: Points, grid: ImageGrid, rows: int) -> NDArray[np.bool_]:
     """(rows, W) which pixels have a point, in an image of so many rows."""
     fine = ImageGrid(rows, grid.columns, grid.elevation_low, grid.elevation_high)
-    return project_sweep(points, None, 0.0, (fine,))[0].index >= 0
+    return project(points, [fine])[0].index >= 0
 
 
 def middle_offset_s(scan: Scan) -> float:

@@ -1,10 +1,11 @@
-"""Whether two consecutive scans fit each other under a motion: a check that no odometry can talk itself out of.
+"""Consistency of consecutive scans under a motion, by point-to-plane distances; independent of every odometry.
 
-Points of the new scan are taken to the previous scan's frame and held against small planes through its points. Odometry
-that goes astray lays walls where there are none, and the share of points that find their plane falls.
+Points of the new scan are taken to the previous scan's frame and compared with planes through its points. A wrong
+motion lays walls where there are none, and the inlier ratio falls.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,20 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
-from odometry.config import ConsistencyConfig
 
+# Inlier ratios under which a scan is degraded, and lost.
+_DEGRADED_BELOW, _LOST_BELOW = 0.70, 0.40
+# Largest residual of an inlier: as a fraction of its range, and close to the sensor.
+_GATE_RATIO, _LEAST_GATE_M = 0.02, 0.10
+# Points of the new scan that are looked up in the previous one.
+_QUERIES = 1000
 _PLANE_POINTS = 6
 # Thickness of a neighbourhood that still counts as a plane, relative to its extent (ratio of standard deviations).
 _MAX_THICKNESS = 0.3
-# With fewer planes than this nothing can be said, about the scan or about one direction.
+# With fewer planes the ratio is unknown, of the scan or of one direction.
 _MIN_PLANES = 20
 # Points are thinned to cells of this fraction of the median range, so that the dense ground does not outvote the rest.
 _CELL_PER_RANGE = 0.03
@@ -30,11 +36,11 @@ _MAX_POINTS = 20_000
 
 @dataclass(frozen=True)
 class Consistency:
-    """How well a scan lies on the previous one.
+    """How well a scan fits the previous one.
 
     Attributes:
-        residual_m: median point-to-plane distance; None when there were too few planes to tell.
-        inlier_ratio: share of the looked-up points that lie on their plane, 0 to 1; None likewise.
+        residual_m: median point-to-plane distance; None with too few planes.
+        inlier_ratio: of the points that have a plane, 0 to 1; None likewise.
         status: what the ratio means.
     """
 
@@ -43,22 +49,15 @@ class Consistency:
     status: Status
 
 
-class ConsistencyCheck:
-    """Remembers one scan and holds the next against it."""
+class ConsistencyCheck(Stateful):
+    """Compares each scan with the one before."""
 
-    def __init__(self, config: ConsistencyConfig) -> None:
-        self._config = config
-        self._held: FloatArray | None = None
-        self._T_held_prev = np.eye(4)
+    _reference: Annotated[FloatArray, Shape(None, 3)] | None
+    _T_reference_prev: Annotated[FloatArray, Shape(4, 4)]
 
-    def state(self) -> State:
-        """The scan that is held, and the way since."""
-        return {"held": self._held, "T_held_prev": self._T_held_prev}
-
-    def restore(self, saved: Saved) -> None:
-        """Go on from a state."""
-        self._held = saved.optional_array("held", (None, 3))
-        self._T_held_prev = saved.array("T_held_prev", (4, 4))
+    def __init__(self) -> None:
+        self._reference = None
+        self._T_reference_prev = np.eye(4)
 
     @staticmethod
     def sample(scan: Scan) -> Scan:
@@ -66,37 +65,31 @@ class ConsistencyCheck:
         return scan.select(np.arange(0, len(scan), max(1, len(scan) // _MAX_POINTS)))
 
     def check(self, points: FloatArray, T_prev_curr: FloatArray) -> Consistency:
-        """Hold a scan's motion-compensated points (N, 3) against the previous call's.
+        """Compare a scan's motion-compensated points (N, 3) with the previous call's.
 
-        The first scan has nothing to be held against and is ok. A scan that is all but empty is lost, and the next one
-        is held against the one before it.
+        The first scan is ok. A scan that is all but empty is lost, and the next one is compared with the one before it.
         """
-        even = _thin_evenly(points)
-        T_held_curr = self._T_held_prev @ T_prev_curr
-        if len(even) < _MIN_PLANES:  # go on holding the last scan that had something to see
-            self._T_held_prev = T_held_curr
+        thinned = _thinned(points)
+        T_reference_curr = self._T_reference_prev @ T_prev_curr
+        if len(thinned) < _MIN_PLANES:
+            self._T_reference_prev = T_reference_curr
             return Consistency(None, None, Status.LOST)
-        held, self._held, self._T_held_prev = self._held, even, np.eye(4)
-        if held is None:
+        reference, self._reference, self._T_reference_prev = self._reference, thinned, np.eye(4)
+        if reference is None:
             return Consistency(None, None, Status.OK)
-        queries = _every_nth(even, self._config.queries)
-        ranges = np.linalg.norm(queries, axis=1)
-        distances, facing = plane_distances(transform_points(T_held_curr, queries), held)
+        queries = thinned[:: max(1, len(thinned) // _QUERIES)]
+        distances, facing = plane_distances(transform_points(T_reference_curr, queries), reference)
         known = np.isfinite(distances)
         if np.count_nonzero(known) < _MIN_PLANES:
             return Consistency(None, None, Status.DEGRADED)
-        gate = np.maximum(self._config.gate_min_m, self._config.gate_ratio * ranges)
-        ratio = _worst_share(distances[known] < gate[known], facing[known])
-        return Consistency(float(np.median(distances[known])), ratio, self._judge(ratio))
-
-    def _judge(self, inlier_ratio: float) -> Status:
-        if inlier_ratio < self._config.lost_below:
-            return Status.LOST
-        return Status.DEGRADED if inlier_ratio < self._config.degraded_below else Status.OK
+        gate = np.maximum(_LEAST_GATE_M, _GATE_RATIO * np.linalg.norm(queries, axis=1))
+        ratio = _least_ratio(distances[known] < gate[known], facing[known])
+        status = Status.LOST if ratio < _LOST_BELOW else Status.DEGRADED if ratio < _DEGRADED_BELOW else Status.OK
+        return Consistency(float(np.median(distances[known])), ratio, status)
 
 
 def plane_distances(queries: FloatArray, points: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Hold queries (M, 3) against the planes through their nearest points.
+    """Distances of queries (M, 3) from the planes through their nearest points.
 
     Returns:
         Distances (M,), NaN where the nearest points form no plane, and the axis (M,), 0 to 2, that the plane's normal
@@ -113,24 +106,19 @@ def plane_distances(queries: FloatArray, points: FloatArray) -> tuple[FloatArray
     return np.where(flat, distance, np.nan), np.abs(normals).argmax(axis=1)
 
 
-def _worst_share(inlier: NDArray[np.bool_], facing: NDArray[np.intp]) -> float:
+def _least_ratio(inlier: NDArray[np.bool_], facing: NDArray[np.intp]) -> float:
     """The smallest inlier ratio among the planes facing x, y and z.
 
-    Most points lie on the ground, which fits under every motion along it; what faces forwards or sideways tells.
+    Most points lie on the ground, which fits under every motion along it.
     """
     groups = [inlier[facing == axis] for axis in range(3)]
-    shares = [float(group.mean()) for group in groups if len(group) >= _MIN_PLANES]
-    return min(shares, default=float(inlier.mean()))
+    ratios = [float(group.mean()) for group in groups if len(group) >= _MIN_PLANES]
+    return min(ratios, default=float(inlier.mean()))
 
 
-def _thin_evenly(points: FloatArray) -> FloatArray:
+def _thinned(points: FloatArray) -> FloatArray:
     """One point a cell, the cells sized by the scene."""
     if not len(points):
         return points
     cell = _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1)))
     return np.asarray(points[one_per_cell(points, cell)], dtype=np.float64)
-
-
-def _every_nth(points: FloatArray, count: int) -> FloatArray:
-    """About `count` points, taken at equal steps through the sweep."""
-    return points[:: max(1, len(points) // count)]

@@ -6,14 +6,13 @@ which belongs to the end of the sweep, is expressed at the scan's stamp.
 
 import contextlib
 import fcntl
-import json
 import logging
+import pickle
 import subprocess
 import sys
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
-from typing import cast
+from typing import IO, Any, cast
 
 import numpy as np
 
@@ -23,20 +22,14 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from odometry.config import KissConfig
 from odometry.interface import Motion
-from odometry.methods.kiss_worker import READY, REPLY_FLOATS, REQUEST_HEADER, read_array
+from odometry.methods.kiss_worker import send
 
 _log = logging.getLogger(__name__)
 
 # Fewer points do not fix six degrees of freedom, and one alone makes the library abort.
 _MIN_POINTS = 10
-
-
-@dataclass(frozen=True, eq=False)
-class _TimedPose:
-    """KISS-ICP's pose and the instant it belongs to."""
-
-    time: float
-    T_map_lidar: FloatArray
+# A scan in three pieces instead of fifty saves the switching.
+_PIPE_BYTES = 1 << 20
 
 
 class OdometryError(LidarSlamError):
@@ -50,35 +43,38 @@ class _Worker:
         OdometryError: it did not start.
     """
 
-    def __init__(self, settings: str) -> None:
+    def __init__(self, settings: dict[str, Any]) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "odometry.methods.kiss_worker", settings],
+            [sys.executable, "-m", "odometry.methods.kiss_worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            bufsize=0,
             cwd=Path(__file__).resolve().parents[2],  # a folder called odometry where the user stands must not win
         )
-        _widen(cast(FileIO, self._process.stdin))
-        if cast(FileIO, self._process.stdout).read(1) != READY:
-            raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?")
+        self._requests, self._replies = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
+        with contextlib.suppress(AttributeError, OSError):  # Linux alone can, and may have a lower limit
+            fcntl.fcntl(self._requests, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        try:
+            self._exchange(settings)
+        except (EOFError, OSError) as error:
+            raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?") from error
 
-    def register(self, points: FloatArray, stamps: FloatArray) -> FloatArray:
-        """Send one scan, wait for the reply (17,).
+    def register(self, points: FloatArray, offsets: FloatArray) -> tuple[FloatArray, int]:
+        """The pose (4, 4) after one scan, and how many points were registered.
 
         Raises:
             EOFError, OSError: the child died.
         """
-        stdin, stdout = cast(FileIO, self._process.stdin), cast(FileIO, self._process.stdout)
-        for part in (REQUEST_HEADER.pack(len(points), len(stamps)), _bytes(points), _bytes(stamps)):
-            view = memoryview(part)
-            while view:
-                view = view[stdin.write(view) :]
-        return read_array(stdout, (REPLY_FLOATS,))
+        pose, count = self._exchange((points, offsets))
+        return pose, count
+
+    def _exchange(self, message: object) -> Any:
+        send(cast(Any, self._requests), message)
+        return pickle.load(self._replies)
 
     def close(self) -> int:
         """End the child; its exit status, negative for the signal that ended it."""
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
+        for stream in (self._requests, self._replies):
+            with contextlib.suppress(OSError):  # what was not written yet finds no reader
                 stream.close()
         try:
             return self._process.wait(timeout=5.0)
@@ -87,13 +83,20 @@ class _Worker:
             return self._process.wait()
 
 
+@dataclass(frozen=True, eq=False)
+class _TimedPose:
+    """KISS-ICP's pose and the instant it belongs to."""
+
+    time: float
+    T_map_lidar: FloatArray
+
+
 class KissOdometry:
     """KISS-ICP, untouched, with motions between the stamps of consecutive scans."""
 
     def __init__(self, config: KissConfig) -> None:
-        self._settings = json.dumps(_library_settings(config))
-        self._deskews = config.deskew
-        self._worker: _Worker | None = _Worker(self._settings)
+        self._config = config
+        self._worker: _Worker | None = _Worker(_library_settings(config))
         self._registered = 0  # scans in the child's map
         self._last: _TimedPose | None = None  # the child's last pose, at the time it belongs to
         self._previous: _TimedPose | None = None  # the previous scan, at its stamp
@@ -106,27 +109,22 @@ class KissOdometry:
         offsets = self._usable_offsets(scan)
         try:
             if self._worker is None:
-                self._worker = _Worker(self._settings)
-            reply = self._worker.register(scan.points, np.empty(0) if offsets is None else offsets)
+                self._worker = _Worker(_library_settings(self._config))
+            T_map_lidar, points_used = self._worker.register(scan.points, offsets)
         except (EOFError, OSError):
             return self._predict(scan.stamp, self._bury_worker())
-        pose = _TimedPose(self._pose_time(scan.stamp, offsets), reply[:16].reshape(4, 4))
-        last, self._last = self._last, pose
+        last, self._last = self._last, _TimedPose(self._pose_time(scan.stamp, offsets), T_map_lidar)
         self._registered += 1
         if last is None:
-            return self._begin(_TimedPose(scan.stamp, pose.T_map_lidar))
-        return Motion(self._motion(last, pose, scan.stamp), int(reply[16]))
+            return self._begin(_TimedPose(scan.stamp, T_map_lidar))
+        return Motion(self._motion(last, self._last, scan.stamp), points_used)
 
     def state(self) -> State | None:
         """None: the library does not give its state away."""
         return None
 
     def restore(self, saved: Saved) -> None:
-        """There is no state to go on from.
-
-        Raises:
-            InputError: always.
-        """
+        """There is no state to go on from; always an InputError."""
         raise saved.refuse("KISS-ICP has no state")
 
     def close(self) -> None:
@@ -135,19 +133,19 @@ class KissOdometry:
             self._worker.close()
             self._worker = None
 
-    def _usable_offsets(self, scan: Scan) -> FloatArray | None:
-        """The scan's times if the library can divide by their span, else None (it then does not deskew)."""
-        if not self._deskews or scan.time_offsets is None or np.ptp(scan.time_offsets) <= 0.0:
-            return None
+    def _usable_offsets(self, scan: Scan) -> FloatArray:
+        """The scan's times if the library can divide by their span, else none (it then does not deskew)."""
+        if not self._config.deskew or scan.time_offsets is None or np.ptp(scan.time_offsets) <= 0.0:
+            return np.empty(0)
         return scan.time_offsets
 
-    def _pose_time(self, stamp: float, offsets: FloatArray | None) -> float:
-        """The instant KISS-ICP's next pose belongs to.
+    def _pose_time(self, stamp: float, offsets: FloatArray) -> float:
+        """The instant of KISS-ICP's next pose.
 
         It moves every point to the end of the sweep with the motion before. The first two scans come before any
         motion is known and stay smeared over the sweep: what is registered then is the sweep's middle.
         """
-        if offsets is None:
+        if not len(offsets):
             return stamp
         if self._registered < 2:
             return stamp + 0.5 * float(offsets.min() + offsets.max())
@@ -160,17 +158,17 @@ class KissOdometry:
         interval = pose.time - last.time
         if interval > 0.0:
             self._velocity = log(inverse(last.T_map_lidar) @ pose.T_map_lidar) / interval
-        if self._registered == 2:  # only now is there a velocity that says where the first stamp was
+        if self._registered == 2:  # the first velocity, and with it the pose at the first stamp
             previous = self._at(previous.time, last)
         self._previous = self._at(stamp, pose)
         return inverse(previous.T_map_lidar) @ self._previous.T_map_lidar
 
     def _at(self, time: float, pose: _TimedPose) -> _TimedPose:
-        """Where the sensor was at a time close to a pose, at the current velocity."""
+        """Extrapolate a pose at the current velocity."""
         return _TimedPose(time, pose.T_map_lidar @ exp(self._velocity * (time - pose.time)))
 
     def _begin(self, first: _TimedPose) -> Motion:
-        """The first scan of a map; nothing tells how it lies to the scans before, if there were any."""
+        """The first scan of a map, which has no relation to the scans before, if there were any."""
         previous, self._previous = self._previous, first
         if previous is None:
             return Motion(np.eye(4), 0)
@@ -193,30 +191,12 @@ class KissOdometry:
         return message
 
 
-def _widen(pipe: FileIO) -> None:
-    """Let a pipe hold more than the usual 64 kB: a scan in three pieces instead of fifty saves the switching."""
-    with contextlib.suppress(AttributeError, OSError):  # Linux alone can, and may have a lower limit
-        fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 1 << 20)
-
-
-def _bytes(array: FloatArray) -> memoryview | bytes:
-    """An array's bytes, row by row, without a copy where it lies so in memory."""
-    return np.ascontiguousarray(array).data.cast("B") if array.size else b""
-
-
-def _library_settings(config: KissConfig) -> dict[str, dict[str, object]]:
+def _library_settings(config: KissConfig) -> dict[str, Any]:
+    """The sections of the library's own configuration."""
     voxel_size = config.voxel_size_m or config.max_range_m / 100.0
     return {
         "data": {"max_range": config.max_range_m, "min_range": config.min_range_m, "deskew": config.deskew},
         "mapping": {"voxel_size": voxel_size, "max_points_per_voxel": config.max_points_per_voxel},
-        "registration": {
-            "max_num_iterations": config.max_iterations,
-            "convergence_criterion": config.convergence,
-            "max_num_threads": config.threads,
-        },
-        "adaptive_threshold": {
-            "initial_threshold": config.initial_threshold_m,
-            "min_motion_th": config.min_motion_m,
-            "fixed_threshold": config.fixed_threshold_m,
-        },
+        "registration": {"max_num_threads": config.threads},
+        "adaptive_threshold": {"initial_threshold": config.initial_threshold_m},
     }

@@ -1,13 +1,13 @@
-"""Candidates of the motion between two scans: the highest peaks of the scores that the default network gives.
+"""Candidates of the motion between two scans: the highest peaks of the correlation scores of the default network.
 
-Each peak of the scores of turns is followed; the current scan, seen from above and turned by it, is
-correlated with the previous one over all shifts by the fast Fourier transform, and each peak there is a candidate.
+Each peak of the scores of turns is followed; the current scan, seen from above and turned by it, is correlated with the
+previous one over all shifts by the fast Fourier transform, and each peak there is a candidate.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,7 @@ from scipy import fft
 
 from lidarslam.core.geometry import FloatArray
 from odometry.images.bird_eye import MOST_CELLS, SHIFTS, bird_eye
-
-Floats = NDArray[np.float32]
+from odometry.images.projection import Floats
 
 # Turns and shifts that are followed, and the least probability beside the best one's.
 _TURNS, _SHIFT_PEAKS = 2, 3
@@ -25,10 +24,13 @@ _LEAST_PROBABILITY = 0.02
 _NEAR_COLUMNS, _NEAR_CELLS = 6, 4
 _NEVER = np.float32(-1e4)
 
+Graph = Callable[..., list[Floats]]
+"""A part of a network on one scan or one pair: float32 arrays in, float32 arrays out."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A motion that is possible by a network's scores.
+    """A motion that is likely by a network's scores.
 
     Attributes:
         T_prev_curr: (4, 4).
@@ -51,7 +53,7 @@ _NO_MOTION = Candidate(np.full((4, 4), np.nan), np.full((6, 6), np.nan), 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """What is kept of a scan to compare the next one with.
+    """The features of a scan, to compare the next one with.
 
     Attributes:
         columns: (1, C, H', W') features of the range image.
@@ -69,43 +71,43 @@ class Search(Protocol):
     """Finds candidates of the motion from one scan to the next."""
 
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
-        """A scan (3, H, W), points and normals, by itself."""
+        """The features of a scan (3, H, W), points and normals."""
 
     def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
-        """The candidates, the most probable first, of the motion of a scan (3, H, W), and what is kept of it."""
+        """The candidates, the most probable first, of the motion of a scan (3, H, W), and its features."""
 
 
-class Graphs(Protocol):
-    """The parts of the network `correlation`, on one scan or one pair at a time, in float32."""
+class CorrelationParts(NamedTuple):
+    """The parts of the network `correlation`.
 
-    def columns(self, points: Floats, normals: Floats) -> Floats:
-        """(1, 3, H, W) twice -> (1, C, H', W')."""
+    Attributes:
+        columns: points and normals (1, 3, H, W) -> features (1, C, H', W').
+        turns: features (1, C, H', W') of the previous and the current scan -> scores (1, W').
+        bird: grid (1, CHANNELS, CELLS, CELLS) -> features (1, F, CELLS, CELLS).
+        peaks: scores (1, W') and (1, SHIFTS, SHIFTS) -> turn (1,), radians; shift (1, 2), metres; log sigma (1, 6).
+    """
 
-    def turn_scores(self, previous: Floats, current: Floats) -> Floats:
-        """(1, C, H', W') twice -> (1, W')."""
-
-    def bird(self, grid: Floats) -> Floats:
-        """(1, CHANNELS, CELLS, CELLS) -> (1, F, CELLS, CELLS)."""
-
-    def peaks(self, turn_scores: Floats, shift_scores: Floats) -> tuple[float, Floats, Floats]:
-        """(1, W') and (1, SHIFTS, SHIFTS) -> turn, radians; shift (2,), metres; log sigma (6,)."""
+    columns: Graph
+    turns: Graph
+    bird: Graph
+    peaks: Graph
 
 
 class CorrelationSearch:
     """The search with the network `correlation`; implements `Search`."""
 
-    def __init__(self, graphs: Graphs) -> None:
-        self._graphs = graphs
+    def __init__(self, parts: CorrelationParts) -> None:
+        self._parts = parts
 
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
         """See `Search`."""
-        columns = self._graphs.columns(points[None], normals[None])
+        (columns,) = self._parts.columns(points[None], normals[None])
         return Described(columns, self._spectrum(points, normals, heading), heading)
 
     def compare(self, previous: Described, points: Floats, normals: Floats) -> tuple[tuple[Candidate, ...], Described]:
         """See `Search`."""
-        columns = self._graphs.columns(points[None], normals[None])
-        turn_scores = self._graphs.turn_scores(previous.columns, columns)
+        (columns,) = self._parts.columns(points[None], normals[None])
+        (turn_scores,) = self._parts.turns(previous.columns, columns)
         found: list[tuple[float, Candidate, Described]] = []
         for turns in _peaks(turn_scores, _TURNS, _NEAR_COLUMNS):
             angle = float(turns[0].argmax()) * (2.0 * math.pi / turns.shape[1])
@@ -116,7 +118,7 @@ class CorrelationSearch:
                 # Of both correlations together: a wrong turn has no high peak among the shifts.
                 score = float(turns.max() + shifts.max())
                 found.append((score, self._candidate(previous, turns, shifts), current))
-        if not found:  # weights can be finite, and what they make of a scan is not a number
+        if not found:  # weights can be finite, and their scores not
             return (_NO_MOTION,), Described(columns, previous.spectrum, previous.heading)
         found.sort(key=lambda one: -one[0])
         scores = np.array([score for score, _, _ in found])
@@ -129,16 +131,17 @@ class CorrelationSearch:
         return kept, found[0][2]
 
     def _spectrum(self, points: Floats, normals: Floats, heading: float) -> NDArray[np.complex64]:
-        features = self._graphs.bird(bird_eye(points, normals, heading)[None])[0]
-        return np.asarray(fft.rfft2(features), dtype=np.complex64)
+        (features,) = self._parts.bird(bird_eye(points, normals, heading)[None])
+        return np.asarray(fft.rfft2(features[0]), dtype=np.complex64)
 
     def _candidate(self, previous: Described, turns: Floats, shifts: Floats) -> Candidate:
-        angle, shift, log_sigma = self._graphs.peaks(turns, shifts)
+        angle, shift, log_sigma = (values[0] for values in self._parts.peaks(turns, shifts))
         # The shift is seen in the frame of the previous grid, which is turned by its heading.
         c, s = math.cos(previous.heading), math.sin(previous.heading)
         back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = float(angle)
         T = np.eye(4)
-        T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        T[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
         T[:3, 3] = back @ [shift[0], shift[1], 0.0]
         axes = np.zeros((6, 6))
         axes[:3, :3], axes[3:, 3:] = back, back
@@ -147,13 +150,13 @@ class CorrelationSearch:
 
 
 class WholePairs:
-    """The search with a network that sees nothing but pairs: its one motion is the only candidate; implements `Search`.
+    """The search with a network without parts, whose one motion is the only candidate; implements `Search`.
 
     Args:
-        network: (1, 6, H, W) points and normals of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
+        network: points and normals (1, 6, H, W) of two scans -> T_prev_curr (1, 4, 4), log sigma (1, 6).
     """
 
-    def __init__(self, network: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> None:
+    def __init__(self, network: Graph) -> None:
         self._network = network
 
     def describe(self, points: Floats, normals: Floats, heading: float = 0.0) -> Described:
@@ -171,13 +174,12 @@ class WholePairs:
 def _shift_scores(previous: NDArray[np.complex64], current: NDArray[np.complex64]) -> Floats:
     """(1, SHIFTS, SHIFTS) correlation of features with these spectra, with the current scan shifted along y and x."""
     product = np.einsum("fij,fij->ij", previous, current.conj())
-    scores = fft.irfft2(product)
-    scores = np.roll(scores, (MOST_CELLS, MOST_CELLS), (0, 1))[:SHIFTS, :SHIFTS]
+    scores = np.roll(fft.irfft2(product), (MOST_CELLS, MOST_CELLS), (0, 1))[:SHIFTS, :SHIFTS]
     return np.ascontiguousarray(scores[None], dtype=np.float32)
 
 
 def _peaks(scores: Floats, most: int, near: int) -> list[Floats]:
-    """The scores (1, S) of turns or (1, S, S) of shifts, again and again without what lies near the peaks before."""
+    """The scores (1, S) of turns or (1, S, S) of shifts, again and again without the surroundings of earlier peaks."""
     found: list[Floats] = []
     best = float(scores.max())
     left = scores

@@ -1,4 +1,4 @@
-"""Weights of a network in a file, with all that is needed to use them: its configuration and that of the images."""
+"""Weights of a network in a file, with its name and the size of its images."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 from torch import Tensor, nn
 
 from lidarslam.core.errors import InputError
-from odometry.images.image_config import ImageConfig
-from odometry.network.network_config import NetworkConfig
+from odometry.config import ImageConfig, NetworkConfig
+from odometry.network.exported import describe, read_description
 from odometry.network.networks import make_network
 from odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
 
@@ -24,9 +23,9 @@ class Checkpoint:
 
     Attributes:
         network: which one.
-        images: how scans are shown to it.
+        images: size of its images.
         weights: its parameters and buffers by name, finite.
-        about: what else is worth knowing, such as what it was trained on; values that JSON can hold.
+        about: what it was trained on and the like; values that JSON can hold.
     """
 
     network: NetworkConfig
@@ -49,33 +48,28 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    content = {
-        "network": checkpoint.network.model_dump(mode="json"),
-        "images": checkpoint.images.model_dump(mode="json"),
-        "about": checkpoint.about,
-    }
+    content = describe(checkpoint.network, checkpoint.images) | {"about": checkpoint.about}
     write_tensor_file(path, WEIGHTS, checkpoint.weights, content)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read weights; that they fit the network they are for is checked here.
+    """Read weights and check that they fit their network.
 
     Raises:
-        InputError: there is no such file, it is none of ours, or its weights are missing, misshapen or not finite.
+        InputError: there is no such file, it is none of ours, or its weights do not fit or are not finite.
     """
     file = read_tensor_file(path, WEIGHTS)
     try:
-        network = NetworkConfig.model_validate(file.content.get("network"))
-        images = ImageConfig.model_validate(file.content.get("images"))
-    except ValidationError as error:
-        fault = error.errors()[0]
-        key = ".".join(str(part) for part in fault["loc"]) or error.title
-        raise InputError(
-            f"{path}: its configuration does not fit this program ({key}: {fault['msg'].lower()}); train others"
-        ) from error
-    about = file.content.get("about")
-    _require_fitting(path, network, file.tensors)
-    return Checkpoint(network, images, file.tensors, about if isinstance(about, dict) else {})
+        network, images = read_description(file.content)
+        checkpoint = Checkpoint(network, images, file.tensors, file.content.get("about") or {})
+        network_of(checkpoint)
+        for name, value in file.tensors.items():
+            if not bool(value.isfinite().all()):
+                raise ValueError(f"{name} is not finite")
+    except (ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: does not fit this program ({reason}); use other weights") from error
+    return checkpoint
 
 
 def network_of(checkpoint: Checkpoint) -> nn.Module:
@@ -84,33 +78,7 @@ def network_of(checkpoint: Checkpoint) -> nn.Module:
     Raises:
         RuntimeError: the weights are not those of this network, which no file that was loaded can have.
     """
-    with torch.random.fork_rng(devices=[]):  # the first random weights are thrown away
+    with torch.device("meta"):  # no random weights, which would be thrown away
         network = make_network(checkpoint.network)
-    network.load_state_dict(checkpoint.weights)
+    network.to_empty(device="cpu").load_state_dict(checkpoint.weights)
     return network.eval()
-
-
-def _require_fitting(path: Path, config: NetworkConfig, weights: Mapping[str, Tensor]) -> None:
-    try:
-        with torch.device("meta"):  # shapes alone
-            expected = make_network(config).state_dict()
-    except RuntimeError as error:  # sizes that no memory holds
-        raise InputError(f"{path}: its network cannot be made ({error}); the file is damaged, make it again") from error
-    for name, value in expected.items():
-        if name not in weights:
-            raise InputError(f"{path}: {name} of network {config.name} is missing; the file is damaged, make it again")
-        if weights[name].shape != value.shape:
-            raise InputError(
-                f"{path}: {name} is {tuple(weights[name].shape)}, network {config.name} has {tuple(value.shape)};"
-                " the file is damaged, make it again"
-            )
-        if weights[name].is_floating_point() != value.is_floating_point() or weights[name].is_complex():
-            raise InputError(
-                f"{path}: {name} holds {weights[name].dtype}, network {config.name} has {value.dtype};"
-                " the file is damaged, make it again"
-            )
-        if not bool(weights[name].isfinite().all()):
-            raise InputError(f"{path}: {name} holds values that are not finite; its training went wrong, use others")
-    surplus = sorted(set(weights) - set(expected))
-    if surplus:
-        raise InputError(f"{path}: network {config.name} has no {surplus[0]}; the file is of another version")

@@ -1,13 +1,11 @@
-"""The default network: a turn and a translation are read off correlations over all turns and all shifts.
+"""The default network: a turn and a translation from correlations over all turns and all shifts.
 
-Seen by column, a scan that is turned about z is a scan that is shifted in azimuth; seen from above, one that is
-displaced is one that is shifted in x and y. Two encoders give the features of one scan each, from its range image and
-from its bird's-eye grid; their correlations over all shifts give the scores of turns and of translations, whatever
-their size. A small head reads the standard deviations off the shape of both.
+A turn about z shifts the columns of a range image; a translation shifts the cells of a bird's-eye grid. Two encoders
+give the features of one scan each, from its image and from its grid; their correlations over all shifts are the scores
+of turns and of translations, whatever their size. A small head estimates standard deviations from the shape of both.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -15,55 +13,22 @@ from torch.nn import functional
 
 from odometry.images import bird_eye
 from odometry.images.bird_eye import SHIFTS
-from odometry.network.network_config import CorrelationConfig
-from odometry.training.torch_geometry import full_precision, make_transform, turn_about_z
-from odometry.training.torch_images import has_normal
+from odometry.network.pair_network import Estimate, PairImages, has_normal
+from odometry.network.torch_geometry import make_transform, turn_about_z
 
 INPUT_CHANNELS = 9
-# Standard deviations are kept within these. Peaks of columns of 2 degrees and of cells of half a metre are not known
-# better than to a part of them: while a sensor turns, both sweeps are bent, and the peak with them.
+# Channels of the three stages of the column encoder, and of the bird's-eye encoder; features that are correlated.
+_WIDTHS = (16, 24, 32)
+_BIRD_WIDTH, _BIRD_FEATURES = 16, 8
+# Bounds of the standard deviations. Peaks of columns of 2 degrees and of cells of half a metre are known to a part of
+# them at best: while a sensor turns, both sweeps are bent, and the peak with them.
 _LEAST_TURN, _LEAST_SHIFT_M, _LARGEST_SIGMA = 0.01, 0.1, 20.0
 # A peak is the mean over so many turns or shifts to either side of the highest.
 _PEAK = 2
-# Standard deviations of what the network does not look at: roll and pitch, radians, and the way along z, metres.
+# Standard deviations of the directions that are not estimated: roll and pitch, radians, and z, metres.
 _TILT, _CLIMB_M = 0.05, 0.2
-# What the shape of the two peaks is described by.
+# Numbers that describe the shape of the two peaks.
 _SHAPE = 8
-
-
-@dataclass(frozen=True, eq=False)
-class PairImages:
-    """What the network is shown of B pairs of scans.
-
-    Attributes:
-        previous, current: (B, 6, H, W) points and normals.
-        bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) seen from above, the current scan turned by about the
-            turn between the two; None for networks that do not look from above.
-    """
-
-    previous: Tensor
-    current: Tensor
-    bird_previous: Tensor | None = None
-    bird_current: Tensor | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What a network estimates of B pairs.
-
-    Attributes:
-        T_prev_curr: (B, 4, 4).
-        log_sigma: (B, 6) logarithm of the standard deviation along each direction of a change of `T_prev_curr` from the
-            left: rotation in radians, then translation in metres.
-        turn_scores: (B, S) log-likelihoods, up to a constant, of the turns about z by a whole number of feature
-            columns; (B, 0) where the network has none.
-        shift_scores: (B, SHIFTS, SHIFTS) the same of shifts by whole cells along y and x; (B, 0, 0) without.
-    """
-
-    T_prev_curr: Tensor
-    log_sigma: Tensor
-    turn_scores: Tensor
-    shift_scores: Tensor
 
 
 class CircularConv(nn.Module):
@@ -99,9 +64,9 @@ class Block(nn.Module):
 class ColumnEncoder(nn.Module):
     """Unit features of one range image, cell by cell; turning the scan shifts them and does nothing else."""
 
-    def __init__(self, widths: tuple[int, int, int]) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        a, b, c = widths
+        a, b, c = _WIDTHS
         self.layers = nn.Sequential(
             CircularConv(INPUT_CHANNELS, a, (3, 5), (1, 2)), nn.ReLU(),  # H x W/2
             CircularConv(a, b, (3, 5), (2, 2)), nn.ReLU(), Block(b),  # H/2 x W/4
@@ -116,7 +81,7 @@ class ColumnEncoder(nn.Module):
 
 
 def column_channels(points: Tensor, normals: Tensor) -> Tensor:
-    """(B, 9, H, W) network inputs: what a column sees in its own frame, all about the size of one.
+    """(B, 9, H, W) network inputs in the frame of each column, all about the size of one.
 
     Turning the scan about z by whole columns shifts them and changes nothing else.
     """
@@ -144,8 +109,9 @@ def column_channels(points: Tensor, normals: Tensor) -> Tensor:
 class BirdEncoder(nn.Module):
     """Features of one bird's-eye grid, cell by cell, from the cell's surroundings at two scales."""
 
-    def __init__(self, width: int, features: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
+        width, features = _BIRD_WIDTH, _BIRD_FEATURES
         self.fine = _convolved(bird_eye.CHANNELS, width)
         self.coarse = nn.Sequential(_convolved(width, 2 * width, stride=2), _convolved(2 * width, 2 * width))
         self.from_coarse = nn.Conv2d(2 * width, features, 1)
@@ -157,7 +123,7 @@ class BirdEncoder(nn.Module):
         fine = self.fine(grids)
         coarse = functional.interpolate(self.from_coarse(self.coarse(fine)), scale_factor=2.0, mode="nearest")
         features: Tensor = self.from_fine(fine) + coarse
-        # Cells in which nothing was seen say nothing; the first channel is the count.
+        # Empty cells have no features; the first channel is the count.
         return features * (grids[:, :1] > 0.0) * (0.5 * self.sharpness).exp()
 
 
@@ -190,8 +156,7 @@ class Peaks(nn.Module):
 def _turn_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     """Column (B,) of the peak of scores (B, S), between columns, and its shape (B, 3).
 
-    The mean over the columns around the highest: through it the losses of a motion reach the scores, which they could
-    not through the choice of the highest.
+    The mean over the columns around the highest, through which losses of the motion have gradients.
     """
     width = scores.shape[1]
     around = torch.arange(-_PEAK, _PEAK + 1, device=scores.device)
@@ -209,7 +174,7 @@ def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     """Shift (B, 2) along x and y, metres, of the peak of scores (B, SHIFTS, SHIFTS), and its shape (B, 5)."""
     count = scores.shape[-1]
     likelihood = scores.flatten(1).log_softmax(dim=1)
-    # The surroundings of a peak on the border would lie beyond it.
+    # A peak on the border would have surroundings beyond it.
     inner = scores[:, _PEAK:-_PEAK, _PEAK:-_PEAK].flatten(1).argmax(dim=1)
     row = torch.div(inner, count - 2 * _PEAK, rounding_mode="floor") + _PEAK
     column = inner.remainder(count - 2 * _PEAK) + _PEAK
@@ -231,11 +196,10 @@ def _shift_peak(scores: Tensor) -> tuple[Tensor, Tensor]:
 class CorrelationNetwork(nn.Module):
     """The motion between two scans, and its standard deviations."""
 
-    def __init__(self, config: CorrelationConfig) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.config = config
-        self.columns = ColumnEncoder(config.widths)
-        self.bird = BirdEncoder(config.bird_width, config.bird_features)
+        self.columns = ColumnEncoder()
+        self.bird = BirdEncoder()
         self.peaks = Peaks()
         self.turn_sharpness = nn.Parameter(torch.tensor(3.0))
 
@@ -245,13 +209,12 @@ class CorrelationNetwork(nn.Module):
             raise ValueError("the network `correlation` needs the scans as seen from above")
         images, birds = torch.cat([pairs.previous, pairs.current]), torch.cat([pairs.bird_previous, pairs.bird_current])
         columns, cells = self.columns(images[:, :3], images[:, 3:]), self.bird(birds)
-        with full_precision(images.device):
-            turn_scores = self.turn_scores(*columns.float().chunk(2))
-            shift_scores = self.shift_scores(*cells.float().chunk(2))
-            angle, shift, log_sigma = self.peaks(turn_scores, shift_scores)
-            R = turn_about_z(angle)[:, :3, :3]
-            T_prev_curr = make_transform(R, torch.cat([shift, torch.zeros_like(shift[:, :1])], dim=1))
-            return Estimate(T_prev_curr, log_sigma, turn_scores, shift_scores)
+        turn_scores = self.turn_scores(*columns.chunk(2))
+        shift_scores = self.shift_scores(*cells.chunk(2))
+        angle, shift, log_sigma = self.peaks(turn_scores, shift_scores)
+        translation = torch.cat([shift, torch.zeros_like(shift[:, :1])], dim=1)
+        T_prev_curr = make_transform(turn_about_z(angle), translation)
+        return Estimate(T_prev_curr, log_sigma, turn_scores, shift_scores)
 
     def turn_scores(self, previous: Tensor, current: Tensor) -> Tensor:
         """(B, W') correlation with the current scan turned by 0, 1, ... columns; unit features (B, C, H', W')."""
@@ -266,7 +229,7 @@ class CorrelationNetwork(nn.Module):
     def shift_scores(self, previous: Tensor, current: Tensor) -> Tensor:
         """(B, SHIFTS, SHIFTS) correlation with the current scan shifted along y and x; features (B, F, CELLS, CELLS).
 
-        A sum over cells, not a mean: every cell adds its log-likelihood, and what shows more is more certain.
+        A sum over cells, not a mean: every cell adds its log-likelihood.
         """
         spectrum = torch.fft.rfft2(previous) * torch.fft.rfft2(current).conj()
         scores: Tensor = torch.fft.irfft2(spectrum.sum(dim=1), s=previous.shape[-2:])  # shift by s at index s

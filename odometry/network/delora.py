@@ -1,20 +1,14 @@
 """The network of DeLORA (Nubert et al., ICRA 2021): two range images in, the motion between them out."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from odometry.training.torch_geometry import full_precision, make_transform, rotation_from_quaternion
+from odometry.network.pair_network import Estimate, PairImages
+from odometry.network.torch_geometry import make_transform, rotation_from_quaternion
 
-Activation = Literal["tanh", "relu"]
-
-_ACTIVATIONS: dict[Activation, Callable[[], nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
-
-_MIN_SIZE = 16
 # Output channels of the four stages, and their stride in (elevation, azimuth).
 _STAGES = ((64, (1, 1)), (128, (1, 2)), (256, (1, 2)), (512, (2, 2)))
 _STEM_CHANNELS = 64
@@ -22,58 +16,46 @@ _FEATURES = 1000
 _HEAD_FEATURES = 100
 # How much smaller than torch's default the weights of the two last layers begin.
 _LAST_LAYER_GAIN = 0.1
+# It has no standard deviations; these are written for it, radians and metres.
+_UNKNOWN_SIGMA = 0.1
 
 
 class DeloraNetwork(nn.Module):
     """A ResNet of eight blocks without normalisation, convolving around the full circle of azimuth.
 
     Where the original first trains the network to answer the identity, this one begins close to it: the last layers'
-    weights are scaled down, and their biases are zero but for the quaternion's w, which is one.
-
-    Args:
-        activation: tanh as in the paper, or relu.
-        range_scale_m: what the images are divided by; 1 as in the paper. The translation comes out in metres.
+    weights are scaled down, and their biases are zero but for the quaternion's w, which is one. Images are in metres,
+    16 x 16 or larger.
     """
 
-    def __init__(self, activation: Activation = "tanh", range_scale_m: float = 1.0) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        if not range_scale_m > 0.0:
-            raise ValueError(f"range_scale_m={range_scale_m:g} must be positive")
-        act = _ACTIVATIONS[activation]
-        self.range_scale_m = range_scale_m
         self.stem = nn.Sequential(
             _CircularConv(8, _STEM_CHANNELS, stride=(1, 2)),
-            act(),
+            nn.Tanh(),
             _CircularMaxPool(stride=(1, 2)),
         )
-        self.stages = nn.Sequential(*_make_stages(act))
+        stages, channels_in = list[nn.Module](), _STEM_CHANNELS
+        for channels, stride in _STAGES:
+            stages += [_Block(channels_in, channels, stride), _Block(channels, channels, (1, 1))]
+            channels_in = channels
+        self.stages = nn.Sequential(*stages)
         self.pool = nn.AdaptiveAvgPool2d(1)
-        self.trunk = nn.Sequential(nn.Linear(_STAGES[-1][0], _FEATURES), act())
-        self.rotation = _head(4, act)
-        self.translation = _head(3, act)
+        self.trunk = nn.Sequential(nn.Linear(channels_in, _FEATURES), nn.Tanh())
+        self.rotation = _head(4)
+        self.translation = _head(3)
         _initialise(self)
 
-    def forward(self, images_prev: Tensor, images_curr: Tensor) -> Tensor:
-        """The motions T_prev_curr (B, 4, 4) between range images (B, 4, H, W) of x, y, z and range in metres.
-
-        Raises:
-            ValueError: the images differ in shape, are not (B, 4, H, W), or are smaller than 16 x 16.
-        """
-        _check_images(images_prev, images_curr)
-        features = self.features(images_prev, images_curr)  # (B, 512, H/2, W/32)
-        pooled = self.pool(features).flatten(1)  # (B, 512, 1, 1) -> (B, 512)
-        shared = self.trunk(pooled)  # (B, 1000)
-        with full_precision(shared.device):
-            shared = shared.float()
-            quaternions = self.rotation(shared)  # (B, 4), w first, of any length
-            return make_transform(rotation_from_quaternion(quaternions), self.translation(shared))
-
-    def features(self, images_prev: Tensor, images_curr: Tensor) -> Tensor:
-        """What is pooled, (B, 512, ceil(H/2), ceil(W/32)): rolling the images by 32 columns rolls it by one."""
-        images = torch.cat([images_prev, images_curr], dim=1) / self.range_scale_m  # (B, 8, H, W)
-        narrow = self.stem(images)  # (B, 64, H, W/4)
-        result: Tensor = self.stages(narrow)  # (B, 512, H/2, W/32)
-        return result
+    def forward(self, pairs: PairImages) -> Estimate:
+        """The motions of B pairs, with constant standard deviations."""
+        images = torch.cat([_with_ranges(pairs.previous), _with_ranges(pairs.current)], dim=1)  # (B, 8, H, W)
+        features = self.stages(self.stem(images))  # (B, 64, H, W/4) -> (B, 512, H/2, W/32)
+        shared = self.trunk(self.pool(features).flatten(1))  # (B, 512, 1, 1) -> (B, 1000)
+        quaternions = self.rotation(shared)  # (B, 4), w first, of any length
+        T_prev_curr = make_transform(rotation_from_quaternion(quaternions), self.translation(shared))
+        size = len(T_prev_curr)
+        log_sigma = T_prev_curr.new_full((size, 6), _UNKNOWN_SIGMA).log()
+        return Estimate(T_prev_curr, log_sigma, log_sigma.new_zeros(size, 0), log_sigma.new_zeros(size, 0, 0))
 
 
 class _CircularConv(nn.Conv2d):
@@ -100,20 +82,22 @@ class _CircularMaxPool(nn.MaxPool2d):
 class _Block(nn.Module):
     """Two convolutions and a shortcut, which a 1x1 convolution takes to another shape."""
 
-    def __init__(
-        self, channels_in: int, channels_out: int, stride: tuple[int, int], act: Callable[[], nn.Module]
-    ) -> None:
+    def __init__(self, channels_in: int, channels_out: int, stride: tuple[int, int]) -> None:
         super().__init__()
         self.residual = nn.Sequential(
-            _CircularConv(channels_in, channels_out, stride), act(), _CircularConv(channels_out, channels_out)
+            _CircularConv(channels_in, channels_out, stride), nn.Tanh(), _CircularConv(channels_out, channels_out)
         )
         same = channels_in == channels_out and stride == (1, 1)
         self.shortcut = nn.Identity() if same else nn.Conv2d(channels_in, channels_out, 1, stride, bias=False)
-        self.activation = act()
 
     def forward(self, x: Tensor) -> Tensor:
-        result: Tensor = self.activation(self.residual(x) + self.shortcut(x))
-        return result
+        return torch.tanh(self.residual(x) + self.shortcut(x))
+
+
+def _with_ranges(images: Tensor) -> Tensor:
+    """(B, 4, H, W) points and ranges of points and normals (B, 6, H, W)."""
+    points = images[:, :3]
+    return torch.cat([points, points.square().sum(1, keepdim=True).sqrt()], dim=1)
 
 
 def _wrap_azimuth(images: Tensor) -> Tensor:
@@ -121,17 +105,9 @@ def _wrap_azimuth(images: Tensor) -> Tensor:
     return functional.pad(images, (1, 1, 0, 0), mode="circular")
 
 
-def _make_stages(act: Callable[[], nn.Module]) -> list[nn.Module]:
-    channels_in, blocks = _STEM_CHANNELS, list[nn.Module]()
-    for channels, stride in _STAGES:
-        blocks += [_Block(channels_in, channels, stride, act), _Block(channels, channels, (1, 1), act)]
-        channels_in = channels
-    return blocks
-
-
-def _head(outputs: int, act: Callable[[], nn.Module]) -> nn.Sequential:
+def _head(outputs: int) -> nn.Sequential:
     """(B, 1000) -> (B, outputs)."""
-    return nn.Sequential(nn.Linear(_FEATURES, _HEAD_FEATURES), act(), nn.Linear(_HEAD_FEATURES, outputs))
+    return nn.Sequential(nn.Linear(_FEATURES, _HEAD_FEATURES), nn.Tanh(), nn.Linear(_HEAD_FEATURES, outputs))
 
 
 @torch.no_grad()
@@ -150,12 +126,3 @@ def _initialise(network: DeloraNetwork) -> None:
     quaternion = network.rotation[-1]
     assert isinstance(quaternion, nn.Linear)
     quaternion.bias[0] = 1.0
-
-
-def _check_images(images_prev: Tensor, images_curr: Tensor) -> None:
-    shape = tuple(images_prev.shape)
-    if shape != tuple(images_curr.shape) or len(shape) != 4 or shape[1] != 4 or min(shape[2:]) < _MIN_SIZE:
-        raise ValueError(
-            f"two equal batches (B, 4, H, W) with H, W >= {_MIN_SIZE} are needed,"
-            f" got {shape} and {tuple(images_curr.shape)}"
-        )

@@ -20,8 +20,9 @@ from lidarslam.core.errors import ConfigError, OutputError
 from odometry.images import bird_eye
 from odometry.images.bird_eye import SHIFTS
 from odometry.network.checkpoint import Checkpoint, network_of
-from odometry.network.correlation import CorrelationNetwork, PairImages
+from odometry.network.correlation import CorrelationNetwork
 from odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
+from odometry.network.pair_network import PairImages
 
 # Not a size of anything else, so that no dimension is taken for another.
 _EXAMPLE_BATCH = 2

@@ -1,11 +1,9 @@
-"""Where the network that comes with the program lies; without torch."""
+"""The network that comes with the program; without torch."""
 
 from importlib.resources import files
 from pathlib import Path
 
 from lidarslam.core.errors import ConfigError
-
-_NAME = "correlation"
 
 
 def default_weights() -> Path:
@@ -14,26 +12,17 @@ def default_weights() -> Path:
     Raises:
         ConfigError: it came without.
     """
-    path = _folder() / f"{_NAME}.safetensors"
-    return _required(path, path.is_file())
+    return _required("correlation.safetensors")
 
 
 def shipped_folder() -> Path:
-    """The folder of the same network as ONNX, for inference.
-
-    Raises:
-        ConfigError: it came without.
-    """
-    path = _folder() / _NAME
-    return _required(path, path.is_dir())
+    """The folder of the same network as ONNX, for inference; errors likewise."""
+    return _required("correlation")
 
 
-def _folder() -> Path:
-    return Path(str(files("odometry"))) / "weights"
-
-
-def _required(path: Path, is_there: bool) -> Path:
-    if not is_there:
+def _required(name: str) -> Path:
+    path = Path(str(files("odometry"))) / "weights" / name
+    if not path.exists():
         raise ConfigError(
             f"{path}: the weights that come with the program are missing;"
             " install it again, or name a file of weights with --weights FILE"

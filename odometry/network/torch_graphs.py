@@ -1,70 +1,45 @@
-"""The networks in torch behind the interfaces of inference, for weights of one's own and for accelerators."""
+"""The networks in torch for inference, with one's own weights and on accelerators."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
-from odometry.network.candidates import CorrelationSearch, Search, WholePairs
-from odometry.network.correlation import CorrelationNetwork, PairImages
-
-Floats = NDArray[np.float32]
-
-
-class TorchGraphs:
-    """The parts of the network `correlation`; implements `odometry.network.candidates.Graphs`.
-
-    Args:
-        network: in evaluation mode; it is moved to the device.
-        device: torch's name of it.
-        threads: of torch, which would use all and slow down what works beside it.
-    """
-
-    def __init__(self, network: CorrelationNetwork, device: torch.device | str = "cpu", threads: int = 1) -> None:
-        self._network = network.to(device)
-        self._device = device
-        self._threads = threads
-
-    def columns(self, points: Floats, normals: Floats) -> Floats:
-        """See `Graphs`."""
-        return _array(self._run(self._network.columns, points, normals))
-
-    def turn_scores(self, previous: Floats, current: Floats) -> Floats:
-        """See `Graphs`."""
-        return _array(self._run(self._network.turn_scores, previous, current))
-
-    def bird(self, grid: Floats) -> Floats:
-        """See `Graphs`."""
-        return _array(self._run(self._network.bird, grid))
-
-    def peaks(self, turn_scores: Floats, shift_scores: Floats) -> tuple[float, Floats, Floats]:
-        """See `Graphs`."""
-        angle, shift, log_sigma = self._run(self._network.peaks, turn_scores, shift_scores)
-        return float(angle), _array(shift)[0], _array(log_sigma)[0]
-
-    @torch.inference_mode()
-    def _run(self, part: nn.Module | Callable[..., Tensor], *inputs: Floats) -> Tensor:
-        with using_threads(self._threads):
-            result: Tensor = part(*(torch.from_numpy(values).to(self._device) for values in inputs))
-        return result
+from odometry.images.projection import Floats
+from odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
+from odometry.network.correlation import CorrelationNetwork
+from odometry.network.pair_network import PairImages
 
 
 def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads: int = 1) -> Search:
-    """The search for candidates that a network in evaluation mode is made for."""
+    """The search for candidates with a network in evaluation mode, which is moved to the device.
+
+    torch would use all threads and slow down what works beside it.
+    """
+    network = network.to(device)
+
+    def graph(part: Callable[..., Any]) -> Graph:
+        @torch.inference_mode()
+        def run(*inputs: Floats) -> list[Floats]:
+            with using_threads(threads):
+                outputs = part(*(torch.from_numpy(values).to(device) for values in inputs))
+            outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+            return [np.ascontiguousarray(values.float().numpy(force=True)) for values in outputs]
+
+        return run
+
     if isinstance(network, CorrelationNetwork):
-        return CorrelationSearch(TorchGraphs(network, device, threads))
-    moved = network.to(device)
+        parts = (network.columns, network.turn_scores, network.bird, network.peaks)
+        return CorrelationSearch(CorrelationParts(*(graph(part) for part in parts)))
 
-    @torch.inference_mode()
-    def pairs(previous: Floats, current: Floats) -> tuple[Floats, Floats]:
-        with using_threads(threads):
-            estimate = moved(PairImages(*(torch.from_numpy(images).to(device) for images in (previous, current))))
-        return _array(estimate.T_prev_curr), _array(estimate.log_sigma)
+    def pair(previous: torch.Tensor, current: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        estimate = network(PairImages(previous, current))
+        return estimate.T_prev_curr, estimate.log_sigma
 
-    return WholePairs(pairs)
+    return WholePairs(graph(pair))
 
 
 @contextmanager
@@ -76,7 +51,3 @@ def using_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _array(values: Tensor) -> Floats:
-    return np.ascontiguousarray(values.float().numpy(force=True))

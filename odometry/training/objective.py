@@ -1,4 +1,4 @@
-"""What training minimises: the paper's geometric losses, and the distance to the motion that a teacher finds."""
+"""The objective of training: the paper's geometric losses, and the distance from the pseudo-labels."""
 
 import math
 from dataclasses import dataclass
@@ -8,13 +8,14 @@ from torch import Generator, Tensor
 from torch.nn import functional
 
 from odometry.images import bird_eye
-from odometry.network.correlation import Estimate
+from odometry.network.pair_network import Estimate, has_normal
+from odometry.network.torch_geometry import inverse, log
+from odometry.training.augmentation import PairBatch
+from odometry.training.config import TrainingConfig
 from odometry.training.losses import Surfaces, geometric_loss
-from odometry.training.pairs import PairBatch
-from odometry.training.torch_geometry import inverse, log
-from odometry.training.torch_images import has_normal
-from odometry.training.training_config import TrainingConfig
 
+# Points of the current scan that the geometric losses use.
+_GEOMETRIC_POINTS = 1024
 # Errors are squared up to this size, a degree and five centimetres, where they cost a half; beyond they cost linearly.
 _ROTATION = math.radians(1.0)
 _TRANSLATION_M = 0.05
@@ -24,7 +25,7 @@ _NEAR_ROTATION, _NEAR_TRANSLATION_M = math.radians(4.0), 1.0
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """A loss and its parts, means over the pairs that are believed; parts that are switched off are zero."""
+    """A loss and its parts, means over the valid pairs; parts that are switched off are zero."""
 
     total: Tensor
     alignment: Tensor
@@ -36,26 +37,25 @@ class Objective:
 
 
 def objective(estimate: Estimate, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
-    """The loss of a batch; the generator draws the points that the geometric losses look at."""
+    """The loss of a batch; the generator draws the points of the geometric losses."""
     zero = estimate.log_sigma.new_zeros(())
     total, alignment, confidence, turn, shift, planes, normals = (zero,) * 7
     if config.alignment_weight:
         error = motion_error(estimate.T_prev_curr, batch.T_prev_curr)
-        is_near = _is_near(error) if estimate.turn_scores.shape[1] else torch.ones_like(batch.believed)
-        alignment = _mean(_distance(error), batch.believed & is_near)
-        confidence = _mean(_negative_log_likelihood(error, estimate.log_sigma), batch.believed)
+        is_near = _is_near(error) if estimate.turn_scores.shape[1] else torch.ones_like(batch.valid)
+        alignment = _mean(_distance(error), batch.valid & is_near)
+        confidence = _mean(_negative_log_likelihood(error, estimate.log_sigma), batch.valid)
         if estimate.turn_scores.shape[1]:
-            turn = _mean(_turn_loss(estimate.turn_scores, batch.T_prev_curr), batch.believed)
+            turn = _mean(_turn_loss(estimate.turn_scores, batch.T_prev_curr), batch.valid)
         if estimate.shift_scores.shape[1]:
             in_reach = _cells(batch.T_prev_curr).abs().amax(1) < bird_eye.MOST_CELLS - 1
-            shift = _mean(_shift_loss(estimate.shift_scores, batch.T_prev_curr), batch.believed & in_reach)
+            shift = _mean(_shift_loss(estimate.shift_scores, batch.T_prev_curr), batch.valid & in_reach)
         total = total + config.alignment_weight * (0.3 * alignment + 0.1 * confidence + turn + shift)
-    surfaces = batch.previous_surfaces, batch.current_surfaces
-    if config.geometric is not None and surfaces[0] is not None and surfaces[1] is not None:
-        current = _surfaces(surfaces[1], config.geometric_points, generator)
-        loss = geometric_loss(estimate.T_prev_curr, current, _surfaces(surfaces[0]), config.geometric)
-        planes, normals = (_mean(part, batch.believed) for part in (loss.point_to_plane, loss.plane_to_plane))
-        total = total + config.geometric_weight * _mean(loss.total, batch.believed)
+    if config.geometric is not None and batch.previous_surfaces is not None and batch.current_surfaces is not None:
+        current = _surfaces(batch.current_surfaces, _GEOMETRIC_POINTS, generator)
+        loss = geometric_loss(estimate.T_prev_curr, current, _surfaces(batch.previous_surfaces), config.geometric)
+        planes, normals = (_mean(part, batch.valid) for part in (loss.point_to_plane, loss.plane_to_plane))
+        total = total + _mean(loss.total, batch.valid)
     return Objective(total, alignment, confidence, turn, shift, planes, normals)
 
 
@@ -74,17 +74,16 @@ def _distance(error: Tensor) -> Tensor:
 
 
 def _is_near(error: Tensor) -> Tensor:
-    """(B,) whether the right peak was found; drawing at a wrong one would teach nothing."""
+    """(B,) whether the right peak was found; the position of a wrong one has no useful gradient."""
     rotation, translation = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
     near: Tensor = (rotation < _NEAR_ROTATION) & (translation < _NEAR_TRANSLATION_M)
     return near
 
 
 def _negative_log_likelihood(error: Tensor, log_sigma: Tensor) -> Tensor:
-    """(B,) of errors that are distributed as Laplace said, each direction with its own standard deviation.
+    """(B,) of errors with a Laplace distribution, each direction with its own standard deviation.
 
-    Its gradient reaches the confidence alone: were the motion drawn by it as well, pairs that are hard would be
-    given up rather than learnt.
+    Its gradient reaches the standard deviations alone: through the motion, hard pairs would be given up.
     """
     scale = math.sqrt(2.0)
     return (scale * error.detach().abs() * (-log_sigma).exp() + log_sigma).sum(dim=1)
@@ -126,12 +125,12 @@ def _shift_loss(scores: Tensor, target: Tensor) -> Tensor:
     return loss
 
 
-def _mean(values: Tensor, believed: Tensor) -> Tensor:
-    return (values * believed).sum() / believed.sum().clamp(min=1)
+def _mean(values: Tensor, valid: Tensor) -> Tensor:
+    return (values * valid).sum() / valid.sum().clamp(min=1)
 
 
 def _surfaces(images: Tensor, most: int | None = None, generator: Generator | None = None) -> Surfaces:
-    """The pixels of images (B, 6, H, W), or as many of them with a normal as are wanted, drawn at random."""
+    """The pixels of images (B, 6, H, W), or at most so many of them with a normal, drawn at random."""
     values = images.flatten(2).mT  # (B, N, 6)
     if most is not None and most < values.shape[1]:
         order = torch.rand(values.shape[:2], generator=generator).to(values.device) + has_normal(values[..., 3:], -1)

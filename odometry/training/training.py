@@ -1,4 +1,4 @@
-"""Training of a network, one step after another; whoever calls it chooses devices, writes files and draws curves."""
+"""Learning rate, optimizer, loss and validation of a training; devices, files and curves are the caller's."""
 
 import math
 from collections.abc import Sequence
@@ -9,26 +9,27 @@ import torch
 from torch import Generator, Tensor, nn
 
 from odometry.network.candidates import Search
-from odometry.network.networks import PairNetwork
+from odometry.network.pair_network import PairNetwork
 from odometry.network.torch_graphs import torch_search
+from odometry.training.augmentation import PairBatch
+from odometry.training.config import TrainingConfig
 from odometry.training.objective import Objective, motion_error, objective
-from odometry.training.pairs import PairBatch, pair_of
+from odometry.training.pairs import pair_of
 from odometry.training.preparation import PreparedRecording
-from odometry.training.torch_geometry import full_precision
-from odometry.training.training_config import TrainingConfig
 
 _LEAST_RATE = 0.01  # of the learning rate, at the end
+_WEIGHT_DECAY = 1e-3
 
 
 @dataclass(frozen=True)
 class Validation:
-    """How far a network is from the motions that the teacher found on recordings it does not learn from.
+    """Errors of a network against the pseudo-labels of recordings that it is not trained on.
 
     Attributes:
-        rotation_rms_deg, translation_rms_m: over all believed pairs.
+        rotation_rms_deg, translation_rms_m: over all valid pairs.
         rotation_median_deg, translation_median_m: likewise.
         covered_percent: of the errors that lie within one, two and three standard deviations.
-        pairs: how many; where there is none, all else is not a number.
+        pairs: how many; without any, all else is not a number.
     """
 
     rotation_rms_deg: float
@@ -51,15 +52,13 @@ def make_optimizer(network: nn.Module, config: TrainingConfig) -> torch.optim.Op
     """AdamW; biases, scales and the like are not decayed."""
     decayed = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim <= 1]
-    groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+    groups = [{"params": decayed, "weight_decay": _WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.98))
 
 
 def loss_of(network: PairNetwork, batch: PairBatch, config: TrainingConfig, generator: Generator) -> Objective:
     """The loss of a network on a batch."""
-    estimate = network(batch.shown)
-    with full_precision(batch.previous.device):
-        return objective(estimate, batch, config, generator)
+    return objective(network(batch.images), batch, config, generator)
 
 
 def validate(
@@ -67,7 +66,7 @@ def validate(
 ) -> Validation:
     """Every pair of scans that lie `gap` apart, as it is; recordings that are too short for one have none.
 
-    The network, in evaluation mode, is asked as in use: by its most probable candidate.
+    The network, in evaluation mode, answers as in use: by its most probable candidate.
     """
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
     search = torch_search(network, device or torch.device("cpu"))
@@ -93,7 +92,7 @@ def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
 
 
 def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tuple[Tensor, Tensor]:
-    """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where it is believed."""
+    """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where labels are valid."""
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
     points, normals = recording.images.points.numpy(), recording.images.normals.float().numpy()
     before = None
@@ -103,7 +102,7 @@ def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tupl
             continue
         candidates, before = search.compare(before, points[number], normals[number])
         pair = pair_of(recording, number - chosen.step, number, surfaces=False)
-        if bool(pair.believed):
+        if bool(pair.valid):
             T_prev_curr = torch.from_numpy(candidates[0].T_prev_curr).float()
             errors.append(motion_error(T_prev_curr[None], pair.T_prev_curr))
             sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])

@@ -13,7 +13,7 @@ from evaluation.comparison.comparison import (
     PublishedRow,
     SequenceComparison,
 )
-from evaluation.comparison.summary_table import SummaryTable, TableCell, TableColumn, TableRow
+from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory, chain
@@ -113,7 +113,7 @@ def comparison(random_drive, straight_drive, finished, rng) -> Comparison:
         TableColumn("00-08", "t_rel", "%", 2, True, ("00", "01")),
     ]
     rows = [
-        TableRow("learned", [TableCell(1.234, 1), TableCell(0.111, 1)]),
+        TableRow("learned", [TableCell(1.234, 1), TableCell(0.111, 1, "over 1 of 2", ranked=False)]),
         TableRow("kiss-icp", [TableCell(0.567, 1), TableCell(0.333, 2)]),
         TableRow("DeLORA", [TableCell(6.05, 1), TableCell("NA", 2)], source="Nubert et al., ICRA 2021"),
     ]
@@ -133,7 +133,7 @@ def comparison(random_drive, straight_drive, finished, rng) -> Comparison:
                 "LOAM", {"09 translation_percent": 1.2, "10 translation_percent": "NA", "ATE": 0.345}, "Zhang, 2014"
             )
         ],
-        tables=[SummaryTable(f"Means {HOSTILE}", columns, rows, "a note")],
+        tables=[Table(f"Means {HOSTILE}", columns, rows, "a note")],
         missing=[MissingRecording("03", "/data/03", "holds no scans")],
         notes=["interrupted"],
     )

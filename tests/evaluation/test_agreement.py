@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluation.trajectory.agreement import disagreement
-from evaluation.trajectory.metrics import evaluate_trajectory
+from evaluation.trajectory.metrics import disagreement, evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory
 

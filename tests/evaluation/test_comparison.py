@@ -16,7 +16,7 @@ from evaluation.comparison.comparison import (
 )
 from evaluation.comparison.mean_table import TablePlan, mean_table
 from evaluation.comparison.quantities import QUANTITIES, find_quantity
-from evaluation.comparison.summary_table import TableCell, TableRow
+from evaluation.comparison.table import TableCell, TableRow
 from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import exp
@@ -91,6 +91,7 @@ def test_quantities_are_read_off_the_entry(result: MethodResult) -> None:
     assert find_quantity("ate_percent_of_path").of(result) == pytest.approx(100.0 * 1.5 / 12**0.5 / 150.0, rel=0.02)
     assert find_quantity("lost_scans").of(result) == 2.0
     assert find_quantity("map_chamfer_m").of(result) is None
+    assert find_quantity("map_entropy").of(replace(result, map_entropy=-4.5)) == -4.5
     mapped = replace(result, map_metrics={"f_score_percent": {"0.2": 80.0}, "coverage_percent": {"1.0": 90.0}})
     assert find_quantity("map_f_score_percent_0.2").of(mapped) == 80.0
     assert find_quantity("map_coverage_percent_1.0").of(mapped) == 90.0
@@ -119,8 +120,8 @@ def test_means_count_the_recordings_that_have_a_value() -> None:
     assert [column.heading for column in table.columns] == ["all", "01"]
     assert list(table.columns[0].sequences) == ["00", "01", "02", "03"]
     assert [row.method for row in table.rows] == ["a", "b", "p"]
-    assert list(table.rows[0].cells) == [TableCell(30.0, 3), TableCell(20.0, 1)]
-    assert list(table.rows[1].cells) == [TableCell(30.0, 1), TableCell(None, 0)]
+    assert list(table.rows[0].cells) == [TableCell(30.0, 3, "over 3 of 4", ranked=False), TableCell(20.0, 1)]
+    assert list(table.rows[1].cells) == [TableCell(30.0, 1, "over 1 of 4", ranked=False), TableCell(None, 0)]
     assert table.rows[2].source == "a paper"
     content = json.loads(json.dumps(table.to_json()))
     assert content["rows"][0]["cells"][0] == {"value": 30.0, "averaged": 3}

@@ -18,9 +18,8 @@ from safetensors.torch import save_file
 
 from lidarslam.cli import main
 from lidarslam.core.trajectory_io import format_kitti, read_tum
-from odometry.images.image_config import ImageConfig
+from odometry.config import ImageConfig, NetworkConfig
 from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.network_config import CorrelationConfig, NetworkConfig
 from odometry.network.networks import make_network
 from odometry.network.shipped import default_weights
 
@@ -50,14 +49,14 @@ LAUGHS = "a: &a [x]\n" + "".join(f"{c}: &{c} [{', '.join(['*' + b] * 9)}]\n" for
             "odometry: {kiss_icp: {voxel_size: 1}}",
             "no odometry.kiss_icp.voxel_size; did you mean voxel_size_m?",
         ),
-        ("mapping: {refinement: {max_iteratons: 3}}", "did you mean max_iterations?"),
+        ("mapping: {tracking: {lost_belo: 0.3}}", "did you mean lost_below?"),
         (
             "odometry: {kiss_icp: {voxel_size_m: [1]}}",
             "voxel_size_m=[1]: input should be a valid number",
         ),
         ("odometry: {kiss_icp: {voxel_size_m: .nan}}", "input should be a finite number"),
         ("odometry: 3", "odometry=3: expected a section"),
-        ("odometry: {method: kiss-icp}\nodometry: {method: learned}", "the key 'odometry' stands twice"),
+        ("odometry: {method: kiss-icp}\nodometry: {method: learned}", "the key 'odometry' occurs twice"),
         ("- 1\n- 2", "expected keys and values, got a list"),
         ("hello", "expected keys and values, got a str"),
         ("{{{:\n]", "not YAML"),
@@ -125,7 +124,7 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, small_recording: Path, name: s
 def small_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a network that learned nothing."""
     path = tmp_path_factory.mktemp("weights") / "small.safetensors"
-    network = NetworkConfig(correlation=CorrelationConfig(widths=(8, 8, 8), bird_width=4))
+    network = NetworkConfig()
     save_checkpoint(path, checkpoint_of(make_network(network), network, ImageConfig(columns=180)))
     return path
 
@@ -222,7 +221,7 @@ BAD_TRAJECTORIES = {
     "NaN": "holds numbers that are no poses",
     "no rotation": "holds numbers that are no poses",
     "seven columns": "expected 8 numbers, got 7",
-    "light years": "expected metres on this planet",
+    "light years": "expected metres",
     "one pose": "two poses or more|too short to be compared",
     "one stamp": "two poses or more|too short to be compared",
 }

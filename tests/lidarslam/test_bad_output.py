@@ -17,13 +17,13 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.core.directory_lock import only_writer
 from lidarslam.core.errors import OutputError
+from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.run.directory import FILES, RunDirectory
-from lidarslam.viewer.rerun_viewer import IncompleteRecordingError, require_complete
+from lidarslam.viewer.rerun_recording import IncompleteRecordingError, require_complete
 from mapping.global_map.global_map import PointCloud
 from mapping.global_map.map_io import write_cloud
 
@@ -35,7 +35,7 @@ def lidarslam(*arguments: object) -> Result:
 
 
 def shell(*arguments: object, **options: object) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "lidarslam.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "lidarslam", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, **options)  # type: ignore[call-overload,no-any-return]
 
 
@@ -332,10 +332,10 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
     np.save(source / "000000.npy", points)
     for index in range(1, 3_000):
         os.link(source / "000000.npy", source / f"{index:06d}.npy")
-    command = [sys.executable, "-m", "lidarslam.cli", "run", str(source), "--out", str(out), *FAST]
+    command = [sys.executable, "-m", "lidarslam", "run", str(source), "--out", str(out), *FAST]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     begun = time.monotonic()
-    while not (out / "unfinished" / "scans.csv").exists() and time.monotonic() - begun < 30.0:
+    while not (out / "unfinished" / "run.json").exists() and time.monotonic() - begun < 30.0:
         time.sleep(0.05)
     time.sleep(1.5)
     process.send_signal(sent)
@@ -358,7 +358,7 @@ def test_a_request_to_end_leaves_what_there_is(tmp_path: Path, room_scans: list[
 def test_standard_streams_that_are_closed_or_full(
     tmp_path: Path, small_recording: Path, redirected: str, status: int
 ) -> None:
-    command = f"'{sys.executable}' -m lidarslam.cli run '{small_recording}' --out run --odometry constant-velocity"
+    command = f"'{sys.executable}' -m lidarslam run '{small_recording}' --out run --odometry constant-velocity"
     ended = subprocess.run(
         ["bash", "-c", f"{command} {redirected}"],
         cwd=tmp_path,
@@ -398,11 +398,11 @@ def test_environments(tmp_path: Path, small_recording: Path, changed: dict[str, 
 
 
 def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
-    run = f"'{sys.executable}' -m lidarslam.cli run '{small_recording}' --out '{tmp_path / 'never'}'"
+    run = f"'{sys.executable}' -m lidarslam run '{small_recording}' --out '{tmp_path / 'never'}'"
     script = f"cd gone && rmdir ../gone && {run}"
     (tmp_path / "gone").mkdir()
     folders = [folder for folder in sys.path if Path(folder).is_absolute()]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
     ended = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert ended.stderr == "lidarslam: the folder you stand in is gone; change to another\n"
+    assert ended.stderr == "lidarslam: the current folder was removed; change to another\n"

@@ -1,5 +1,6 @@
 """When states are saved, who may be at work on a run, and where a resumed one goes on in its recording."""
 
+import contextlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
@@ -17,14 +19,14 @@ from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.resume import checkpoints
 from lidarslam.resume.checkpoints import Checkpoints
-from lidarslam.resume.config import CheckpointConfig
 from lidarslam.resume.resuming import scans_left
 from lidarslam.resume.state_file import read_state
 from lidarslam.resume.unfinished import About, Unfinished, require_whole
 from lidarslam.run.directory import RunDirectory
+from lidarslam.run.scan_log import ScanLog
 from mapping.config import GlobalMapConfig
-from odometry.config import ConsistencyConfig
 from odometry.methods.consistency import ConsistencyCheck
+from odometry.methods.constant_velocity import ConstantVelocity
 from odometry.methods.external import ExternalOdometry
 
 
@@ -47,46 +49,60 @@ class Still:
         return {}
 
 
+@contextlib.contextmanager
+def claim(path: Path, description: dict[str, Any], resume: bool = False) -> Iterator[Unfinished]:
+    with (
+        RunDirectory.create(path, overwrite=True, resume=resume) as directory,
+        Unfinished.claim(directory, description, resume) as claimed,
+    ):
+        yield claimed
+
+
 @pytest.fixture
 def unfinished(tmp_path: Path) -> Iterator[Unfinished]:
-    with Unfinished.claim(tmp_path, {}, resume=False) as claimed:
+    with claim(tmp_path, {}) as claimed:
         yield claimed
+
+
+@pytest.fixture
+def log() -> ScanLog:
+    return ScanLog()
 
 
 @pytest.mark.parametrize(("cost_s", "pause_s"), [(0.01, 10.0), (0.2, 10.0), (1.0, 50.0)])
 def test_saving_takes_two_percent_of_the_time_at_most(
-    unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch, cost_s: float, pause_s: float
+    unfinished: Unfinished, log: ScanLog, monkeypatch: pytest.MonkeyPatch, cost_s: float, pause_s: float
 ) -> None:
     clock = Clock(monkeypatch)
-    warnings: list[str] = []
-    kept = Checkpoints(unfinished, CheckpointConfig(), lambda: {"number": 1}, warnings.append)
+    kept = Checkpoints(unfinished, CheckpointConfig(), ConstantVelocity(), log, None)
     pipeline = cast(Pipeline, Still(clock, cost_s))
     clock.now += 9.99
     assert not kept.is_due()
     clock.now += 0.02
     assert kept.is_due()
-    kept.keep(pipeline)
-    assert read_state(unfinished.state).integer("number") == 1
+    kept.save(pipeline)
+    assert read_state(unfinished.state).part("log").value("messages") == []
     clock.now += pause_s - 0.01
     assert not kept.is_due()
     clock.now += 0.02
     assert kept.is_due()
-    assert not warnings
+    assert not log.warnings
 
 
-def test_a_disk_that_is_full_does_not_end_the_run(unfinished: Unfinished, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_full_does_not_end_the_run(
+    unfinished: Unfinished, log: ScanLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(path: Path, _: State) -> None:
         raise OutputError(f"{path}: cannot be written (No space left on device)")
 
     monkeypatch.setattr(checkpoints, "write_state", fail)
-    warnings: list[str] = []
-    kept = Checkpoints(unfinished, CheckpointConfig(every_scans=2), dict, warnings.append)
+    kept = Checkpoints(unfinished, CheckpointConfig(every_scans=2), ConstantVelocity(), log, None)
     pipeline = cast(Pipeline, Still(Clock(monkeypatch), 0.0))
     assert [kept.is_due(), kept.is_due()] == [False, True]
-    kept.keep(pipeline)
+    kept.save(pipeline)
     assert [kept.is_due(), kept.is_due()] == [False, True]
-    assert "the state could not be saved" in warnings[0]
-    assert "No space left" in warnings[0]
+    assert "a checkpoint could not be saved" in log.warnings[0]
+    assert "No space left" in log.warnings[0]
 
 
 @dataclass
@@ -101,15 +117,15 @@ class Counting:
         self.asked += 1
         return self.asked % 2 == 0
 
-    def keep(self, pipeline: Pipeline) -> None:
+    def save(self, pipeline: Pipeline) -> None:
         assert pipeline.held is not None
         self.states.append((self.out, pipeline.state()))
 
 
 def make_pipeline(truth: Trajectory, keeper: Counting | None = None) -> tuple[Pipeline, ExternalOdometry]:
     odometry = ExternalOdometry(truth)
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
-    return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), keeper=keeper), odometry
+    localiser = OdometryAlone(ConsistencyCheck())
+    return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), checkpointer=keeper), odometry
 
 
 def test_nothing_is_at_work_while_a_state_is_kept(
@@ -126,9 +142,9 @@ def test_nothing_is_at_work_while_a_state_is_kept(
     pipeline, odometry = make_pipeline(room_truth)
     saved: Saved = through_disk(keeper.states[1][1])
     pipeline.restore(saved)
-    odometry.restore(saved.part("odometry"))
     assert pipeline.held is not None
-    assert pipeline.held.stamp == room_scans[4].stamp
+    assert pipeline.held.scan.stamp == room_scans[4].stamp
+    odometry.estimate(room_scans[4])
     rest = list(pipeline.run(room_scans[5:9]))
     assert len(rest) == 5
     for found, expected in zip(rest, whole[4:], strict=True):
@@ -168,50 +184,45 @@ def test_a_run_goes_on_after_the_scan_that_was_read_last(done: int) -> None:
 def test_another_scan_than_the_one_that_was_read_is_noticed(held: Scan) -> None:
     odometry: Any = Deaf()
     odometry.restore = lambda _: None
-    with pytest.raises(InputError, match="the recording is not what it was"):
+    with pytest.raises(InputError, match="the recording has changed"):
         scans_left(map(scan_at, STAMPS), held, odometry, Saved({"odometry": {}}))
 
 
 def test_two_are_not_at_work_on_one_run(tmp_path: Path) -> None:
-    with Unfinished.claim(tmp_path, {"a": 1}, resume=False) as first:
-        first.begin(None)
+    with claim(tmp_path, {"a": 1}) as first:
+        first.begin(0)
         for resume in (False, True):
-            with (
-                pytest.raises(OutputError, match="somebody else is at work"),
-                Unfinished.claim(tmp_path, {"a": 1}, resume=resume),
-            ):
+            with pytest.raises(OutputError, match="another lidarslam"), claim(tmp_path, {"a": 1}, resume):
                 pass
         assert About.read(tmp_path) is not None
-    with Unfinished.claim(tmp_path, {"a": 1}, resume=True):
-        pass
 
 
 def test_what_failed_before_it_began_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
-        unfinished.begin(None)
+    with pytest.raises(RuntimeError), claim(tmp_path, {}) as unfinished:
+        unfinished.begin(0)
         raise RuntimeError
     assert not list(tmp_path.iterdir())
 
 
 def test_results_that_are_not_whole_are_not_taken_for_such_by_a_failed_attempt_to_replace_them(tmp_path: Path) -> None:
-    with Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
-        unfinished.begin(None)
-    with pytest.raises(RuntimeError), Unfinished.claim(tmp_path, {"other": 1}, resume=False):
+    with claim(tmp_path, {}) as unfinished:
+        unfinished.begin(0)
+    with pytest.raises(RuntimeError), claim(tmp_path, {"other": 1}):
         raise RuntimeError
     with pytest.raises(InputError, match="did not finish"):
         require_whole(tmp_path)
 
 
 def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> None:
-    with Unfinished.claim(tmp_path, {"a": 1}, resume=False) as unfinished:
-        unfinished.begin(None)
+    with claim(tmp_path, {"a": 1}) as unfinished:
+        unfinished.begin(0)
         with pytest.raises(InputError, match="did not finish"):
             require_whole(tmp_path)
         unfinished.end(stopped=True)
     require_whole(tmp_path)
     with pytest.raises(OutputError, match="--resume"), RunDirectory.create(tmp_path):
         pass
-    with Unfinished.claim(tmp_path, {"a": 1}, resume=True) as unfinished:
+    with claim(tmp_path, {"a": 1}, resume=True) as unfinished:
         unfinished.begin(3)
         with pytest.raises(InputError, match="did not finish"):
             require_whole(tmp_path)
@@ -222,20 +233,20 @@ def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> N
 
 
 def test_what_differs_is_named_and_not_too_much_of_it(tmp_path: Path) -> None:
-    with Unfinished.claim(tmp_path, {"a": {"b": 1, "c": 2}, "d": 3, "e": 4}, resume=False) as unfinished:
-        unfinished.begin(None)
+    with claim(tmp_path, {"a": {"b": 1, "c": 2}, "d": 3, "e": 4}) as unfinished:
+        unfinished.begin(0)
     other = {"a": {"b": 0, "c": 0}, "e": 0, "f": 0}
     with (
         pytest.raises(InputError, match=r"begun with a\.b 1 \(now 0\), a\.c 2 \(now 0\), d 3 \(now None\) and 2 more"),
-        Unfinished.claim(tmp_path, other, resume=True),
+        claim(tmp_path, other, resume=True),
     ):
         pass
 
 
 def test_results_of_another_command_in_the_place_of_a_killed_run_are_whole(tmp_path: Path) -> None:
     """A merge saves nothing, and is not taken for the run that was killed there."""
-    with Unfinished.claim(tmp_path, {}, resume=False) as unfinished:
-        unfinished.begin(None)
+    with claim(tmp_path, {}) as unfinished:
+        unfinished.begin(0)
     with pytest.raises(RuntimeError), RunDirectory.create(tmp_path, overwrite=True):
         raise RuntimeError
     with pytest.raises(InputError, match="did not finish"):

@@ -256,7 +256,7 @@ def test_a_clock_that_jumps_a_year_ahead_for_good_is_followed_and_told(tmp_path,
     stamps = messages_at(tables, lambda i: usual_ns(i) + (YEAR_NS if i > 3 else 0))
     code, summary, _ = run(write_bag(tmp_path / "drive", stamps), asked=8)
     assert (code, summary["scans"]) == (0, 8)
-    assert any("1 gaps in the stamps" in w and "31536000.1 s after scan 3" in w for w in summary["warnings"])
+    assert any("1 gap in the stamps" in w and "31536000.1 s after scan 3" in w for w in summary["warnings"])
 
 
 def test_a_clock_set_back_for_good_ends_the_run_with_a_line_and_what_there_is(tmp_path, tables):
@@ -273,7 +273,7 @@ def test_scans_that_were_dropped_are_told_as_gaps(tmp_path, tables):
     stamps = messages_at(tables, lambda i: usual_ns(i) + (20 * PERIOD_NS if i > 5 else 0))
     _, summary, _ = run(write_bag(tmp_path / "drive", stamps), asked=8)
     assert summary["scans"] == 8
-    assert any("1 gaps in the stamps" in w and "2.1 s after scan 5" in w for w in summary["warnings"])
+    assert any("1 gap in the stamps" in w and "2.1 s after scan 5" in w for w in summary["warnings"])
 
 
 def test_two_sensors_on_one_topic(tmp_path, tables):

@@ -34,7 +34,7 @@ def test_a_run_may_have_no_map(finished: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(b"index,state\n0,ok\n", "no column 'status'"), (b"index,status\n0,\xff\n", "UTF-8")]
+    ("content", "message"), [(b"index,state\n0,ok\n", "'status' is missing"), (b"index,status\n0,\xff\n", "utf-8")]
 )
 def test_a_damaged_table_is_named(finished: Path, content: bytes, message: str) -> None:
     (finished / "scans.csv").write_bytes(content)

@@ -10,12 +10,13 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, tr
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.pipeline.localisation import Estimated, Localised, OdometryAlone, ScanToMap, SweepMotion
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, SweepMotion
+from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap
+from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig, MappingConfig
 from mapping.mapper import Mapper
 from odometry.interface import Motion, Odometry
-from odometry.methods.consistency import ConsistencyCheck, ConsistencyConfig
+from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.constant_velocity import ConstantVelocity
 from odometry.methods.external import ExternalOdometry
 
@@ -50,13 +51,13 @@ def test_a_direction_of_which_nothing_is_seen_is_told_without_mapping_too() -> N
     """Standing still in a corner, of which the odometry says that it leaves nothing open, and that it leaves x open."""
     rng = np.random.default_rng(0)
     corner = np.concatenate([np.insert(rng.uniform(1.0, 6.0, (800, 2)), axis, 1.0, axis=1) for axis in range(3)])
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    localiser = OdometryAlone(ConsistencyCheck())
     told = [
         localiser.localise(Estimated(Scan(corner, 0.1 * number), Motion(np.eye(4), 100, degenerate=names), 0.1), None)
         for number, names in enumerate([(), (), ("x", "yaw")])
     ]
     assert [localised.status for localised in told[1:]] == [Status.OK, Status.DEGRADED]
-    assert (told[1].message, told[2].message) == ("", "nothing to see along x, yaw")
+    assert (told[1].message, told[2].message) == ("", "degenerate along x, yaw")
     assert told[2].degenerate == ("x", "yaw")
 
 
@@ -122,8 +123,8 @@ def check_poses_and_map(results: list[ScanResult], pipeline: Pipeline, room: Any
     assert np.linalg.norm(errors[:, :3, 3], axis=1).max() < 0.01
     assert np.rad2deg(rotation_angle(errors)).max() < 0.1
     assert all(result.status is Status.OK for result in results)
-    assert pipeline.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert pipeline.map.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 0.005
     assert np.percentile(distance, 99) < 0.06

@@ -12,20 +12,18 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import OdometryAlone
-from lidarslam.pipeline.pipeline import Pipeline, ScanResult
+from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig
 from mapping.pose_graph.graph_scan import GraphScan
-from odometry.config import ConsistencyConfig
 from odometry.interface import Motion
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.external import ExternalOdometry
 
 
 def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:
-    return Pipeline(
-        odometry, OdometryAlone(ConsistencyCheck(ConsistencyConfig())), GlobalMapConfig(voxel_size_m=voxel_size_m)
-    )
+    return Pipeline(odometry, OdometryAlone(ConsistencyCheck()), GlobalMapConfig(voxel_size_m=voxel_size_m))
 
 
 @pytest.fixture
@@ -41,8 +39,8 @@ def test_true_motions_give_true_poses_and_a_true_map(
     truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar
     np.testing.assert_allclose([result.T_world_lidar for result in results], truth, atol=1e-9)
     assert all(result.status is Status.OK for result in results)
-    assert pipeline.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert pipeline.map.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     # A voxel's mean may lie off a corner by a part of the voxel; nothing else may lie off a surface.
     distance = room.distance_to_surface(in_room)
     assert np.median(distance) < 1e-6
@@ -63,8 +61,8 @@ def test_a_single_scan_becomes_the_map(true_odometry: ExternalOdometry, room_sca
     pipeline = make_pipeline(true_odometry)
     (result,) = pipeline.run(room_scans[:1])
     np.testing.assert_array_equal(result.T_world_lidar, np.eye(4))
-    assert pipeline.global_map is not None
-    assert len(pipeline.global_map.points()) > 1_000
+    assert pipeline.map.global_map is not None
+    assert len(pipeline.map.global_map.points()) > 1_000
 
 
 def test_no_scans_give_no_results(true_odometry: ExternalOdometry) -> None:
@@ -103,8 +101,8 @@ def test_a_lost_scan_is_said_to_be_lost_and_stays_out_of_the_map(
     assert statuses(results[:18]) == [Status.OK] * 18
     assert statuses(results[18:]) in ([Status.OK, Status.LOST], [Status.DEGRADED, Status.LOST])
     assert failure is None or results[19].message == failure
-    assert pipeline.global_map is not None
-    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.global_map.points())
+    assert pipeline.map.global_map is not None
+    in_room = transform_points(room_truth.T_world_lidar[0], pipeline.map.global_map.points())
     assert room.distance_to_surface(in_room).max() < 0.06, "no wall is drawn twice"
 
 
@@ -144,7 +142,7 @@ class _Notes:
 
 
 def followed(odometry: Any, follower: _Notes) -> Pipeline:
-    localiser = OdometryAlone(ConsistencyCheck(ConsistencyConfig()))
+    localiser = OdometryAlone(ConsistencyCheck())
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), follower)
 
 
@@ -213,7 +211,7 @@ def test_a_sweep_is_compensated_with_the_motion_after_it(room: Any, room_truth: 
 def test_the_range_is_cropped(true_odometry: ExternalOdometry, room: Any, drive: Callable[..., FloatArray]) -> None:
     scans = [room.sweep(drive, float(stamp)) for stamp in (0.1, 0.2)]
     config = GlobalMapConfig(voxel_size_m=0.1, min_range_m=2.0, max_range_m=4.0)
-    pipeline = Pipeline(true_odometry, OdometryAlone(ConsistencyCheck(ConsistencyConfig())), config)
+    pipeline = Pipeline(true_odometry, OdometryAlone(ConsistencyCheck()), config)
     for result in pipeline.run(scans):
         ranges = np.linalg.norm(result.points, axis=1)
         assert ranges.min() > 1.9  # compensation moves points by centimetres after the crop

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lidarslam.pipeline.prefetch import prefetch
+from lidarslam.pipeline.scan_stream import prefetch
 
 
 def test_items_come_in_order() -> None:
@@ -43,4 +43,4 @@ def test_leaving_early_ends_the_thread() -> None:
     reader = prefetch(iter(int, 1))  # endless
     next(reader)
     reader.close()  # type: ignore[attr-defined]
-    assert not [thread for thread in threading.enumerate() if thread.name == "prefetch"]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]

@@ -60,7 +60,7 @@ def test_what_did_not_finish_is_not_called_a_run(tmp_path: Path) -> None:
     """It may be a merge, which nothing resumes."""
     (tmp_path / ABOUT).parent.mkdir()
     (tmp_path / ABOUT).write_text("{}")
-    said = "holds what did not finish; replace it with --overwrite, or go on with a run by --resume$"
+    said = "holds an unfinished run or merge; replace it with --overwrite, or resume a run with --resume$"
     with pytest.raises(OutputError, match=said), RunDirectory.create(tmp_path):
         pass
     with RunDirectory.create(tmp_path, overwrite=True):
@@ -92,8 +92,8 @@ def test_a_file_in_the_way_is_an_error(tmp_path: Path) -> None:
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_rest(earlier: Path) -> None:
     directory = RunDirectory(earlier)
-    with pytest.raises(RuntimeError), directory.open_text(CONFIG) as out:
-        out.write("half")
+    with pytest.raises(RuntimeError), directory.replacing(CONFIG) as partial:
+        partial.write_text("half")
         raise RuntimeError
     assert names(earlier) == [CONFIG, METRICS, "notes.txt"]
     assert (earlier / CONFIG).read_text() == "run:\n  version: 0\n"

@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from lidarslam.pipeline.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.run.summary_text import format_outcome
+from mapping.loops.closure import LoopClosure
 
 
 def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
@@ -27,15 +30,15 @@ def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
 
 def test_one_of_a_thing_is_singular() -> None:
     text = format_outcome(Path("out"), RunOutcome(summary_of(), None))
-    for words in ("1 scan, 0.0 m", "map of 1 point, one", "LOST on 1 more stretch\n", "lost on 4 of 1 scan;"):
+    for words in ("1 scan, 0.0 m", "map of 1 point, voxels", "LOST on 1 more stretch\n", "lost on 4 of 1 scan;"):
         assert words in text
 
 
 def test_what_moved_is_counted() -> None:
     for moved, words in (
-        (0, "one in every voxel of 10 cm\n"),
-        (1, "voxel of 10 cm; 1 point of what moved left out\n"),
-        (2345, "voxel of 10 cm; 2,345 points of what moved left out\n"),
+        (0, "voxels of 10 cm\n"),
+        (1, "voxels of 10 cm; 1 point of moving objects removed\n"),
+        (2345, "voxels of 10 cm; 2,345 points of moving objects removed\n"),
     ):
         summary = summary_of(moved=moved)
         assert words in format_outcome(Path("out"), RunOutcome(summary, None))
@@ -43,10 +46,11 @@ def test_what_moved_is_counted() -> None:
 
 
 def test_loops_are_counted_and_their_effect_is_said() -> None:
-    loops = [LoopReport(0, 9, accepted, "", "nearby", 0.9, 0.01, 0.8, 2, 1.0, 5.0) for accepted in (True, False, True)]
+    closure = LoopClosure(0, 5, np.eye(4), np.eye(6), 0.9, 0.01, 0.8, False, 2, "")
+    loops = [LoopReport(closure, accepted, (0, 9)) for accepted in (True, False, True)]
     for chosen, words in (
-        (loops, "7 keyframes, 2 loops closed, which moved poses by up to 1.23 m (1 more did not convince;"),
-        (loops[:1], "7 keyframes, 1 loop closed, which moved poses by up to 1.23 m\n"),
+        (loops, "7 keyframes, 2 loops closed, poses corrected by up to 1.23 m (1 candidate rejected;"),
+        (loops[:1], "7 keyframes, 1 loop closed, poses corrected by up to 1.23 m\n"),
         ([], "7 keyframes, 0 loops closed\n"),
     ):
         summary = summary_of(GraphSummary(7, 12, tuple(chosen), 1.234, None))

@@ -3,7 +3,10 @@
 import csv
 import pickle
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,32 +19,31 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.simulation.recording.mixture import ingredients_of
 from lidarslam.train import data as training_data
-from lidarslam.train.config import SimulatedConfig, TrainConfig, dump_train_yaml, load_train_config, loss_settings
 from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
-from lidarslam.train.request import StepReport, TrainNarrator, TrainRequest
-from lidarslam.train.text import format_outcome, format_validation
-from lidarslam.train.train import execute
+from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
+from lidarslam.train.train import TrainRequest, execute
 from odometry.network.checkpoint import load_checkpoint, network_of
 from odometry.network.networks import make_network
-from odometry.training.loss_config import LossConfig
-from odometry.training.training import Validation, summarise, validate
+from odometry.training.augmentation import AUGMENTATION
+from odometry.training.config import LossConfig, SimulatedConfig
+from odometry.training.pairs import Pairs
+from odometry.training.training import summarise, validate
 
 TINY = (
-    "training.images={rows: 8, columns: 96}",
-    "training.network.correlation={rows: 8, widths: [8, 8, 8], bird_width: 4}",
+    "training.images.columns=96",
     "training.batch=2",
-    "training.geometric_points=64",
     "training.steps=8",
-    "training.log_every=3",
-    "training.validate_every=4",
     "training.warmup_steps=2",
     "training.hold_out=0.3",
 )
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small networks are fastest so."""
+def small_steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Frequent reports; and one thread, with which small networks are fastest."""
+    monkeypatch.setattr("lidarslam.train.loop.LOG_EVERY", 3)
+    monkeypatch.setattr("lidarslam.train.loop.VALIDATE_EVERY", 4)
+    monkeypatch.setattr("odometry.training.objective._GEOMETRIC_POINTS", 64)
     earlier = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -63,25 +65,21 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("ready")
 
 
-class Listener(TrainNarrator):
-    """Keeps what it is told, and presses Ctrl-C after a validation."""
+class Console:
+    """Keeps the lines, and presses Ctrl-C after a validation."""
 
     def __init__(self, interrupt_at: int | None = None) -> None:
         self.interrupt_at = interrupt_at
-        self.reports: list[StepReport] = []
-        self.validations: list[tuple[int, Validation]] = []
-        self.read = 0
+        self.lines: list[str] = []
 
-    def preparing(self, done: int, total: int) -> None:  # noqa: ARG002
-        self.read = done
-
-    def stepped(self, report: StepReport) -> None:
-        self.reports.append(report)
-
-    def validated(self, step: int, result: Validation, is_best: bool) -> None:  # noqa: ARG002
-        self.validations.append((step, result))
-        if step == self.interrupt_at:
+    def __call__(self, line: str) -> None:
+        self.lines.append(line)
+        if line.startswith(f"validation after {self.interrupt_at} steps"):
             signal.raise_signal(signal.SIGINT)
+
+    def validated(self) -> list[int]:
+        """Steps after which there was a validation."""
+        return [int(line.split()[2]) for line in self.lines if line.startswith("validation")]
 
 
 def request(source: Path, out: Path, ready: Path, *settings: str, resume: bool = False) -> TrainRequest:
@@ -102,34 +100,33 @@ def same_weights(one: Path, other: Path) -> bool:
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder: Path, tmp_path: Path, ready: Path) -> None:
     whole, parts, other = tmp_path / "whole", tmp_path / "parts", tmp_path / "other"
-    outcome = execute(request(room_folder, whole, ready), Listener())
-    assert (outcome.steps, outcome.interrupted) == (8, False)
-    listener = Listener(interrupt_at=4)
-    outcome = execute(request(room_folder, parts, ready), listener)
-    assert (outcome.steps, outcome.interrupted) == (4, True)
-    assert [step for step, _ in listener.validations] == [0, 4]
-    outcome = execute(request(room_folder, parts, ready, resume=True), Listener())
-    assert (outcome.steps, outcome.interrupted) == (8, False)
+    assert execute(request(room_folder, whole, ready), Console())
+    console = Console(interrupt_at=4)
+    assert not execute(request(room_folder, parts, ready), console)
+    assert console.validated() == [0, 4]
+    assert console.lines[-1].startswith("4 steps done; weights written to")
+    assert "--resume" in console.lines[-1]
+    assert execute(request(room_folder, parts, ready, resume=True), Console())
     assert [row["step"] for row in losses(whole)] == ["3", "6", "8"]
     assert losses(parts) == losses(whole)
     assert (parts / "validation.csv").read_text() == (whole / "validation.csv").read_text()
     assert same_weights(whole, parts)
-    execute(request(room_folder, other, ready, "training.seed=1"), Listener())
+    execute(request(room_folder, other, ready, "training.seed=1"), Console())
     assert not same_weights(whole, other)
 
 
 def test_what_a_training_leaves(room_folder: Path, tmp_path: Path, ready: Path) -> None:
-    listener = Listener()
-    outcome = execute(request(room_folder, tmp_path / "out", ready), listener)
-    assert listener.read == 10
+    console = Console()
+    assert execute(request(room_folder, tmp_path / "out", ready), console)
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "config.yaml", "state.safetensors", "tensorboard", "train.csv", "validation.csv", "weights.safetensors",
         "weights_last.safetensors",
     }  # fmt: skip
     assert list((tmp_path / "out" / "tensorboard").iterdir())
-    best = load_checkpoint(outcome.weights)
-    assert outcome.best in [result for _, result in listener.validations]
+    best = load_checkpoint(tmp_path / "out" / "weights.safetensors")
+    errors = best.about["validation"]
+    assert f"on held-out scans off by {errors['rotation_rms_deg']:.3f} deg" in console.lines[-1]
     assert best.images.columns == 96
     assert best.about["sources"] == [room_folder.name]  # not where it lay
 
@@ -139,15 +136,15 @@ def test_where_no_held_out_pair_can_be_aligned_the_last_weights_are_kept(
 ) -> None:
     nothing = summarise(torch.zeros(0, 6), torch.zeros(0, 6))
     monkeypatch.setattr("lidarslam.train.loop.validate", lambda *_, **__: nothing)
-    listener = Listener()
-    outcome = execute(request(room_folder, tmp_path / "out", ready), listener)
-    assert "nothing to compare with" in format_validation(8, listener.validations[-1][1], True)
+    console = Console()
+    execute(request(room_folder, tmp_path / "out", ready), console)
+    assert any("nothing to compare with" in line for line in console.lines)
     kept, last = (
         load_checkpoint(tmp_path / "out" / name) for name in ("weights.safetensors", "weights_last.safetensors")
     )
     assert all(torch.equal(kept.weights[name], last.weights[name]) for name in last.weights)
-    assert outcome.best is None
-    assert "nan" not in format_outcome(tmp_path / "out", outcome)
+    assert kept.about["validation"] is None
+    assert not any("nan" in line for line in console.lines)
 
 
 def test_recordings_are_prepared_once(room_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +153,7 @@ def test_recordings_are_prepared_once(room_folder: Path, tmp_path: Path, monkeyp
     first = prepared([stretch], config.training, tmp_path, lambda _: None)
     monkeypatch.setattr(training_data, "prepare", lambda *_: pytest.fail("prepared again"))
     again = prepared([stretch], config.training, tmp_path, lambda _: None)
-    for name in ("T_prev_curr", "believed", "explained", "interval_s"):
+    for name in ("T_prev_curr", "valid", "interval_s"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name))
     for name, value in vars(first[0].images).items():
         assert torch.equal(value, getattr(again[0].images, name))
@@ -204,15 +201,16 @@ def test_of_the_simulated_recordings_some_kinds_can_be_chosen() -> None:
 
 def test_named_losses() -> None:
     def training(name: str) -> tuple[LossConfig | None, float]:
-        config = load_train_config(None, loss_settings(name)).training
+        config = load_train_config(None, LOSSES[name]).training
         return config.geometric, config.alignment_weight
 
     assert training("both") == (LossConfig(), 0.0)
-    assert training("paper") == (LossConfig.paper(), 0.0)
+    assert training("paper") == (LossConfig(robust=False), 0.0)
     assert training("point-to-plane") == (LossConfig(plane_to_plane=False), 0.0)
     assert training("plane-to-plane") == (LossConfig(point_to_plane=False), 0.0)
     assert training("alignment") == (None, 1.0)
-    assert loss_settings(None) == []
+    refined = [*LOSSES["paper"], "training.geometric.plane_to_plane=false"]
+    assert load_train_config(None, refined).training.geometric == LossConfig(plane_to_plane=False, robust=False)
 
 
 def test_a_written_configuration_is_read_back(tmp_path: Path) -> None:
@@ -250,7 +248,7 @@ def test_the_command_trains_goes_on_and_replaces(room_folder: Path, tmp_path: Pa
     ("arguments", "told"),
     [
         ((), "there is nothing to train on; name a SOURCE"),
-        (("--set", "training.geometric.gate=1"), "there is no training.geometric.gate; did you mean gate_m?"),
+        (("--set", "training.geometric.robus=1"), "there is no training.geometric.robus; did you mean robust?"),
         (("--set", "training.batch"), "such as training.batch=8"),
         (("--resume",), "holds no training to go on with"),
         (("--resume", "--overwrite"), "choose one"),
@@ -269,28 +267,49 @@ def test_mistakes_are_told_in_one_line(arguments: tuple[str, ...], told: str, tm
 
 def test_other_recordings_or_files_are_not_gone_on_with(room_folder: Path, tmp_path: Path, ready: Path) -> None:
     out = tmp_path / "out"
-    execute(request(room_folder, out, ready, "training.steps=1"), TrainNarrator())
+    execute(request(room_folder, out, ready, "training.steps=1"), Console())
     with pytest.raises(ConfigError, match="not those that this training was begun with"):
-        execute(request(room_folder, out, ready, "reader.rate_hz=5", resume=True), TrainNarrator())
+        execute(request(room_folder, out, ready, "reader.rate_hz=5", resume=True), Console())
     (out / "state.safetensors").write_bytes(pickle.dumps({"a": 1}))
-    with pytest.raises(InputError, match="is a pickle"):
-        execute(request(room_folder, out, ready, resume=True), TrainNarrator())
+    with pytest.raises(InputError, match="is not the state of a training"):
+        execute(request(room_folder, out, ready, resume=True), Console())
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "weights.safetensors").write_text("mine")
     with pytest.raises(OutputError, match="not those of a training"):
-        execute(request(room_folder, tmp_path / "foreign", ready), TrainNarrator())
+        execute(request(room_folder, tmp_path / "foreign", ready), Console())
 
 
 @pytest.mark.slow
-def test_a_short_recording_is_learnt_by_heart(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+def test_two_processes_train_one_network(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    """The first process validates, writes and speaks; gradients are averaged, so that both have the same weights."""
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", "--no-python"]
+    program = [sys.executable, "-c", "from lidarslam.cli import main; main()"]
+    settings = [word for setting in TINY for word in ("--set", setting)]
+    options = ["--out", str(tmp_path / "out"), "--prepared", str(ready), "--device", "cpu", "--steps", "2"]
+    result = subprocess.run(
+        [*torchrun, *program, "train", str(room_folder), *options, *settings],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert "Computing on cpu in 2 processes" in result.stdout
+    assert result.stdout.count("step 2/2  loss") == 1
+    assert load_checkpoint(tmp_path / "out" / "weights.safetensors").about["steps"] in (0, 2)
+
+
+@pytest.mark.slow
+def test_a_short_recording_is_learnt_by_heart(
+    room_folder: Path, tmp_path: Path, ready: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Labels play no part: alignment found the motions that the error is measured against."""
-    settings = ("training.steps=300", "training.validate_every=100", "training.batch=8", "training.hold_out=0.0")
     plain = ("roll", "any_roll", "mirror", "scale", "drop_beams", "drop_points", "hide_sector")
-    augmentation = f"training.augmentation={{{', '.join(f'{name}: 0.0' for name in plain)}}}"
-    outcome = execute(request(room_folder, tmp_path / "out", ready, *settings, augmentation), TrainNarrator())
-    trained = load_checkpoint(outcome.weights)
+    unchanged = AUGMENTATION._replace(**dict.fromkeys(plain, 0.0))
+    monkeypatch.setattr("lidarslam.train.loop.Pairs", partial(Pairs, augmentation=unchanged))
+    monkeypatch.setattr("lidarslam.train.loop.VALIDATE_EVERY", 100)
+    settings = ("training.steps=300", "training.batch=8", "training.hold_out=0.0")
+    execute(request(room_folder, tmp_path / "out", ready, *settings), Console())
+    trained = load_checkpoint(tmp_path / "out" / "weights.safetensors")
     config = load_train_config(None, TINY)
-    recording = prepared([recorded(room_folder, config.reader)], config.training.images, ready, lambda _: None)
+    recording = prepared([recorded(room_folder, config.reader)], config.training, ready, lambda _: None)
     before = validate(make_network(trained.network).eval(), recording)
     after = validate(network_of(trained), recording)
     assert after.rotation_rms_deg < 0.5 * before.rotation_rms_deg

@@ -7,14 +7,14 @@ import torch
 from lidarslam.core.geometry import inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from lidarslam.train.data import Stretch, draw_weights
 from lidarslam.train.teacher import MapTeacher
-from odometry.images.image_config import ImageConfig
+from odometry.config import ImageConfig
 from odometry.images.sweep_images import middle_offset_s
 from odometry.training.preparation import prepare
 
@@ -36,11 +36,11 @@ def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(drive):
     teacher = MapTeacher()
     for scan in scans:
         teacher.follow(scan)
-    taught = teacher.taught(prepare(iter(scans), ImageConfig()))
+    taught = teacher.relabelled(prepare(iter(scans), ImageConfig()))
     middles = np.array([scan.stamp + middle_offset_s(scan) for scan in scans[:-1]])
     poses = truth.at(middles, 0.1)
     expected = inverse(poses[:-1]) @ poses[1:]
-    sure = taught.believed.numpy()[: SCANS - 2]
+    sure = taught.valid.numpy()[: SCANS - 2]
     assert sure.mean() > 0.7
     errors = log(inverse(taught.T_prev_curr.double().numpy()[: SCANS - 2]) @ expected)[sure]
     assert np.linalg.norm(errors[:, 3:], axis=1).max() < 0.05
@@ -54,10 +54,10 @@ def test_what_is_not_sure_is_not_taught(drive):
     strange = [*scans[:5], Scan(scans[5].points[:40], scans[5].stamp), *scans[6:9]]
     for scan in strange:
         teacher.follow(scan)
-    taught = teacher.taught(prepare(iter(strange), ImageConfig()))
-    assert taught.believed.dtype == torch.bool
-    assert not taught.believed[4]
-    assert not taught.believed[5]
+    taught = teacher.relabelled(prepare(iter(strange), ImageConfig()))
+    assert taught.valid.dtype == torch.bool
+    assert not taught.valid[4]
+    assert not taught.valid[5]
 
 
 def stretch(scans: int, simulated: bool) -> Stretch:
@@ -67,15 +67,15 @@ def stretch(scans: int, simulated: bool) -> Stretch:
 
 def test_recordings_have_their_share_of_the_pairs_by_their_lengths():
     given = [stretch(100, False), stretch(300, False), stretch(40, True), stretch(40, True), stretch(40, True)]
-    weights = draw_weights(given, 0.3)
+    weights = draw_weights(given)
     assert weights == pytest.approx([0.075, 0.225, 0.7 / 3, 0.7 / 3, 0.7 / 3])
 
 
 def test_long_recordings_are_drawn_in_pieces():
-    weights = draw_weights([stretch(1200, False), stretch(40, True)], 0.5)
-    assert weights == pytest.approx([1 / 6, 1 / 6, 1 / 6, 0.5])
+    weights = draw_weights([stretch(1200, False), stretch(40, True)])
+    assert weights == pytest.approx([0.1, 0.1, 0.1, 0.7])
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_recordings_of_one_kind_are_drawn_equally_often(simulated):
-    assert draw_weights([stretch(10, simulated), stretch(400, simulated)], 0.3) == [1.0, 1.0]
+    assert draw_weights([stretch(10, simulated), stretch(400, simulated)]) == [1.0, 1.0]

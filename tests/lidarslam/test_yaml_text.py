@@ -16,8 +16,8 @@ def test_plain_values() -> None:
     ("text", "message"),
     [
         ("a: [1", "not YAML"),
-        ("a: 1\nb: 2\na: 3\n", "the key 'a' stands twice"),
-        ("a: {b: 1, b: 2}", "the key 'b' stands twice"),
+        ("a: 1\nb: 2\na: 3\n", "the key 'a' occurs twice"),
+        ("a: {b: 1, b: 2}", "the key 'b' occurs twice"),
         ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
         ("a: !!python/name:os.system", "could not determine a constructor"),
         ("a: 2021-13-45", "looks like a date or a number but is none"),

@@ -97,12 +97,7 @@ def test_a_turn_that_was_missed_is_made_up_for_evenly() -> None:
     assert np.linalg.norm(from_first[2, :3]) == pytest.approx(0.5 * np.linalg.norm(log(poses[1])[:3]))
 
 
-@pytest.mark.parametrize("keyframes", [[], [3, 3], [5, 3], [-1, 3], [3, 40]])
-def test_keyframes_must_be_scans_and_increase(trajectory: FloatArray, keyframes: list[int]) -> None:
+@pytest.mark.parametrize("keyframes", [[], [3, 3], [5, 3]])
+def test_keyframes_must_increase(trajectory: FloatArray, keyframes: list[int]) -> None:
     with pytest.raises(ValueError, match="keyframe"):
         corrected(trajectory, np.array(keyframes, dtype=np.intp), np.tile(np.eye(4), (len(keyframes), 1, 1)))
-
-
-def test_each_keyframe_needs_a_pose(trajectory: FloatArray) -> None:
-    with pytest.raises(ValueError, match="2 keyframes"):
-        corrected(trajectory, np.array([3, 5]), np.eye(4)[None])

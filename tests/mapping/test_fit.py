@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
 from mapping.config import TrackingConfig
-from mapping.surfels.surfel_map import LocalMap
+from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.fit import Fit, directional_support, measure_fit
 
 CONFIG = TrackingConfig()
@@ -22,10 +22,10 @@ def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> Flo
 
 
 @pytest.fixture
-def box_map(rng: np.random.Generator) -> LocalMap:
-    local_map = LocalMap(0.2, 100.0)
+def box_map(rng: np.random.Generator) -> SurfelMap:
+    local_map = SurfelMap(0.2, 100.0)
     points = box_points(rng, 60_000)
-    local_map.add(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.empty((0, 3)), np.zeros(3))
+    local_map.insert(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.zeros(3))
     return local_map
 
 
@@ -35,8 +35,8 @@ def scan_points(rng: np.random.Generator) -> FloatArray:
     return transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 3_000, margin=0.5))
 
 
-def test_a_scan_in_its_place_fits_entirely(box_map: LocalMap, scan_points: FloatArray) -> None:
-    fit = measure_fit(scan_points, T_WORLD_LIDAR, box_map, CONFIG)
+def test_a_scan_in_its_place_fits_entirely(box_map: SurfelMap, scan_points: FloatArray) -> None:
+    fit = measure_fit(scan_points, T_WORLD_LIDAR, box_map)
     assert fit.matched == len(scan_points)
     assert fit.overlap == 1.0
     assert fit.inlier_ratio == 1.0
@@ -46,46 +46,46 @@ def test_a_scan_in_its_place_fits_entirely(box_map: LocalMap, scan_points: Float
     assert fit.explain(CONFIG) == ""
 
 
-def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map: LocalMap, scan_points: FloatArray) -> None:
+def test_of_points_half_of_which_see_nothing_known_half_overlap(box_map: SurfelMap, scan_points: FloatArray) -> None:
     elsewhere = scan_points + np.array([0.0, 0.0, 50.0])
-    fit = measure_fit(np.concatenate([scan_points, elsewhere]), T_WORLD_LIDAR, box_map, CONFIG)
+    fit = measure_fit(np.concatenate([scan_points, elsewhere]), T_WORLD_LIDAR, box_map)
     assert fit.overlap == pytest.approx(0.5)
     assert fit.inlier_ratio == 1.0
     assert fit.inlier_share == pytest.approx(0.5)
 
 
-def test_points_at_corners_count_once_each(box_map: LocalMap, rng: np.random.Generator) -> None:
-    """Whatever a point there is held against, planes, lines or bodies."""
+def test_points_at_corners_count_once_each(box_map: SurfelMap, rng: np.random.Generator) -> None:
+    """Whatever a point there is held against, planes or bodies."""
     points = transform_points(inverse(T_WORLD_LIDAR), box_points(rng, 4_000))
-    fit = measure_fit(points, T_WORLD_LIDAR, box_map, CONFIG)
+    fit = measure_fit(points, T_WORLD_LIDAR, box_map)
     assert fit.matched <= len(points)
     assert 0.8 < fit.overlap <= 1.0
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_worst_axis_decides(box_map: LocalMap, scan_points: FloatArray, axis: int) -> None:
+def test_the_worst_axis_decides(box_map: SurfelMap, scan_points: FloatArray, axis: int) -> None:
     """A shift by a little more than the gate along one axis of the world: the others' walls all fit."""
     shift = np.eye(4)
     shift[axis, 3] = 0.35
-    fit = measure_fit(scan_points, shift @ T_WORLD_LIDAR, box_map, CONFIG)
+    fit = measure_fit(scan_points, shift @ T_WORLD_LIDAR, box_map)
     assert fit.inlier_ratio is not None
     assert fit.inlier_ratio < 0.05
     assert fit.status(CONFIG) is Status.LOST
-    assert "lies on the map" in fit.explain(CONFIG)
+    assert "fits the map" in fit.explain(CONFIG)
 
 
-def test_a_scan_far_from_everything_does_not_meet_the_map(box_map: LocalMap, scan_points: FloatArray) -> None:
+def test_a_scan_far_from_everything_does_not_meet_the_map(box_map: SurfelMap, scan_points: FloatArray) -> None:
     far = np.eye(4)
     far[:3, 3] = 500.0
-    fit = measure_fit(scan_points, far, box_map, CONFIG)
+    fit = measure_fit(scan_points, far, box_map)
     assert fit == Fit(0, 0.0, None, None)
     assert fit.status(CONFIG) is Status.LOST
     assert fit.inlier_share == 0.0
-    assert "0 % of the scan meets the map" in fit.explain(CONFIG)
+    assert "0 % of the scan overlaps the map" in fit.explain(CONFIG)
 
 
-def test_no_points_fit_nothing(box_map: LocalMap) -> None:
-    assert measure_fit(np.empty((0, 3)), np.eye(4), box_map, CONFIG) == Fit(0, 0.0, None, None)
+def test_no_points_fit_nothing(box_map: SurfelMap) -> None:
+    assert measure_fit(np.empty((0, 3)), np.eye(4), box_map) == Fit(0, 0.0, None, None)
 
 
 @pytest.mark.parametrize(
@@ -99,17 +99,17 @@ def test_the_share_of_inliers_decides_on_the_status(inlier_ratio: float, status:
 
 def test_a_scan_that_hardly_meets_the_map_is_lost_however_it_fits() -> None:
     assert Fit(50, 0.05, 0.001, 1.0).status(CONFIG) is Status.LOST
-    assert Fit(50, 0.05, 0.001, 1.0).explain(CONFIG) == "only 5 % of the scan meets the map"
+    assert Fit(50, 0.05, 0.001, 1.0).explain(CONFIG) == "only 5 % of the scan overlaps the map"
 
 
 def test_far_points_may_lie_farther_from_their_surface(rng: np.random.Generator) -> None:
     """At 40 m two per cent of the range are 0.8 m; the same offset nearby is none of an inlier."""
     for distance, expected in ((40.0, 1.0), (5.0, 0.0)):
         wall = np.column_stack([np.full(20_000, distance), rng.uniform(-3, 3, (20_000, 2))])
-        local_map = LocalMap(0.5, 100.0)
-        local_map.add(wall, rng.uniform(-0.1, 0.1, 20_000), np.empty((0, 3)), np.zeros(3))
+        local_map = SurfelMap(0.5, 100.0)
+        local_map.insert(wall, rng.uniform(-0.1, 0.1, 20_000), np.zeros(3))
         asked = np.column_stack([np.full(500, distance - 0.4), rng.uniform(-2, 2, (500, 2))])
-        fit = measure_fit(asked, np.eye(4), local_map, CONFIG)
+        fit = measure_fit(asked, np.eye(4), local_map)
         assert fit.inlier_ratio == expected
 
 

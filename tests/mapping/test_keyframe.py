@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from mapping.pose_graph.graph_config import KeyframeConfig
+from mapping.config import KeyframeConfig
+from mapping.pose_graph import keyframes
 from mapping.pose_graph.keyframes import KeyframeSelector
 
 
@@ -26,16 +27,18 @@ def moved(x: float = 0.0, turn_deg: float = 0.0) -> FloatArray:
     return exp([0.0, 0.0, np.deg2rad(turn_deg), x, 0.0, 0.0])
 
 
-def test_the_way_to_the_next_follows_the_scene(hall: FloatArray) -> None:
+def test_the_way_to_the_next_follows_the_scene(hall: FloatArray, monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of 8 m; in a hall four times as large it would be 4 m at most, in a shaft 0.5 m at least."""
+    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.0)
     for scale, distance_m in ((1.0, 2.05), (4.0, 4.0), (0.1, 0.5)):
-        chosen = selector(scale * hall, least_overlap=0.0)
+        chosen = selector(scale * hall)
         assert not chosen.is_due(moved(0.97 * distance_m), scale * hall)
         assert chosen.is_due(moved(1.03 * distance_m), scale * hall)
 
 
-def test_the_way_can_be_set(hall: FloatArray) -> None:
-    chosen = selector(hall, distance_m=3.0, least_overlap=0.0)
+def test_the_way_can_be_set(hall: FloatArray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.0)
+    chosen = selector(hall, distance_m=3.0)
     assert not chosen.is_due(moved(2.9), hall)
     assert chosen.is_due(moved(3.0), hall)
 
@@ -46,17 +49,20 @@ def test_a_turn_on_the_spot_makes_a_keyframe(hall: FloatArray) -> None:
     assert chosen.is_due(moved(turn_deg=-31.0), hall)
 
 
-def test_a_scan_that_sees_other_things_is_due(hall: FloatArray) -> None:
+def test_a_scan_that_sees_other_things_is_due(hall: FloatArray, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of it elsewhere: through a door, say."""
-    chosen = selector(hall, least_overlap=0.6)
+    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.6)
+    chosen = selector(hall)
     beyond = hall + np.where(hall[:, :1] > 0.0, [[10.0, 0.0, 0.0]], 0.0)
     assert not chosen.is_due(moved(0.1), hall)
     assert chosen.is_due(moved(0.1), beyond)
-    assert not selector(hall, least_overlap=0.4).is_due(moved(0.1), beyond)
+    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.4)
+    assert not selector(hall).is_due(moved(0.1), beyond)
 
 
-def test_noise_is_no_new_sight(hall: FloatArray, rng: np.random.Generator) -> None:
-    chosen = selector(hall, least_overlap=0.95)
+def test_noise_is_no_new_sight(hall: FloatArray, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keyframes, "_LEAST_OVERLAP", 0.95)
+    chosen = selector(hall)
     assert not chosen.is_due(np.eye(4), hall + rng.normal(0.0, 0.05, hall.shape))
 
 

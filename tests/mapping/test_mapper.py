@@ -12,8 +12,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from mapping.config import MappingConfig, TrackingConfig
-from mapping.mapper import MappedScan, Mapper
+from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.tracking.tracker import MappedScan
 
 Path = Callable[[FloatArray], FloatArray]
 VELOCITY = np.array([0.0, 0.01, 0.3, 0.8, 0.05, 0.0])  # of the drive
@@ -193,7 +194,7 @@ def test_a_first_scan_of_nothing_is_lost_and_the_next_begins_the_map(
 ) -> None:
     first = mapper.process(empty(0.0), NOTHING)
     assert first.status is Status.LOST
-    assert first.message == "there is no point within range"
+    assert first.message == "no points within range"
     assert mapper.local_map is None
     assert_true(process(mapper, rest_scans), rest_truth.T_world_lidar, 0.006, 0.06)
 
@@ -204,10 +205,10 @@ def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothi
     held = size(settled)
     lost = settled.process(empty(rest_scans[15].stamp), NOTHING)
     assert lost.status is Status.LOST
-    assert lost.message == "there is no point within range"
+    assert lost.message == "no points within range"
     assert not lost.registered
     assert size(settled) == held
-    np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_expected)
+    np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_predicted)
     truth = inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar
     assert np.linalg.norm(lost.state.T_world_lidar[:3, 3] - truth[15, :3, 3]) < 0.02, "it goes on as it did"
 
@@ -242,7 +243,7 @@ def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_the_map(rest_scans: 
     placed = mapper.process(replace(rest_scans[1], points=crowded), NOTHING)
     assert placed.registered
     assert placed.status is Status.DEGRADED
-    assert "lies on the map" in placed.message
+    assert "fits the map" in placed.message
     assert size(mapper) == held
 
 
@@ -267,24 +268,28 @@ def test_turned_on_the_spot_it_finds_its_way_back(
     assert np.linalg.norm(error[:3, 3]) < 0.01
     assert np.rad2deg(rotation_angle(error)) < 0.1
     assert found.status is Status.DEGRADED
-    assert "from where it was expected" in found.message
+    assert "from the prediction" in found.message
 
 
-def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans: list[Scan]) -> None:
-    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=3)))
+def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans: list[Scan], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 3)
+    mapper = Mapper(MappingConfig())
     process(mapper, rest_scans[:10])
     stamps = rest_scans[9].stamp + 0.1 * np.arange(1, 4)
     lost = [mapper.process(garbage(float(stamp), seed), NOTHING) for seed, stamp in enumerate(stamps)]
     assert [result.status for result in lost] == [Status.LOST] * 3
-    assert ["a new map is begun here" in result.message for result in lost] == [False, False, True]
+    assert ["a new map begins here" in result.message for result in lost] == [False, False, True]
 
 
-def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(rest_scans: list[Scan], rest_truth: Trajectory) -> None:
+def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(
+    rest_scans: list[Scan], rest_truth: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two covered scans, then the room again, which fits the new map and not what came between."""
-    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=1)))
+    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 1)
+    mapper = Mapper(MappingConfig())
     process(mapper, [garbage(0.0)])
     restarted = mapper.process(rest_scans[0], NOTHING)
-    assert "a new map is begun here" in restarted.message
+    assert "a new map begins here" in restarted.message
     results = process(mapper, rest_scans[1:])
     assert [result.status for result in results] == [Status.OK] * 19
     relative = inverse(restarted.state.T_world_lidar) @ results[-1].state.T_world_lidar
@@ -292,8 +297,11 @@ def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(rest_scans: list
     assert np.linalg.norm(relative[:3, 3] - truth[:3, 3]) < 0.01
 
 
-def test_scans_of_nothing_never_begin_a_new_map(rest_scans: list[Scan], rest_truth: Trajectory) -> None:
-    mapper = Mapper(MappingConfig(tracking=TrackingConfig(give_up_after=2)))
+def test_scans_of_nothing_never_begin_a_new_map(
+    rest_scans: list[Scan], rest_truth: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
+    mapper = Mapper(MappingConfig())
     process(mapper, rest_scans[:10])
     held = size(mapper)
     process(mapper, [empty(rest_scans[9].stamp + 0.01 * k) for k in range(1, 6)])

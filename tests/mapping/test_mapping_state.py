@@ -10,17 +10,21 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig, TrackingConfig
+from mapping.config import KeyframeConfig, MappingConfig
 from mapping.global_map import global_map
 from mapping.global_map.global_map import GlobalMap
-from mapping.loam.rings import RingFinder, RingSource
-from mapping.mapper import MappedScan, Mapper
-from mapping.pose_graph.graph_config import KeyframeConfig
+from mapping.mapper import Mapper
 from mapping.pose_graph.keyframes import KeyframeSelector
-from mapping.prediction import Carrier, OdometryNoise, Prior
+from mapping.prediction import OdometryNoise, Prior, ProcessNoise
+from mapping.tracking.tracker import MappedScan
 
 ThroughDisk = Callable[[State], Saved]
-CONFIG = MappingConfig(keypoints=600, tracking=TrackingConfig(give_up_after=2))
+CONFIG = MappingConfig(keypoints=600)
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +41,8 @@ def scans(room_scans: list[Scan]) -> list[Scan]:
 def assert_same(found: MappedScan, expected: MappedScan) -> None:
     for name, value in vars(expected.state).items():
         np.testing.assert_array_equal(getattr(found.state, name), value, err_msg=name)
-    np.testing.assert_array_equal(found.T_world_expected, expected.T_world_expected)
-    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "way_known"):
+    np.testing.assert_array_equal(found.T_world_predicted, expected.T_world_predicted)
+    for name in ("registered", "status", "message", "fit", "degenerate", "iterations", "added", "is_connected"):
         assert getattr(found, name) == getattr(expected, name), name
 
 
@@ -63,29 +67,27 @@ def test_a_map_that_has_forgotten_goes_on(
     rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch, tidied_after: int
 ) -> None:
     """Rows of cells are in the order in which they came, also after some were dropped."""
-    from mapping.surfels.surfel_map import LocalMap
+    from mapping.surfels.surfel_map import SurfelMap
 
     monkeypatch.setattr("mapping.surfels.surfel_map._TIDIED_AFTER", tidied_after)
 
-    def add(local_map: LocalMap, step: int, seed: int) -> None:
+    def add(local_map: SurfelMap, step: int, seed: int) -> None:
         points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])
-        local_map.add(points, np.zeros(3000), points[:200], np.array([2.0 * step, 0.0, 0.0]))
+        local_map.insert(points, np.zeros(3000), np.array([2.0 * step, 0.0, 0.0]))
 
-    whole = LocalMap(0.3, 6.0)
+    whole = SurfelMap(0.3, 6.0)
     for step in range(4):
         add(whole, step, step)
-    restored = LocalMap.restored(through_disk(whole.state()))
+    restored = SurfelMap(0.3, 6.0)
+    restored.restore(through_disk(whole.state()))
     assert len(restored) == len(whole)
     queries = rng.uniform(-4.0, 12.0, (2000, 3))
     for step in range(4, 8):
         add(whole, step, step)
         add(restored, step, step)
-        for one, other in (
-            (restored.match_planes(queries, np.eye(4)), whole.match_planes(queries, np.eye(4))),
-            (restored.match_lines(queries), whole.match_lines(queries)),
-        ):
-            for name, value in vars(other).items():
-                np.testing.assert_array_equal(getattr(one, name), value)
+        found = restored.match(queries, np.eye(4))
+        for name, value in vars(whole.match(queries, np.eye(4))).items():
+            np.testing.assert_array_equal(getattr(found, name), value)
 
 
 def test_a_global_map_goes_on(
@@ -101,36 +103,11 @@ def test_a_global_map_goes_on(
         part = GlobalMap(0.5)
         for cloud in clouds[:after]:
             part.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-        restored = GlobalMap.restored(through_disk(part.state()))
+        restored = GlobalMap(1.0)
+        restored.restore(through_disk(part.state()))
         for cloud in clouds[after:]:
             restored.add(cloud, exp([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
-        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
-
-
-@pytest.mark.parametrize("source", ["ELEVATION", "STORAGE", "FIELD", "NONE"])
-def test_rings_are_found_as_before(source: str, rng: np.random.Generator, through_disk: ThroughDisk) -> None:
-    azimuth = np.tile(np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False), 8)
-    ring = np.repeat(np.arange(8), 720)
-    spread = {"ELEVATION": 0.0, "STORAGE": 0.015}.get(source, 0.3)
-    elevation = np.deg2rad(2.0 * ring) + spread * rng.normal(size=len(ring))
-    if source == "NONE":
-        shuffled = rng.permutation(len(ring))
-        azimuth, elevation, ring = azimuth[shuffled], elevation[shuffled], ring[shuffled]
-    if source == "FIELD":
-        elevation = np.deg2rad(2.0 * ring)
-    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    points = 5.0 * np.stack(rays, axis=1)
-    given = ring if source == "FIELD" else None
-    finder = RingFinder()
-    finder.rings(points, given)
-    assert finder.source is RingSource[source]
-    restored = RingFinder()
-    restored.restore(through_disk(finder.state()))
-    expected, found = finder.rings(points[::-1], given), restored.rings(points[::-1], given)
-    assert restored.source is finder.source
-    assert (found is None) == (expected is None)
-    if expected is not None:
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(restored.means(), whole.means())
 
 
 def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
@@ -149,33 +126,39 @@ def test_a_state_of_another_shape_is_refused(through_disk: ThroughDisk) -> None:
     mapper = Mapper(CONFIG)
     mapper.process(Scan(np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3)), 0.0), Prior())
     state = mapper.state()
-    state["last"] = {**state["last"], "covariance": np.eye(6)}
-    with pytest.raises(InputError, match=r"covariance should be float64 \(12, 12\), and is float64 \(6, 6\)"):
+    state["_last"] = {**state["_last"], "covariance": np.eye(6)}
+    with pytest.raises(InputError, match=r"covariance.*expected an array of shape \(12, 12\), got float64 \(6, 6\)"):
+        Mapper(CONFIG).restore(through_disk(state))
+
+
+def test_a_state_whose_arrays_differ_in_length_is_refused(scans: list[Scan], through_disk: ThroughDisk) -> None:
+    mapper = Mapper(CONFIG)
+    mapper.process(scans[0], Prior())
+    state = mapper.state()
+    grid = state["_map"]["_grids"][0]
+    grid["_keys"] = grid["_keys"][:-1]
+    with pytest.raises(InputError, match="differ in length"):
         Mapper(CONFIG).restore(through_disk(state))
 
 
 def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through_disk: ThroughDisk) -> None:
-    """Values unlike those at the beginning come back; an attribute that is new has to be saved as well."""
+    """Values unlike those at the beginning come back, and no attribute but the settings goes unsaved."""
     mapper, restored = Mapper(CONFIG), Mapper(CONFIG)
     for scan in scans[:2]:
         mapper.process(scan, Prior())
+    tracker = mapper._tracker
     mapper._first = mapper._sampler.sample(scans[0])
-    mapper._carrier, mapper._noise = Carrier(1.5, 7.0), OdometryNoise(3.5, 4)
-    mapper._expected_error_m, mapper._scans_in_map, mapper._has_velocity = 0.125, 7, True
+    tracker._process_noise, tracker._odometry_noise = ProcessNoise(1.5, 7.0), OdometryNoise(3.5, 4)
+    tracker._prediction_error_m = 0.125
     assert mapper._map is not None
-    mapper._earlier.set_aside(mapper._map, 9)
-    mapper._doubt.missed()
-    mapper._doubt.laid(Status.OK, found=False, quality=0.75, stamp=5.0)
-    mapper._doubt.laid(Status.DEGRADED, found=True, quality=0.5, stamp=5.1)
+    mapper._map.scans = 9
+    tracker._archive.add(mapper._map)
+    tracker._state.lost(has_points=True)
+    tracker._state.registered(Status.OK, relocalised=False, quality=0.75, stamp=5.0)
+    tracker._state.registered(Status.DEGRADED, relocalised=True, quality=0.5, stamp=5.1)
     restored.restore(through_disk(mapper.state()))
-    assert set(vars(mapper)) == {
-        "_config", "_sampler", "_map", "_state", "_carrier", "_noise", "_expected_error_m", "_doubt", "_earlier",
-        "_scans_in_map", "_first", "_has_velocity",
-    }  # fmt: skip
-    assert set(vars(mapper._doubt)) == {
-        "lost_in_a_row", "is_astray", "_was_degraded", "_to_confirm", "_found_s", "_usual",
-    }  # fmt: skip
-    assert set(vars(mapper._earlier)) == {"_maps", "_scans_until_look", "_wait"}
+    for part in (mapper, tracker, tracker._state, tracker._archive):
+        assert set(vars(part)) - {"_config"} == set(part.state())
     assert flat(restored.state()) == flat(mapper.state())
 
 

@@ -1,11 +1,11 @@
-"""Places drawn from above: turned, moved, tilted and upside down, they are recognised; others are not."""
+"""Bird's-eye views of places: turned, moved, tilted and upside down, they are recognised; others are not."""
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
-from mapping.loops.descriptor import Drawing, Expected, Places, lay_over
-from mapping.loops.place import LINE, PLANE, level_rotation, make_patch
+from mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, _level_rotation
 
 RADIUS_M = 16.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])
@@ -32,14 +32,13 @@ def pose(x: float, y: float, yaw_deg: float) -> FloatArray:
     return make_transform(exp([0, 0, np.deg2rad(yaw_deg), 0, 0, 0])[:3, :3], [x, y, 1.5])
 
 
-def patch(points_world: FloatArray, T_world_lidar: FloatArray):
-    return make_patch(transform_points(inverse(T_world_lidar), points_world), 0.5, 60.0, 30.0, 2500)
+def submap(points_world: FloatArray, T_world_lidar: FloatArray):
+    return SparseSubmap.of(transform_points(inverse(T_world_lidar), points_world), 60.0)
 
 
 def similarity(first, second, upside_down: bool = False) -> tuple[float, float]:
-    places = Places()
-    places.add(Drawing.of(first).signature(RADIUS_M))
-    found, turn = places.compare(Drawing.of(second, upside_down).signature(RADIUS_M), np.array([0]))
+    descriptor = BirdEyeView.of(second, upside_down).descriptor(RADIUS_M)
+    found, turn = compare(descriptor, BirdEyeView.of(first).descriptor(RADIUS_M)[None])
     return float(found[0]), float(turn[0])
 
 
@@ -53,48 +52,34 @@ HOME = pose(0.5, 0.3, 0.0)
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 37.0, 90.0, 150.0, -60.0, 180.0])
 def test_the_turn_is_found_whatever_it_is(hall, yaw_deg):
-    score, turn = similarity(patch(hall, HOME), patch(hall, pose(0.5, 0.3, yaw_deg)))
+    score, turn = similarity(submap(hall, HOME), submap(hall, pose(0.5, 0.3, yaw_deg)))
     off = np.rad2deg(turn) - yaw_deg
     assert abs((off + 90.0) % 180.0 - 90.0) <= 3.0
     assert score > 0.7
 
 
 def test_itself_is_alike_in_full(hall):
-    score, turn = similarity(patch(hall, HOME), patch(hall, HOME))
+    score, turn = similarity(submap(hall, HOME), submap(hall, HOME))
     assert score == pytest.approx(1.0, abs=1e-5)
     assert turn == 0.0
 
 
 def test_a_place_is_found_among_others(hall):
-    places = Places()
-    for seed in range(2, 30):
-        places.add(Drawing.of(patch(scene(seed), HOME)).signature(RADIUS_M))
-    places.add(Drawing.of(patch(hall, HOME)).signature(RADIUS_M))
-    query = Drawing.of(patch(hall, pose(2.0, -0.9, 130.0))).signature(RADIUS_M)
-    scores, _ = places.compare(query, np.arange(len(places)))
+    places = [scene(seed) for seed in range(2, 30)] + [hall]
+    descriptors = np.stack([BirdEyeView.of(submap(place, HOME)).descriptor(RADIUS_M) for place in places])
+    query = BirdEyeView.of(submap(hall, pose(2.0, -0.9, 130.0))).descriptor(RADIUS_M)
+    scores, _ = compare(query, descriptors)
     assert scores.argmax() == 28
-    only_others, _ = places.compare(query, np.array([3, 7]))
-    assert np.allclose(only_others, scores[[3, 7]], atol=1e-5)
-
-
-def test_many_places_keep_their_order_and_their_size(hall):
-    places = Places()
-    signatures = [Drawing.of(patch(scene(seed), HOME)).signature(RADIUS_M) for seed in (1, 2, 3)]
-    for i in range(150):
-        places.add(signatures[i % 3])
-    scores, _ = places.compare(signatures[1], np.arange(150))
-    assert (np.flatnonzero(scores > 0.999) % 3 == 1).all()
-    assert (scores > 0.999).sum() == 50
-    assert places.nbytes / 150 < 6_500
+    assert descriptors[0].nbytes < 6_500
 
 
 @pytest.mark.parametrize("T_target_source", [pose(1.5, -2.0, 24.0), pose(-3.0, 1.0, -160.0), pose(0.0, 2.5, 93.0)])
 def test_laid_over_one_another(hall, T_target_source):
     true = T_target_source.copy()
     true[2, 3] = 0.4
-    target, source = patch(hall, HOME), patch(hall, HOME @ true)
+    target, source = submap(hall, HOME), submap(hall, HOME @ true)
     _, turn = similarity(target, source)
-    T, score = lay_over(Drawing.of(target), Drawing.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
+    T, score = align(BirdEyeView.of(target), BirdEyeView.of(source), turn + np.array([0.0, np.pi]), RADIUS_M)
     error = inverse(true) @ T
     assert np.linalg.norm(error[:3, 3]) < 0.6
     assert np.rad2deg(rotation_angle(error)) < 4.0
@@ -108,9 +93,9 @@ def test_of_repeated_places_the_expected_one_counts():
         1,
         8,
     ]
-    target = source = Drawing(points[:, :2], points[:, 2], np.eye(3))
+    target = source = BirdEyeView(points[:, :2], points[:, 2], np.eye(3))
     for x in (-4.0, 0.0, 4.0):
-        T, _ = lay_over(target, source, np.zeros(1), RADIUS_M, Expected(np.array([x + 0.5, 0.0]), 3.0))
+        T, _ = align(target, source, np.zeros(1), RADIUS_M, np.array([x + 0.5, 0.0]), 3.0)
         assert T[0, 3] == pytest.approx(x, abs=0.6)
 
 
@@ -122,24 +107,24 @@ def test_the_sensor_is_stood_upright(hall, tilt_deg, upside_down):
         @ (UPSIDE_DOWN if upside_down else np.eye(4))
         @ exp([0.3 * np.deg2rad(tilt_deg), np.deg2rad(tilt_deg), 0, 0, 0, 0])
     )
-    level = patch(hall, T).R_level_lidar
+    level = submap(hall, T).R_level_lidar
     up = level @ T[:3, :3].T @ [0.0, 0.0, 1.0]
     assert up == pytest.approx([0.0, 0.0, -1.0 if upside_down else 1.0], abs=0.03)
     assert level @ level.T == pytest.approx(np.eye(3), abs=1e-9)
 
 
 def test_without_floor_the_sensor_is_taken_as_upright():
-    assert level_rotation(np.tile([1.0, 0.0, 0.0], (100, 1))) == pytest.approx(np.eye(3))
-    assert level_rotation(np.empty((0, 3))) == pytest.approx(np.eye(3))
+    assert _level_rotation(np.tile([1.0, 0.0, 0.0], (100, 1))) == pytest.approx(np.eye(3))
+    assert _level_rotation(np.empty((0, 3))) == pytest.approx(np.eye(3))
 
 
 def test_a_sensor_that_hangs_upside_down_sees_the_same_place(hall):
     hanging = pose(1.0, -0.8, 70.0) @ UPSIDE_DOWN
-    target, source = patch(hall, HOME), patch(hall, hanging)
+    target, source = submap(hall, HOME), submap(hall, hanging)
     score, turn = similarity(target, source, upside_down=True)
     assert score > 0.7
     assert score > similarity(target, source)[0] + 0.1
-    T, _ = lay_over(Drawing.of(target), Drawing.of(source, True), turn + np.array([0.0, np.pi]), RADIUS_M)
+    T, _ = align(BirdEyeView.of(target), BirdEyeView.of(source, True), turn + np.array([0.0, np.pi]), RADIUS_M)
     error = inverse(inverse(HOME) @ hanging) @ T
     assert np.linalg.norm(error[:3, 3]) < 0.6
     assert np.rad2deg(rotation_angle(error)) < 4.0
@@ -150,7 +135,7 @@ def test_shapes_of_what_points_lie_on():
     floor = np.column_stack([rng.uniform(-6, 6, (6000, 2)), np.full(6000, -1.5)])
     pole = np.column_stack([np.full((400, 2), 3.0), rng.uniform(-1.2, 3.0, 400)])
     wire = np.column_stack([rng.uniform(-6, 6, 800), np.full(800, -4.0), np.full(800, 2.0)])
-    found = make_patch(np.concatenate([floor, pole, wire]), 0.5, 60.0, 30.0, 2500)
+    found = SparseSubmap.of(np.concatenate([floor, pole, wire]), 60.0)
     z, at_pole = found.points[:, 2], np.abs(found.points[:, :2] - 3.0).max(axis=1) < 0.01
     assert (found.kinds[z < -1.49] == PLANE).mean() > 0.95
     assert (found.axes[(z < -1.49) & (found.kinds == PLANE), 2] > 0.99).all()  # towards the sensor
@@ -159,28 +144,30 @@ def test_shapes_of_what_points_lie_on():
     assert (found.kinds[z == 2.0] == 0).all()  # a single ring of a sensor looks like this
 
 
-def test_sight_holds_the_nearest_range():
+def test_the_range_image_holds_the_nearest_range():
     points = np.array([[4.0, 0.01, 0.01], [6.0, 0.015, 0.015], [0.0, -7.0, 0.01]])
-    sight = make_patch(points, 0.5, 60.0, 30.0, 2500).sight
-    assert sorted(sight[sight > 0.0].tolist()) == pytest.approx([4.0, 7.0], abs=0.01)
+    found = SparseSubmap.of(points, 60.0)
+    image = found.range_image
+    assert found.nearest_ranges(np.array([[9.0, 0.02, 0.02], [5.0, 5.0, 0.0]])) == pytest.approx([4.0, 0.0], abs=0.01)
+    assert sorted(image[image > 0.0].tolist()) == pytest.approx([4.0, 7.0], abs=0.01)
 
 
 def test_points_out_of_range_or_not_finite_are_left_out():
     points = np.array([[0.1, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 1.0, 1.0], [99.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])
-    assert make_patch(points, 0.5, 60.0, 30.0, 2500).points == pytest.approx(np.array([[5.0, 0.0, 0.0]]))
+    assert SparseSubmap.of(points, 60.0).points == pytest.approx(np.array([[5.0, 0.0, 0.0]]))
 
 
 @pytest.mark.parametrize("count", [0, 1, 8])
-def test_nearly_empty_submaps_have_a_signature(count):
-    tiny = make_patch(np.random.default_rng(0).uniform(-4, 4, (count, 3)), 0.5, 60.0, 30.0, 2500)
-    signature = Drawing.of(tiny).signature(RADIUS_M)
-    assert np.isfinite(signature).all()
-    T, _ = lay_over(Drawing.of(tiny), Drawing.of(tiny), np.zeros(1), RADIUS_M)
+def test_nearly_empty_submaps_have_a_descriptor(count):
+    tiny = SparseSubmap.of(np.random.default_rng(0).uniform(-4, 4, (count, 3)), 60.0)
+    descriptor = BirdEyeView.of(tiny).descriptor(RADIUS_M)
+    assert np.isfinite(descriptor).all()
+    T, _ = align(BirdEyeView.of(tiny), BirdEyeView.of(tiny), np.zeros(1), RADIUS_M)
     assert np.isfinite(T).all()
 
 
-def test_memory_of_a_patch_is_bounded():
+def test_memory_of_a_submap_is_bounded():
     points = np.random.default_rng(0).uniform(-30, 30, (60_000, 3))
-    found = make_patch(points, 0.5, 60.0, 30.0, 2500)
+    found = SparseSubmap.of(points, 60.0)
     assert len(found) == 2500
-    assert found.nbytes < 70_000
+    assert sum(array.nbytes for array in vars(found).values() if isinstance(array, np.ndarray)) < 70_000

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from mapping.config import MappingConfig
-from mapping.prediction import LEAST_SIGMA, Carrier, OdometryNoise, Prediction, Prior, State, predict
+from mapping.prediction import LEAST_SIGMA, MotionState, OdometryNoise, Prediction, Prior, ProcessNoise, predict
 
 VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s
 MOVED = exp(0.1 * VELOCITY)
@@ -20,8 +20,8 @@ POSE_SIGMA, VELOCITY_SIGMA = np.array([1e-7] * 3 + [1e-6] * 3), np.array([0.5] *
 
 def predicted(prior: Prior, config: MappingConfig | None = None, pose: FloatArray | None = None) -> Prediction:
     known = np.diag(np.concatenate([POSE_SIGMA, VELOCITY_SIGMA]) ** 2)
-    state = State(5.0, np.eye(4) if pose is None else pose, VELOCITY, known, seen_until_s=0.1)
-    return predict(state, 5.1, prior, Carrier(), config or AS_TOLD)
+    state = MotionState(5.0, np.eye(4) if pose is None else pose, VELOCITY, known, seen_until_s=0.1)
+    return predict(state, 5.1, prior, ProcessNoise(), config or AS_TOLD)
 
 
 def motion_covariance(prediction: Prediction) -> FloatArray:
@@ -108,7 +108,9 @@ def test_uncertainty_goes_along_with_the_sensor() -> None:
     """Half a metre along x of the last scan is along y of one that has turned by 90 degrees meanwhile."""
     turning = np.array([0.0, 0.0, 0.5 * np.pi / 0.1, 0.0, 0.0, 0.0])
     covariance = np.diag(np.array([1e-4] * 3 + [0.5, 1e-4, 1e-4] + [1e-4] * 6) ** 2)
-    prediction = predict(State(5.0, np.eye(4), turning, covariance, 0.1), 5.1, Prior(), Carrier(), MappingConfig())
+    prediction = predict(
+        MotionState(5.0, np.eye(4), turning, covariance, 0.1), 5.1, Prior(), ProcessNoise(), MappingConfig()
+    )
     sigmas = np.sqrt(np.diag(prediction.covariance)[:6])
     assert sigmas[4] == pytest.approx(0.5, rel=0.01)
     assert sigmas[3] < 0.1
@@ -124,8 +126,8 @@ def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_a
     after = before + rng.normal(scale=sigma, size=count)
     way = before * (0.1 - seen_from_s) + after * seen_from_s
     known = np.diag(np.concatenate([np.full(6, 1e-9), np.full(6, VELOCITY_SIGMA[3])]) ** 2)
-    state = State(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.1 - seen_from_s)
-    covariance = predict(state, 5.1, Prior(), Carrier(translation=15.0), MappingConfig(), seen_from_s).covariance
+    state = MotionState(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.1 - seen_from_s)
+    covariance = predict(state, 5.1, Prior(), ProcessNoise(translation=15.0), MappingConfig(), seen_from_s).covariance
     joint = covariance[np.ix_([4, 10], [4, 10])]
     uneven = (15.0 * 0.1**2 / 8.0) ** 2 + LEAST_SIGMA[4] ** 2
     np.testing.assert_allclose(joint - np.diag([uneven, 0.0]), np.cov(way, after), rtol=0.02, atol=2e-4)
@@ -134,8 +136,8 @@ def test_pose_and_velocity_have_the_joint_covariance_of_sweeps_that_follow_one_a
 def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable() -> None:
     """Independent, both would be likely; it is the correlation that keeps the one from making up for the other."""
     known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
-    state = State(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.05)
-    covariance = predict(state, 5.1, Prior(), Carrier(), MappingConfig(), 0.05).covariance
+    state = MotionState(5.0, np.eye(4), np.zeros(6), known, seen_until_s=0.05)
+    covariance = predict(state, 5.1, Prior(), ProcessNoise(), MappingConfig(), 0.05).covariance
     back_and_fast = np.zeros(12)
     back_and_fast[3], back_and_fast[9] = -0.05, 1.0
     forth_and_fast = np.abs(back_and_fast)
@@ -147,8 +149,8 @@ def test_a_velocity_that_disagrees_with_the_way_between_poses_is_improbable() ->
 def test_the_motion_between_two_scans_says_nothing_of_where_the_first_was() -> None:
     """However sure the odometry is, the next pose is no better known than the last."""
     known = np.diag(np.array([1e-6] * 3 + [0.3] * 3 + [1e-6] * 6) ** 2)
-    state = State(5.0, np.eye(4), np.zeros(6), known)
-    prediction = predict(state, 5.1, Prior(np.eye(4), covariance=isotropic(1e-6)), Carrier(), AS_TOLD)
+    state = MotionState(5.0, np.eye(4), np.zeros(6), known)
+    prediction = predict(state, 5.1, Prior(np.eye(4), covariance=isotropic(1e-6)), ProcessNoise(), AS_TOLD)
     np.testing.assert_allclose(np.sqrt(np.diag(prediction.covariance))[3:6], 0.3, rtol=1e-3)
 
 
@@ -157,23 +159,23 @@ def test_an_odometry_that_the_motion_before_makes_improbable_is_contradicted() -
     assert not predicted(Prior(moved, covariance=isotropic(0.01))).contradicted
     assert not predicted(Prior()).contradicted
     known = np.diag(np.array([1e-4] * 3 + [1e-3] * 3 + [1e-2] * 3 + [0.1] * 3) ** 2)
-    driving = State(5.0, np.eye(4), np.array([0.0, 0.0, 0.0, 11.0, 0.0, 0.0]), known, 0.1)
+    driving = MotionState(5.0, np.eye(4), np.array([0.0, 0.0, 0.0, 11.0, 0.0, 0.0]), known, 0.1)
     standing = Prior(np.eye(4), covariance=isotropic(0.01))
-    assert predict(driving, 5.1, standing, Carrier(), AS_TOLD).contradicted
+    assert predict(driving, 5.1, standing, ProcessNoise(), AS_TOLD).contradicted
     doubted = OdometryNoise(variance=1e4)
-    assert not predict(driving, 5.1, standing, Carrier(), AS_TOLD, noise=doubted).contradicted
+    assert not predict(driving, 5.1, standing, ProcessNoise(), AS_TOLD, odometry_noise=doubted).contradicted
 
 
 def test_the_noise_of_an_odometry_follows_its_errors() -> None:
     rng, noise = np.random.default_rng(0), OdometryNoise()
     for _ in range(200):
-        noise = noise.seen(
+        noise = noise.updated(
             Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.01, size=6)), AS_TOLD
         )
     assert noise.variance < 2.5
     for _ in range(200):
-        noise = noise.seen(
+        noise = noise.updated(
             Prior(MOVED, covariance=isotropic(0.01)), MOVED @ exp(rng.normal(scale=0.1, size=6)), AS_TOLD
         )
     assert 50.0 < noise.variance < 200.0
-    assert noise.seen(Prior(), MOVED, AS_TOLD) == noise
+    assert noise.updated(Prior(), MOVED, AS_TOLD) == noise

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse
-from mapping.loops.detection import LoopClosure
+from mapping.loops.closure import LoopClosure
 from mapping.loops.revisits import as_registered
 
 SIGMA = np.array([1e-3] * 3 + [5e-3] * 3)
@@ -25,7 +25,7 @@ def closure(way: FloatArray, off: FloatArray, sigma: float = 0.01) -> LoopClosur
     """Of its first and last pose, off by (6,) from what the way says."""
     T_first_second = inverse(way[0]) @ way[-1] @ exp(off)
     covariance = sigma**2 * np.eye(6)
-    return LoopClosure(0, 25, T_first_second, covariance, 0.9, 0.01, 0.9, "nearby", 3, "accepted", "")
+    return LoopClosure(0, 25, T_first_second, covariance, 0.9, 0.01, 0.9, False, 3, "")
 
 
 NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
@@ -34,7 +34,7 @@ NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
 def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip: FloatArray) -> None:
     found = as_registered(closure(round_trip, NEAR), round_trip, REGISTERED, REGISTERED, radius_m=100.0)
     np.testing.assert_allclose(found.T_first_second, inverse(round_trip[0]) @ round_trip[-1], atol=1e-12)
-    assert found.verdict == "accepted"
+    assert found.accepted
     assert np.linalg.eigvalsh(found.covariance - REGISTERED).min() > 0.0, "both registrations err"
 
 

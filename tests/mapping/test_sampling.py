@@ -26,7 +26,7 @@ def cells(points: FloatArray, cell_m: float) -> FloatArray:
 
 def test_at_most_one_point_goes_into_the_map_from_each_half_cell(rng: np.random.Generator) -> None:
     sampled = sample(shell(rng, 5.0, 50_000), cell_m=0.4)
-    assert len(np.unique(cells(sampled.points, 0.2), axis=0)) == len(sampled)
+    assert len(np.unique(cells(sampled.sweep.points, 0.2), axis=0)) == len(sampled)
 
 
 def test_nearly_every_half_cell_gives_its_point(rng: np.random.Generator) -> None:
@@ -37,7 +37,7 @@ def test_nearly_every_half_cell_gives_its_point(rng: np.random.Generator) -> Non
 
 def test_registered_points_are_spread_wider(rng: np.random.Generator) -> None:
     sampled = sample(shell(rng, 5.0, 50_000), cell_m=0.1, keypoints=100_000)
-    keys = sampled.points[sampled.keys]
+    keys = sampled.keypoints.points
     assert 100 < len(keys) < len(sampled)
     assert len(np.unique(cells(keys, 0.25), axis=0)) == len(keys)
 
@@ -47,9 +47,9 @@ def test_no_more_points_are_registered_than_wanted_and_they_come_from_everywhere
     rng: np.random.Generator, keypoints: int
 ) -> None:
     sampled = sample(shell(rng, 5.0), cell_m=0.05, keypoints=keypoints)
-    keys = sampled.points[sampled.keys]
+    keys = sampled.keypoints.points
     assert len(keys) == keypoints
-    assert len(np.unique(sampled.keys)) == keypoints
+    assert len(np.unique(keys, axis=0)) == keypoints
     np.testing.assert_allclose((keys > 0.0).mean(axis=0), 0.5, atol=0.15)
 
 
@@ -57,7 +57,7 @@ def test_only_points_within_range_are_left(rng: np.random.Generator) -> None:
     points = rng.normal(size=(20_000, 3))
     points *= rng.uniform(0.1, 20.0, (20_000, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
     sampled = sample(Scan(points, 0.0), cell_m=0.1, min_range_m=2.0, max_range_m=10.0)
-    ranges = np.linalg.norm(sampled.points, axis=1)
+    ranges = np.linalg.norm(sampled.sweep.points, axis=1)
     assert 2.0 < ranges.min() < 2.2
     assert 9.8 < ranges.max() < 10.0
 
@@ -65,48 +65,41 @@ def test_only_points_within_range_are_left(rng: np.random.Generator) -> None:
 def test_times_stay_with_their_points(rng: np.random.Generator) -> None:
     scan = shell(rng, 5.0)
     sampled = sample(scan, cell_m=0.3, min_range_m=4.7, keypoints=150)
-    assert sampled.times is not None
-    index = np.round(1e6 * sampled.times).astype(int)
-    np.testing.assert_array_equal(sampled.points, scan.points[index])
-    sweep = sampled.sweep
-    assert sweep.plane_times is not None
-    np.testing.assert_array_equal(sweep.planes, scan.points[np.round(1e6 * sweep.plane_times).astype(int)])
+    for sweep in (sampled.sweep, sampled.keypoints):
+        assert sweep.times is not None
+        np.testing.assert_array_equal(sweep.points, scan.points[np.round(1e6 * sweep.times).astype(int)])
 
 
 def test_elevations_are_those_of_their_points(rng: np.random.Generator) -> None:
     sampled = sample(shell(rng, 5.0), cell_m=0.3)
-    upward = np.hypot(sampled.points[:, 0], sampled.points[:, 1])
-    np.testing.assert_allclose(sampled.elevations, np.arctan2(sampled.points[:, 2], upward), atol=1e-12)
+    upward = np.hypot(sampled.sweep.points[:, 0], sampled.sweep.points[:, 1])
+    np.testing.assert_allclose(sampled.elevations, np.arctan2(sampled.sweep.points[:, 2], upward), atol=1e-12)
 
 
 def test_a_scan_without_times_is_sampled_without(rng: np.random.Generator) -> None:
     sampled = sample(Scan(shell(rng, 5.0).points, 1.5))
-    assert sampled.times is None
-    assert not sampled.sweep.is_rolling
+    assert sampled.sweep.times is None
     assert sampled.stamp == 1.5
 
 
-def test_without_the_wish_for_edges_there_are_none(rng: np.random.Generator) -> None:
-    assert len(sample(shell(rng, 5.0)).edges) == 0
-
-
 def test_nothing_is_sampled_from_nothing() -> None:
-    sampled = sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)), edges=True)
-    assert len(sampled) == len(sampled.keys) == len(sampled.edges) == 0
+    sampled = sample(Scan(np.empty((0, 3)), 0.0, np.empty(0)))
+    assert len(sampled) == len(sampled.keypoints) == 0
+    assert sampled.is_sparse
     assert sampled.cell_m > 0.0
 
 
 def test_an_empty_scan_does_not_decide_on_the_cells(rng: np.random.Generator) -> None:
-    sampler = Sampler(MappingConfig(cells_per_range=25.0))
+    sampler = Sampler(MappingConfig())
     sampler.sample(Scan(np.empty((0, 3)), 0.0))
-    assert sampler.sample(shell(rng, 10.0)).cell_m == pytest.approx(0.4, rel=0.02)
+    assert sampler.sample(shell(rng, 12.0)).cell_m == pytest.approx(0.4, rel=0.02)
 
 
-@pytest.mark.parametrize(("radius_m", "cell_m"), [(5.0, 0.2), (20.0, 0.8), (0.6, 0.05), (60.0, 1.0)])
+@pytest.mark.parametrize(("radius_m", "cell_m"), [(6.0, 0.2), (24.0, 0.8), (0.6, 0.05), (60.0, 1.0)])
 def test_cells_are_a_share_of_the_median_range_within_bounds(
     rng: np.random.Generator, radius_m: float, cell_m: float
 ) -> None:
-    assert sample(shell(rng, radius_m), cells_per_range=25.0).cell_m == pytest.approx(cell_m, rel=0.02)
+    assert sample(shell(rng, radius_m)).cell_m == pytest.approx(cell_m, rel=0.02)
 
 
 def test_a_given_cell_stays_whatever_the_scene(rng: np.random.Generator) -> None:
@@ -115,7 +108,7 @@ def test_a_given_cell_stays_whatever_the_scene(rng: np.random.Generator) -> None
 
 
 def cell_sizes(rng: np.random.Generator, radii_m: list[float]) -> list[float]:
-    sampler = Sampler(MappingConfig(cells_per_range=25.0))
+    sampler = Sampler(MappingConfig())
     return [sampler.sample(shell(rng, radius_m, 500)).cell_m for radius_m in radii_m]
 
 
@@ -130,7 +123,7 @@ def test_a_scene_that_has_changed_by_more_has_other_cells_in_the_end(
 ) -> None:
     sizes = cell_sizes(rng, [before_m] + [after_m] * 120)
     assert len(set(sizes)) == 2, "it changes once"
-    assert sizes[-1] == pytest.approx(after_m / 25.0, rel=0.25)
+    assert sizes[-1] == pytest.approx(after_m / 30.0, rel=0.25)
 
 
 def test_one_scan_of_another_scale_changes_nothing(rng: np.random.Generator) -> None:

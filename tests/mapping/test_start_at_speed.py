@@ -6,15 +6,16 @@ import pytest
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig
 from mapping.deskew import move
-from mapping.mapper import MappedScan, Mapper
+from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.tracking.tracker import MappedScan
 
 COUNT = 12
 # What an odometry states of itself: a tenth of a degree and a centimetre.
@@ -67,7 +68,7 @@ def test_an_odometry_that_states_that_it_stands_is_overruled(scans: list[Scan], 
     assert worst_m(results, truth) < 0.1
     assert Status.LOST not in {result.status for result in results}
     assert results[1].status is Status.DEGRADED, "the first contradiction is reported"
-    assert "neither the odometry" in results[1].message
+    assert "neither odometry" in results[1].message
     assert [result.status for result in results[-6:]] == [Status.OK] * 6
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.grid import SurfelGrid
+from mapping.surfels.grid import COUNT, DIRECTION, ELEVATION_SPREAD, IS_PLANE, MEAN, NORMAL, SPREADS, SurfelGrid
 from mapping.surfels.voxel_hash import ABSENT
 
 CELL = 0.5
@@ -25,7 +25,7 @@ def on_plane(
 
 def grid_of(points: FloatArray, elevations: FloatArray | None = None) -> SurfelGrid:
     grid = SurfelGrid(CELL)
-    grid.add(points, np.zeros(len(points)) if elevations is None else elevations, from_above(len(points)))
+    grid.insert(points, np.zeros(len(points)) if elevations is None else elevations, from_above(len(points)))
     return grid
 
 
@@ -40,25 +40,25 @@ def cloud(rng: np.random.Generator, count: int = 5_000, half_size: float = 5.0) 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("away_m", [0.0, 10_000.0])
-def test_patches_of_a_plane_lie_on_it_wherever_it_is(seed: int, away_m: float) -> None:
+def test_surfels_of_a_plane_lie_on_it_wherever_it_is(seed: int, away_m: float) -> None:
     rng = np.random.default_rng(seed)
     normal, through = unit(rng.normal(size=3)), away_m * unit(rng.normal(size=3))
     points = on_plane(rng, normal, through)
     grid = grid_of(points)
-    patches = grid.patches(grid.look_up(points))
-    assert patches.is_plane.all()
-    np.testing.assert_allclose(np.abs(patches.normals @ normal), 1.0, rtol=0.0, atol=1e-10)
-    np.testing.assert_allclose(np.cross(patches.normals, normal), 0.0, atol=2e-5)
-    np.testing.assert_allclose((patches.points - through) @ normal, 0.0, atol=2e-6)
-    assert patches.spreads_m[:, 0].max() < 1e-3
+    surfels = grid.surfels(grid.find(points))
+    assert surfels[:, IS_PLANE].all()
+    np.testing.assert_allclose(np.abs(surfels[:, NORMAL] @ normal), 1.0, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(np.cross(surfels[:, NORMAL], normal), 0.0, atol=2e-5)
+    np.testing.assert_allclose((surfels[:, MEAN] - through) @ normal, 0.0, atol=2e-6)
+    assert surfels[:, SPREADS][:, 0].max() < 1e-3
 
 
-def test_a_patch_is_as_thick_as_the_noise(rng: np.random.Generator) -> None:
+def test_a_surfel_is_as_thick_as_the_noise(rng: np.random.Generator) -> None:
     normal = unit(np.array([0.2, -0.3, 0.9]))
     points = on_plane(rng, normal, np.zeros(3), count=20_000)
     grid = grid_of(points + rng.normal(0.0, 0.02, (len(points), 1)) * normal)
     inner = np.abs(points).max(axis=1) < 0.5
-    thickness = grid.patches(grid.look_up(points[inner])).spreads_m[:, 0]
+    thickness = grid.surfels(grid.find(points[inner]))[:, SPREADS][:, 0]
     np.testing.assert_allclose(thickness, 0.02, rtol=0.1)
 
 
@@ -66,14 +66,14 @@ def test_several_batches_make_what_one_makes(rng: np.random.Generator) -> None:
     points, elevations = cloud(rng, 20_000), rng.normal(size=20_000)
     at_once, in_parts = grid_of(points, elevations), SurfelGrid(CELL)
     for part in np.array_split(np.arange(len(points)), 7):
-        in_parts.add(points[part], elevations[part], from_above(len(part)))
+        in_parts.insert(points[part], elevations[part], from_above(len(part)))
     assert len(at_once) == len(in_parts)
-    one = at_once.patches(at_once.look_up(points))
-    other = in_parts.patches(in_parts.look_up(points))
-    np.testing.assert_allclose(other.points, one.points, atol=1e-5)
-    np.testing.assert_allclose(other.spreads_m, one.spreads_m, atol=1e-4)
-    np.testing.assert_allclose(other.elevation_spreads, one.elevation_spreads, atol=1e-4)
-    np.testing.assert_allclose(other.counts, one.counts, rtol=1e-5)
+    one = at_once.surfels(at_once.find(points))
+    other = in_parts.surfels(in_parts.find(points))
+    np.testing.assert_allclose(other[:, MEAN], one[:, MEAN], atol=1e-5)
+    np.testing.assert_allclose(other[:, SPREADS], one[:, SPREADS], atol=1e-4)
+    np.testing.assert_allclose(other[:, ELEVATION_SPREAD], one[:, ELEVATION_SPREAD], atol=1e-4)
+    np.testing.assert_allclose(other[:, COUNT], one[:, COUNT], rtol=1e-5)
 
 
 @pytest.mark.parametrize("offset", [-0.004, 0.004])
@@ -82,17 +82,17 @@ def test_a_wall_along_the_border_of_cells_is_one_plane(rng: np.random.Generator,
     points = np.column_stack([rng.normal(offset, 0.005, 6_000), rng.uniform(-2, 2, (6_000, 2))])
     grid = grid_of(points)
     inner = np.abs(points[:, 1:]).max(axis=1) < 1.0
-    patches = grid.patches(grid.look_up(points[inner]))
-    assert patches.is_plane.all()
-    np.testing.assert_allclose(patches.points[:, 0], offset, atol=0.002)
-    assert np.rad2deg(np.arccos(np.abs(patches.normals[:, 0]).min())) < 0.5
+    surfels = grid.surfels(grid.find(points[inner]))
+    assert surfels[:, IS_PLANE].all()
+    np.testing.assert_allclose(surfels[:, MEAN][:, 0], offset, atol=0.002)
+    assert np.rad2deg(np.arccos(np.abs(surfels[:, NORMAL][:, 0]).min())) < 0.5
 
 
 def test_two_walls_beyond_each_others_neighbourhood_do_not_mix(rng: np.random.Generator) -> None:
     across = np.repeat([0.25, 0.25 + 2 * CELL], 3_000)
     points = np.column_stack([across, rng.uniform(-1, 1, (6_000, 2))])
     grid = grid_of(points)
-    np.testing.assert_allclose(grid.patches(grid.look_up(points)).points[:, 0], across, atol=1e-5)
+    np.testing.assert_allclose(grid.surfels(grid.find(points))[:, MEAN][:, 0], across, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -104,29 +104,29 @@ def test_each_side_of_a_thin_wall_is_a_plane_of_its_own_that_faces_who_saw_it(se
     for x, side in ((0.45, -1.0), (0.6, 1.0)):
         face = np.column_stack([np.full(count, x), rng.uniform(-1, 1, (count, 2))])
         views = np.array([side, 0.0, 0.0]) * np.ones((count, 1)) + rng.uniform(-0.8, 0.8, (count, 3))
-        grid.add(face, np.zeros(count), views / np.linalg.norm(views, axis=1, keepdims=True))
-        patches = grid.patches(grid.look_up(face))
-        assert patches.is_plane.all()
-        np.testing.assert_allclose(patches.points[:, 0], x, atol=1e-5)
-        np.testing.assert_allclose(patches.normals[:, 0], side, atol=1e-5)
+        grid.insert(face, np.zeros(count), views / np.linalg.norm(views, axis=1, keepdims=True))
+        surfels = grid.surfels(grid.find(face))
+        assert surfels[:, IS_PLANE].all()
+        np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
+        np.testing.assert_allclose(surfels[:, NORMAL][:, 0], side, atol=1e-5)
 
 
 def test_samples_of_cells_are_seen_from_where_their_points_were(rng: np.random.Generator) -> None:
     wall = np.column_stack([np.full(5_000, 0.25), rng.uniform(-1, 1, (5_000, 2))])
     grid, other = SurfelGrid(CELL), SurfelGrid(0.5 * CELL)
-    grid.add(wall, np.zeros(5_000), np.tile([-0.6, 0.8, 0.0], (5_000, 1)))
+    grid.insert(wall, np.zeros(5_000), np.tile([-0.6, 0.8, 0.0], (5_000, 1)))
     samples, elevations, views = grid.samples()
     np.testing.assert_allclose(views, np.tile([-0.6, 0.8, 0.0], (len(samples), 1)), atol=1e-5)
-    other.add(samples, elevations, views)
-    assert other.patches(other.look_up(samples)).normals[:, 0].max() < -0.99
+    other.insert(samples, elevations, views)
+    assert other.surfels(other.find(samples))[:, NORMAL][:, 0].max() < -0.99
 
 
 def test_neighbours_count_less_than_the_cell_itself() -> None:
-    """Two points beside one another in neighbouring cells: the patch lies nearer to the cell's own."""
+    """Two points beside one another in neighbouring cells: the surfel lies nearer to the cell's own."""
     grid = grid_of(np.array([[0.25, 0.25, 0.25], [0.75, 0.25, 0.25]]))
-    patch = grid.patches(grid.look_up(np.array([[0.25, 0.25, 0.25]])))
-    np.testing.assert_allclose(patch.points, [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
-    np.testing.assert_allclose(patch.counts, 1.8, rtol=1e-6)
+    surfel = grid.surfels(grid.find(np.array([[0.25, 0.25, 0.25]])))
+    np.testing.assert_allclose(surfel[:, MEAN], [[(0.25 + 0.8 * 0.75) / 1.8, 0.25, 0.25]], atol=1e-6)
+    np.testing.assert_allclose(surfel[:, COUNT], 1.8, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -135,25 +135,22 @@ def test_a_line_has_its_direction(seed: int) -> None:
     direction, through = unit(rng.normal(size=3)), 100.0 * rng.normal(size=3)
     points = through + rng.uniform(-3.0, 3.0, (600, 1)) * direction
     grid = grid_of(points)
-    patches = grid.patches(grid.look_up(points))
-    assert patches.is_line.all()
-    assert not patches.is_plane.any()
-    np.testing.assert_allclose(np.cross(patches.directions, direction), 0.0, atol=2e-5)
-    np.testing.assert_allclose(np.cross(patches.points - through, direction), 0.0, atol=1e-5)
+    surfels = grid.surfels(grid.find(points))
+    assert not surfels[:, IS_PLANE].any()
+    np.testing.assert_allclose(np.cross(surfels[:, DIRECTION], direction), 0.0, atol=2e-5)
+    np.testing.assert_allclose(np.cross(surfels[:, MEAN] - through, direction), 0.0, atol=1e-5)
 
 
-def test_a_ball_of_points_is_neither_plane_nor_line(rng: np.random.Generator) -> None:
+def test_a_ball_of_points_is_no_plane(rng: np.random.Generator) -> None:
     grid = grid_of(cloud(rng, 20_000, half_size=1.5))
-    patches = grid.patches(grid.look_up(np.array([[0.1, 0.2, 0.3]])))
-    assert not patches.is_plane.any()
-    assert not patches.is_line.any()
+    surfels = grid.surfels(grid.find(np.array([[0.1, 0.2, 0.3]])))
+    assert not surfels[:, IS_PLANE].any()
 
 
 def test_five_points_show_nothing() -> None:
     grid = grid_of(np.array([[0.1, 0.1, 0.1], [0.4, 0.1, 0.1], [0.1, 0.4, 0.1], [0.4, 0.4, 0.1], [0.2, 0.3, 0.1]]))
-    patches = grid.patches(grid.look_up(np.array([[0.2, 0.2, 0.1]])))
-    assert not patches.is_plane.any()
-    assert not patches.is_line.any()
+    surfels = grid.surfels(grid.find(np.array([[0.2, 0.2, 0.1]])))
+    assert not surfels[:, IS_PLANE].any()
 
 
 def test_an_empty_cell_shows_the_nearest_around_it() -> None:
@@ -161,8 +158,8 @@ def test_an_empty_cell_shows_the_nearest_around_it() -> None:
     grid = grid_of(held)
     asked = np.array([[0.3, 0.3, 0.3], [0.05, 0.3, 0.3], [0.3, 0.4, 0.3], [-0.4, 0.45, 0.7]])
     asked[1, 0] = 0.01
-    rows = grid.look_up(asked)
-    own = grid.look_up(held)
+    rows = grid.find(asked)
+    own = grid.find(held)
     distances = np.linalg.norm(asked[:, None] - held, axis=2)
     np.testing.assert_array_equal(rows, own[distances.argmin(axis=1)])
     assert len(set(rows.tolist())) > 1
@@ -171,14 +168,14 @@ def test_an_empty_cell_shows_the_nearest_around_it() -> None:
 def test_nothing_is_found_two_cells_away() -> None:
     grid = grid_of(np.array([[0.25, 0.25, 0.25]]))
     asked = np.array([[0.75, 0.75, 0.75], [1.01, 0.25, 0.25], [-0.51, 0.25, 0.25], [1e4, 1e4, 1e4]])
-    assert (grid.look_up(asked) == ABSENT).tolist() == [False, True, True, True]
+    assert (grid.find(asked) == ABSENT).tolist() == [False, True, True, True]
 
 
 def test_nothing_is_found_in_an_empty_grid(rng: np.random.Generator) -> None:
     grid = SurfelGrid(CELL)
-    rows = grid.look_up(cloud(rng, 50))
+    rows = grid.find(cloud(rng, 50))
     assert (rows == ABSENT).all()
-    assert len(grid.patches(rows[:0])) == 0
+    assert len(grid.surfels(rows[:0])) == 0
 
 
 def test_means_are_those_of_the_cells_points(rng: np.random.Generator) -> None:
@@ -191,42 +188,42 @@ def test_means_are_those_of_the_cells_points(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(means[order], expected[other], atol=1e-5)
 
 
-def test_what_is_near_stays_with_its_patches_when_the_rest_is_forgotten(rng: np.random.Generator) -> None:
+def test_what_is_near_stays_with_its_surfels_when_the_rest_is_forgotten(rng: np.random.Generator) -> None:
     points = cloud(rng, 20_000)
     grid = grid_of(points)
     centre = np.array([1.0, 0.0, -1.0])
     middles = (np.floor(points / CELL) + 0.5) * CELL
     distance = np.linalg.norm(middles - centre, axis=1)
     # Patches are worked out before: what is kept must not be worked out from what is gone.
-    before = grid.patches(grid.look_up(points)).values
+    before = grid.surfels(grid.find(points))
     held = len(grid)
-    grid.forget_beyond(centre, 3.0)
+    grid.drop_beyond(centre, 3.0)
     near = distance <= 3.0
     assert len(grid) == len(np.unique(middles[near], axis=0)) < held
-    np.testing.assert_array_equal(grid.patches(grid.look_up(points[near])).values, before[near])
+    np.testing.assert_array_equal(grid.surfels(grid.find(points[near])), before[near])
     far = distance > 3.0 + 2.0 * CELL * 3**0.5
-    assert (grid.look_up(points[far]) == ABSENT).all()
+    assert (grid.find(points[far]) == ABSENT).all()
 
 
 def test_goes_on_growing_after_forgetting(rng: np.random.Generator) -> None:
     points = cloud(rng, 20_000)
     grid = grid_of(points)
-    grid.forget_beyond(np.zeros(3), 2.0)
+    grid.drop_beyond(np.zeros(3), 2.0)
     other = cloud(rng) + 50.0
-    grid.add(other, np.zeros(len(other)), from_above(len(other)))
+    grid.insert(other, np.zeros(len(other)), from_above(len(other)))
     fresh = grid_of(other)
     np.testing.assert_allclose(
-        grid.patches(grid.look_up(other)).points, fresh.patches(fresh.look_up(other)).points, atol=1e-9
+        grid.surfels(grid.find(other))[:, MEAN], fresh.surfels(fresh.find(other))[:, MEAN], atol=1e-9
     )
 
 
 def test_a_cell_that_has_seen_enough_moves_no_more(rng: np.random.Generator) -> None:
     wall = np.column_stack([np.full(9_000, 0.25), rng.uniform(-1, 1, (9_000, 2))])
     grid = grid_of(wall)
-    before = grid.patches(grid.look_up(wall)).values
+    before = grid.surfels(grid.find(wall))
     drifted = wall + np.array([0.1, 0.0, 0.0])
-    grid.add(drifted, np.zeros(len(wall)), from_above(len(wall)))
-    np.testing.assert_array_equal(grid.patches(grid.look_up(wall)).values, before)
+    grid.insert(drifted, np.zeros(len(wall)), from_above(len(wall)))
+    np.testing.assert_array_equal(grid.surfels(grid.find(wall)), before)
 
 
 def test_a_cell_that_has_seen_little_still_moves(rng: np.random.Generator) -> None:
@@ -235,18 +232,18 @@ def test_a_cell_that_has_seen_little_still_moves(rng: np.random.Generator) -> No
 
     grid = grid_of(wall(0.2))
     asked = np.array([[0.2, 0.25, 0.25]])
-    np.testing.assert_allclose(grid.patches(grid.look_up(asked)).points[:, 0], 0.2, atol=1e-6)
-    grid.add(wall(0.3), np.zeros(120), from_above(120))
-    moved = grid.patches(grid.look_up(asked)).points[0, 0]
+    np.testing.assert_allclose(grid.surfels(grid.find(asked))[:, MEAN][:, 0], 0.2, atol=1e-6)
+    grid.insert(wall(0.3), np.zeros(120), from_above(120))
+    moved = grid.surfels(grid.find(asked))[:, MEAN][0, 0]
     assert 0.23 < moved < 0.27
 
 
 def test_one_ring_has_no_spread_of_elevation_and_two_have_half_their_distance(rng: np.random.Generator) -> None:
     points = np.column_stack([np.full(400, 10.1), rng.uniform(-0.2, 0.2, 400), np.full(400, 0.1)])
     one = grid_of(points, np.full(400, 0.25))
-    assert one.patches(one.look_up(points)).elevation_spreads.max() < 3e-4
+    assert one.surfels(one.find(points))[:, ELEVATION_SPREAD].max() < 3e-4
     two = grid_of(points, np.repeat([0.25, 0.29], 200))
-    np.testing.assert_allclose(two.patches(two.look_up(points)).elevation_spreads, 0.02, rtol=0.1)
+    np.testing.assert_allclose(two.surfels(two.find(points))[:, ELEVATION_SPREAD], 0.02, rtol=0.1)
 
 
 def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng: np.random.Generator) -> None:
@@ -254,14 +251,14 @@ def test_what_a_cell_shows_follows_its_neighbours_once_it_is_tidied(rng: np.rand
     stray = np.array([[0.25, 0.25, 0.6]]) + rng.normal(0.0, 0.02, (10, 3))
     wall = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.array([0.25, 0.25, 0.45]), half_size=2.0)
     grid = grid_of(stray)
-    assert not grid.patches(grid.look_up(stray)).is_plane.any()
-    grid.add(wall, np.zeros(len(wall)), from_above(len(wall)))
-    assert not grid.patches(grid.look_up(stray)).is_plane.any()
+    assert not grid.surfels(grid.find(stray))[:, IS_PLANE].any()
+    grid.insert(wall, np.zeros(len(wall)), from_above(len(wall)))
+    assert not grid.surfels(grid.find(stray))[:, IS_PLANE].any()
     grid._tidied = len(grid)  # so that no cell is forgotten
     grid.tidy()
-    patches = grid.patches(grid.look_up(stray))
-    assert patches.is_plane.all()
-    np.testing.assert_allclose(np.abs(patches.normals[:, 2]), 1.0, atol=1e-3)
+    surfels = grid.surfels(grid.find(stray))
+    assert surfels[:, IS_PLANE].all()
+    np.testing.assert_allclose(np.abs(surfels[:, NORMAL][:, 2]), 1.0, atol=1e-3)
 
 
 def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng: np.random.Generator) -> None:
@@ -270,11 +267,11 @@ def test_strays_are_forgotten_where_much_was_seen_and_nowhere_else(rng: np.rando
     once = on_plane(rng, np.array([1.0, 0.0, 0.0]), np.array([30.25, 0.0, 0.0]), count=60)  # as few as a stray, alone
     grid = grid_of(np.concatenate([wall, strays, once]))
     inner = wall[np.abs(wall).max(axis=1) < 1.9]  # at its border cells have few points, too
-    seen = grid.patches(grid.look_up(inner)).points
+    seen = grid.surfels(grid.find(inner))[:, MEAN]
     grid.tidy()
-    assert (grid.look_up(strays[strays[:, 2] > 1.8]) == ABSENT).all()
-    assert (grid.look_up(once) != ABSENT).all()
-    np.testing.assert_allclose(grid.patches(grid.look_up(inner)).points, seen, atol=1e-3)
+    assert (grid.find(strays[strays[:, 2] > 1.8]) == ABSENT).all()
+    assert (grid.find(once) != ABSENT).all()
+    np.testing.assert_allclose(grid.surfels(grid.find(inner))[:, MEAN], seen, atol=1e-3)
 
 
 def test_a_place_seen_again_and_again_takes_no_more_cells(rng: np.random.Generator) -> None:
@@ -284,7 +281,7 @@ def test_a_place_seen_again_and_again_takes_no_more_cells(rng: np.random.Generat
         grid, counts = SurfelGrid(0.1), []
         for scan in range(1, 4_001):
             points = on_plane(rng, np.array([0.0, 0.0, 1.0]), np.zeros(3), half_size=1.0, count=300)
-            grid.add(points + rng.normal(0.0, 0.03, points.shape), np.zeros(len(points)), from_above(len(points)))
+            grid.insert(points + rng.normal(0.0, 0.03, points.shape), np.zeros(len(points)), from_above(len(points)))
             if tidied and scan % 250 == 0:
                 grid.tidy()
             if scan % 1_000 == 0:

@@ -8,13 +8,12 @@ import pytest
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state import Saved
 from mapping.surfels.cell_kernels import OTHER_SIDE
-from mapping.surfels.grid import SurfelGrid
-from mapping.surfels.surfel_map import LocalMap
-from mapping.surfels.voxel_hash import VoxelTable, key_cells, point_keys
+from mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
+from mapping.surfels.surfel_map import SurfelMap
+from mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005
-NO_EDGES = np.empty((0, 3))
 SENSORS = (np.array([0.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]))
 OFFSETS = np.arange(8) / 8.0
 ONE_AFTER_THE_OTHER, IN_TURNS = [0] * 20 + [1] * 20, [0, 1] * 20
@@ -24,21 +23,21 @@ def face(rng: np.random.Generator, x: float, half_size: float, count: int) -> Fl
     return np.column_stack([np.full(count, x), rng.uniform(-half_size, half_size, (count, 2))])
 
 
-def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float], sides: list[int]) -> LocalMap:
+def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float], sides: list[int]) -> SurfelMap:
     """A map of a wall with faces at these x, of which scan after scan saw one side."""
-    local_map, half_size = LocalMap(cell_m, 100.0), 6.0 * cell_m
+    local_map, half_size = SurfelMap(cell_m, 100.0), 6.0 * cell_m
     for side in sides:
         points = face(rng, faces[side], half_size, 1_000)
-        local_map.match_planes(points, make_transform(np.eye(3), SENSORS[side]))  # as a scan is before it is added
+        local_map.match(points, make_transform(np.eye(3), SENSORS[side]))  # as a scan is before it is added
         points[:, 0] += rng.normal(0.0, NOISE_M, len(points))
-        local_map.add(points, rng.uniform(-0.3, 0.3, len(points)), NO_EDGES, SENSORS[side])
+        local_map.insert(points, rng.uniform(-0.3, 0.3, len(points)), SENSORS[side])
     return local_map
 
 
-def matched(rng: np.random.Generator, local_map: LocalMap, x: float, side: int) -> tuple[float, FloatArray]:
+def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int) -> tuple[float, FloatArray]:
     """The share of points on a face that are matched from one side, and how far these are off."""
     asked = face(rng, x, 4.0 * local_map.cell_m, 500)
-    matches = local_map.match_planes(asked, make_transform(np.eye(3), SENSORS[side])).one_each()
+    matches = local_map.match(asked, make_transform(np.eye(3), SENSORS[side])).first_of_each_point()
     return len(matches) / len(asked), np.abs(matches.residuals(asked[matches.index]))
 
 
@@ -67,7 +66,7 @@ def test_both_sides_stay_when_cells_change_their_size(rng: np.random.Generator, 
     resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(cell_m * factor)
     for side in (0, 1):
         asked = face(rng, faces[side], 2.0 * cell_m, 500)
-        matches = resized.match_planes(asked, make_transform(np.eye(3), SENSORS[side])).one_each()
+        matches = resized.match(asked, make_transform(np.eye(3), SENSORS[side])).first_of_each_point()
         assert len(matches) > 0.95 * len(asked)
         assert np.abs(matches.residuals(asked[matches.index])).mean() < 0.005
 
@@ -76,17 +75,17 @@ def grid_of_both_sides(rng: np.random.Generator, count: int = 4_000) -> tuple[Su
     """A wall within cells, and points of both its faces."""
     grid, faces = SurfelGrid(CELL), [face(rng, x, 1.4, count) for x in (2.1, 2.2)]
     for points, view in zip(faces, (-1.0, 1.0), strict=True):
-        grid.add(points, np.zeros(count), np.tile([view, 0.0, 0.0], (count, 1)))
+        grid.insert(points, np.zeros(count), np.tile([view, 0.0, 0.0], (count, 1)))
     return grid, *faces
 
 
 def test_the_side_that_faces_the_sensor_is_found_and_each_has_its_own_plane(rng: np.random.Generator) -> None:
     grid, near, far = grid_of_both_sides(rng)
     for points, sensor, x, normal in ((near, SENSORS[0], 2.1, -1.0), (far, SENSORS[1], 2.2, 1.0)):
-        patches = grid.patches(grid.look_up(points, sensor))
-        assert patches.is_plane.all()
-        np.testing.assert_allclose(patches.points[:, 0], x, atol=1e-5)
-        np.testing.assert_allclose(patches.normals[:, 0], normal, atol=1e-5)
+        surfels = grid.surfels(grid.find(points, sensor))
+        assert surfels[:, IS_PLANE].all()
+        np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
+        np.testing.assert_allclose(surfels[:, NORMAL][:, 0], normal, atol=1e-5)
 
 
 def test_another_side_takes_cells_only_where_it_was_seen(rng: np.random.Generator) -> None:
@@ -94,11 +93,11 @@ def test_another_side_takes_cells_only_where_it_was_seen(rng: np.random.Generato
     one = SurfelGrid(CELL)
     for seed in range(5):
         noisy = near + np.random.default_rng(seed).normal(0.0, 0.02, near.shape) * [1.0, 0.0, 0.0]
-        one.add(noisy, np.zeros(len(near)), np.tile([-1.0, 0.0, 0.0], (len(near), 1)))
+        one.insert(noisy, np.zeros(len(near)), np.tile([-1.0, 0.0, 0.0], (len(near), 1)))
     cells = len(np.unique(np.floor(near / CELL), axis=0))
     assert len(one) == cells
     half = far[far[:, 1] > 0.0]
-    one.add(half, np.zeros(len(half)), np.tile([1.0, 0.0, 0.0], (len(half), 1)))
+    one.insert(half, np.zeros(len(half)), np.tile([1.0, 0.0, 0.0], (len(half), 1)))
     assert len(one) == cells + len(np.unique(np.floor(half / CELL), axis=0))
     assert len(both) == 2 * cells
 
@@ -108,13 +107,13 @@ def test_a_floor_passed_at_a_flat_angle_has_one_side_and_from_below_another(rng:
     grid, count = SurfelGrid(CELL), 4_000
     for view in ([0.98, 0.0, 0.2], [-0.98, 0.0, 0.2], [0.0, -0.98, 0.2]):
         floor = face(rng, 0.2, 1.4, count)[:, [1, 2, 0]]
-        grid.add(floor, np.zeros(count), np.tile(view, (count, 1)))
+        grid.insert(floor, np.zeros(count), np.tile(view, (count, 1)))
     cells = len(np.unique(np.floor(floor / CELL), axis=0))
     assert len(grid) == cells
-    grid.add(floor - [0.0, 0.0, 0.1], np.zeros(count), np.tile([0.8, 0.0, -0.6], (count, 1)))
+    grid.insert(floor - [0.0, 0.0, 0.1], np.zeros(count), np.tile([0.8, 0.0, -0.6], (count, 1)))
     assert len(grid) == 2 * cells
     for sensor, z in ((np.array([0.0, 0.0, 5.0]), 0.2), (np.array([0.0, 0.0, -5.0]), 0.1)):
-        heights = grid.patches(grid.look_up(floor, sensor)).points[:, 2]
+        heights = grid.surfels(grid.find(floor, sensor))[:, MEAN][:, 2]
         np.testing.assert_allclose(heights, z, atol=1e-5)
 
 
@@ -123,54 +122,55 @@ def test_a_wall_seen_along_from_one_end_still_has_two_sides(rng: np.random.Gener
     grid, count = SurfelGrid(CELL), 4_000
     faces = [face(rng, x, 1.4, count) for x in (2.1, 2.2)]
     for points, view in zip(faces, ([-0.4, 0.9, 0.0], [0.4, 0.9, 0.0]), strict=True):
-        grid.add(points, np.zeros(count), np.tile(view, (count, 1)))
+        grid.insert(points, np.zeros(count), np.tile(view, (count, 1)))
     for points, sensor, x in ((faces[0], [-1.0, 7.0, 0.0], 2.1), (faces[1], [5.0, 7.0, 0.0], 2.2)):
-        patches = grid.patches(grid.look_up(points, np.array(sensor)))
-        np.testing.assert_allclose(patches.points[:, 0], x, atol=1e-5)
+        surfels = grid.surfels(grid.find(points, np.array(sensor)))
+        np.testing.assert_allclose(surfels[:, MEAN][:, 0], x, atol=1e-5)
 
 
 def test_restored_it_goes_on_alike_to_the_last_bit(rng: np.random.Generator) -> None:
     grid, near, far = grid_of_both_sides(rng, count=300)
-    restored = SurfelGrid.restored(Saved(deepcopy(grid.state())))
+    restored = SurfelGrid(CELL)
+    restored.restore(Saved(deepcopy(grid.state())))
     for other in (grid, restored):
         for points, view in ((near, -1.0), (far, 1.0)):
-            other.add(points + np.array([0.0, 0.4, 0.0]), np.zeros(300), np.tile([view, 0.0, 0.0], (300, 1)))
+            other.insert(points + np.array([0.0, 0.4, 0.0]), np.zeros(300), np.tile([view, 0.0, 0.0], (300, 1)))
     one, other_state = grid.state(), restored.state()
     for name, value in one.items():
         np.testing.assert_array_equal(value, other_state[name])
     for points, sensor in ((near, SENSORS[0]), (far, SENSORS[1])):
-        np.testing.assert_array_equal(grid.look_up(points, sensor), restored.look_up(points, sensor))
+        np.testing.assert_array_equal(grid.find(points, sensor), restored.find(points, sensor))
 
 
 def test_what_stays_of_both_sides_is_found_when_the_rest_is_forgotten(rng: np.random.Generator) -> None:
     grid, near, far = grid_of_both_sides(rng)
-    before = [grid.patches(grid.look_up(p, s)).values for p, s in ((near, SENSORS[0]), (far, SENSORS[1]))]
+    before = [grid.surfels(grid.find(p, s)) for p, s in ((near, SENSORS[0]), (far, SENSORS[1]))]
     held = len(grid)
-    grid.forget_beyond(np.array([2.15, 0.0, 0.0]), 1.0)
+    grid.drop_beyond(np.array([2.15, 0.0, 0.0]), 1.0)
     assert 0 < len(grid) < held
     for points, sensor, values in zip((near, far), SENSORS, before, strict=True):
         inner = np.abs(points[:, 1:]).max(axis=1) < 0.5
-        np.testing.assert_array_equal(grid.patches(grid.look_up(points[inner], sensor)).values, values[inner])
+        np.testing.assert_array_equal(grid.surfels(grid.find(points[inner], sensor)), values[inner])
 
 
 def test_a_side_whose_first_side_was_a_stray_is_the_cells_only_one(rng: np.random.Generator) -> None:
     """Seen from there again it grows, and no third one begins."""
     grid, count = SurfelGrid(CELL), 60_000
     for x, points, view in ((2.1, 300, -1.0), (2.2, count, 1.0)):
-        grid.add(face(rng, x, 2.9, points), np.zeros(points), np.tile([view, 0.0, 0.0], (points, 1)))
-    assert len(grid) > len(np.unique(key_cells(grid.state()["keys"]), axis=0))  # type: ignore[arg-type]
+        grid.insert(face(rng, x, 2.9, points), np.zeros(points), np.tile([view, 0.0, 0.0], (points, 1)))
+    assert len(grid) > len(np.unique(key_cells(grid.state()["_keys"]), axis=0))  # type: ignore[arg-type]
     grid.tidy()
-    cells = key_cells(grid.state()["keys"])  # type: ignore[arg-type]
+    cells = key_cells(grid.state()["_keys"])  # type: ignore[arg-type]
     assert len(grid) == len(np.unique(cells, axis=0))
     far = face(rng, 2.2, 2.4, count)
-    patches = grid.patches(grid.look_up(far))
-    np.testing.assert_allclose(patches.normals[:, 0], 1.0, atol=1e-3)
-    grid.add(far, np.zeros(count), np.tile([1.0, 0.0, 0.0], (count, 1)))
+    surfels = grid.surfels(grid.find(far))
+    np.testing.assert_allclose(surfels[:, NORMAL][:, 0], 1.0, atol=1e-3)
+    grid.insert(far, np.zeros(count), np.tile([1.0, 0.0, 0.0], (count, 1)))
     assert len(grid) == len(cells)
 
 
 def test_the_other_side_of_the_farthest_cell_is_no_free_slot() -> None:
-    table, keys = VoxelTable(), point_keys(np.full((1, 3), 1e12), CELL) | OTHER_SIDE
+    table, keys = VoxelHash(), point_keys(np.full((1, 3), 1e12), CELL) | OTHER_SIDE
     table.insert(keys)
     table.insert(keys)
     assert len(table) == 1

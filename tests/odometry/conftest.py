@@ -9,7 +9,7 @@ import torch
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from odometry.images.sweeps import SweepImages
+from odometry.images.sweep_images import SweepImages
 from odometry.training.preparation import PreparedRecording
 from odometry.training.torch_images import RecordedImages
 
@@ -88,14 +88,13 @@ class Scene:
         return scans
 
     def recording(self, count: int, twist: Sequence[float], rolling: bool = True) -> PreparedRecording:
-        """The sweeps with their true motions, all believed."""
+        """The sweeps with their true motions, all valid."""
         T = torch.from_numpy(exp(self.period_s * np.asarray(twist))).float().expand(count - 1, 4, 4)
         return PreparedRecording(
             RecordedImages.stacked(self.sweeps(count, twist, rolling=rolling)),
             torch.full((count - 1,), self.period_s),
             T.clone(),
             torch.ones(count - 1, dtype=torch.bool),
-            torch.ones(count - 1),
         )
 
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment.alignment import Aligned, Guess, align
-from odometry.alignment.alignment_config import AlignmentConfig
-from odometry.alignment.search import align_best, try_guesses
-from odometry.images.sweeps import SweepImages, SweepPair
+from odometry.alignment import search
+from odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align
+from odometry.alignment.search import DOUBTFUL, align_best, try_instead
+from odometry.alignment.sweep_motion import SweepPair
+from odometry.images.sweep_images import SweepImages
 
-CONFIG = AlignmentConfig()
+FINE = Effort(column_step=2)
 TWIST = (0.0, 0.0, 0.0, 14.0, 0.0, 0.0)  # rad/s, m/s: 1.4 m from sweep to sweep
 REST = np.eye(4)
 
@@ -24,6 +25,11 @@ def street(box_room) -> list[SweepImages]:
     return scene.sweeps(2, TWIST)
 
 
+@pytest.fixture
+def no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "STEPS_M", ())
+
+
 def moved(along_m: float) -> FloatArray:
     """(4, 4) ahead."""
     return exp([0.0, 0.0, 0.0, along_m, 0.0, 0.0])
@@ -34,44 +40,44 @@ def second_on_first(sweeps: list[SweepImages]) -> SweepPair:
 
 
 def one_on_the_other(
-    sweeps: list[SweepImages], *guesses: FloatArray, information: FloatArray | None = None, **options
-) -> Aligned:
+    sweeps: list[SweepImages], *guesses: FloatArray, information: FloatArray | None = None
+) -> Alignment:
     """The second of two sweeps on the first; the information is about the first guess."""
     first, *others = guesses
-    hypotheses = [Guess(first, information), *(Guess(guess) for guess in others)]
-    return align_best(hypotheses, second_on_first(sweeps), AlignmentConfig(**options))
+    hypotheses = [InitialEstimate(first, information), *(InitialEstimate(guess) for guess in others)]
+    return align_best(hypotheses, second_on_first(sweeps), FINE)
 
 
-def wrong_by_m(aligned: Aligned) -> float:
+def wrong_by_m(aligned: Alignment) -> float:
     return float(np.linalg.norm(log(aligned.T_prev_curr @ inverse(moved(1.4)))[3:]))
 
 
 def test_alignment_from_rest_stays_there_and_knows_it(street):
-    found = align(Guess(REST), second_on_first(street), CONFIG)
+    found = align(InitialEstimate(REST), second_on_first(street), FINE)
     assert wrong_by_m(found) == pytest.approx(1.4, abs=0.05)
-    assert found.share > 0.3  # the ground and the walls go along
-    assert found.explained < CONFIG.doubtful - 0.2
+    assert found.inlier_share > 0.3  # the ground and the walls go along
+    assert found.explained < DOUBTFUL - 0.2
     np.testing.assert_allclose(np.abs(found.weakest), [1.0, 0.0, 0.0], atol=0.05)
 
 
 def test_steps_along_the_direction_in_doubt_find_the_motion(street):
     found = one_on_the_other(street, REST)
     assert wrong_by_m(found) < 0.02
-    assert found.explained > CONFIG.doubtful
+    assert found.explained > DOUBTFUL
 
 
-def test_no_steps_are_tried_where_there_are_none(street):
-    assert wrong_by_m(one_on_the_other(street, REST, search_m=())) > 1.3
+def test_no_steps_are_tried_where_there_are_none(street, no_steps):
+    assert wrong_by_m(one_on_the_other(street, REST)) > 1.3
 
 
 def test_a_good_alignment_is_not_searched_around(street):
     found = one_on_the_other(street, moved(1.35))
-    alone = align(Guess(moved(1.35)), second_on_first(street), CONFIG)
+    alone = align(InitialEstimate(moved(1.35)), second_on_first(street), FINE)
     assert np.array_equal(found.T_prev_curr, alone.T_prev_curr)
 
 
-def test_a_later_guess_that_explains_more_is_taken(street):
-    found = one_on_the_other(street, REST, moved(1.3), search_m=())
+def test_a_later_guess_that_explains_more_is_taken(street, no_steps):
+    found = one_on_the_other(street, REST, moved(1.3))
     assert wrong_by_m(found) < 0.02
 
 
@@ -88,12 +94,12 @@ def test_guesses_that_are_alike_are_as_good_as_the_first(street):
     assert np.array_equal(both.T_prev_curr, one_on_the_other(street, moved(1.3)).T_prev_curr)
 
 
-def test_information_is_about_the_first_guess_alone(street, corridor):
+def test_information_is_about_the_first_guess_alone(street, corridor, no_steps):
     """It holds the first guess along the corridor, and says nothing of another that is taken instead."""
     firm = 1e9 * np.eye(6)
     held = one_on_the_other(corridor.sweeps(2, TWIST), moved(1.0), information=firm)
     np.testing.assert_allclose(held.T_prev_curr, moved(1.0), atol=1e-4)
-    other = one_on_the_other(street, REST, moved(1.3), information=firm, search_m=())
+    other = one_on_the_other(street, REST, moved(1.3), information=firm)
     assert wrong_by_m(other) < 0.02
 
 
@@ -107,13 +113,15 @@ def test_a_search_does_not_go_where_the_guess_is_sure_not_to_be(street, sigma_m,
 
 def test_the_best_of_many_guesses_is_found_roughly(street):
     guesses = [moved(0.1 * x) for x in (-20, -10, 0, 13, 25)]
-    found = try_guesses(guesses, second_on_first(street), CONFIG)
-    assert found[0, 3] == pytest.approx(1.4, abs=0.05)
+    bad = align(InitialEstimate(REST), second_on_first(street), FINE)
+    found = try_instead(bad, guesses, second_on_first(street), FINE)
+    assert found is not None
+    assert wrong_by_m(found) < 0.02
 
 
-def test_the_less_likely_a_guess_the_more_it_must_explain(street):
+def test_the_less_likely_a_guess_the_more_it_must_explain(street, no_steps):
     """From rest hardly anything fits; what lies beside it is right, and taken unless it is held next to impossible."""
-    rest, right = Guess(REST), moved(1.4)
+    rest, right = InitialEstimate(REST), moved(1.4)
     for odds, wrong in ((1.0, False), (30.0, True)):
-        found = align_best([rest, Guess(right, odds=odds)], second_on_first(street), AlignmentConfig(search_m=()))
+        found = align_best([rest, InitialEstimate(right, sigmas=odds)], second_on_first(street), FINE)
         assert (wrong_by_m(found) > 0.5) == wrong

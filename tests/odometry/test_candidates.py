@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from lidarslam.core.geometry import exp, log, make_transform, rotation_angle
-from odometry.network.candidates import CorrelationSearch, Floats, _peaks, _shift_scores
+from odometry.network.candidates import CorrelationParts, CorrelationSearch, Search, _peaks, _shift_scores
 from odometry.network.checkpoint import load_checkpoint, network_of
 from odometry.network.correlation import CorrelationNetwork
 from odometry.network.shipped import default_weights
-from odometry.network.torch_graphs import TorchGraphs
+from odometry.network.torch_graphs import torch_search
 
 TURN_DEG = 2.0
 
@@ -26,8 +26,8 @@ def network() -> CorrelationNetwork:
 
 
 @pytest.fixture(scope="module")
-def search(network) -> CorrelationSearch:
-    return CorrelationSearch(TorchGraphs(network))
+def search(network) -> Search:
+    return torch_search(network)
 
 
 @pytest.fixture(scope="module")
@@ -76,27 +76,23 @@ def test_candidates_are_a_distribution(search, seen):
         assert (np.linalg.eigvalsh(one.covariance) > 0.0).all()
 
 
-class Known:
-    """Graphs that find one turn and one shift, whatever they are shown."""
-
-    def columns(self, points: Floats, normals: Floats) -> Floats:  # noqa: ARG002
-        return np.zeros((1, 4, 4, 180), dtype=np.float32)
-
-    def turn_scores(self, previous: Floats, current: Floats) -> Floats:  # noqa: ARG002
-        scores = np.full((1, 180), -20.0, dtype=np.float32)
-        scores[0, 5] = 0.0
-        return scores
-
-    def bird(self, grid: Floats) -> Floats:
-        return np.zeros((1, 8, *grid.shape[2:]), dtype=np.float32)
-
-    def peaks(self, turn_scores: Floats, shift_scores: Floats) -> tuple[float, Floats, Floats]:  # noqa: ARG002
-        return 0.2, np.float32([2.0, 1.0]), np.log(np.float32([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
+def known(turn_scores: np.ndarray) -> CorrelationSearch:
+    """With parts that find one turn and one shift in any scan."""
+    log_sigma = np.log(np.float32([[0.01, 0.02, 0.03, 0.1, 0.2, 0.3]]))
+    parts = CorrelationParts(
+        columns=lambda *_: [np.zeros((1, 4, 4, 180), dtype=np.float32)],
+        turns=lambda *_: [turn_scores],
+        bird=lambda grid: [np.zeros((1, 8, *grid.shape[2:]), dtype=np.float32)],
+        peaks=lambda *_: [np.float32([0.2]), np.float32([[2.0, 1.0]]), log_sigma],
+    )
+    return CorrelationSearch(parts)
 
 
 def test_what_was_seen_in_a_turned_grid_is_turned_back():
     nothing = np.zeros((3, 16, 720), dtype=np.float32)
-    search = CorrelationSearch(Known())
+    scores = np.full((1, 180), -20.0, dtype=np.float32)
+    scores[0, 5] = 0.0
+    search = known(scores)
     for heading, shift, sigmas in (
         (0.0, (2.0, 1.0), (0.01, 0.02, 0.03, 0.1, 0.2, 0.3)),
         (math.pi / 2, (1.0, -2.0), (0.02, 0.01, 0.03, 0.2, 0.1, 0.3)),
@@ -108,16 +104,9 @@ def test_what_was_seen_in_a_turned_grid_is_turned_back():
         assert current.heading == pytest.approx(heading + math.radians(10.0))
 
 
-class Overflowing(Known):
-    """Graphs whose features are too large for their products."""
-
-    def turn_scores(self, previous: Floats, current: Floats) -> Floats:  # noqa: ARG002
-        return np.full((1, 180), np.nan, dtype=np.float32)
-
-
 def test_scores_that_are_no_numbers_give_no_motion():
     nothing = np.zeros((3, 16, 720), dtype=np.float32)
-    search = CorrelationSearch(Overflowing())
+    search = known(np.full((1, 180), np.nan, dtype=np.float32))
     candidates, _ = search.compare(search.describe(nothing, nothing), nothing, nothing)
     assert [candidate.is_motion() for candidate in candidates] == [False]
 

@@ -8,13 +8,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from mapping.deskew import body_velocity, deskew
-from odometry.config import ConsistencyConfig
 from odometry.methods.consistency import Consistency, ConsistencyCheck, plane_distances
 
 
 @pytest.fixture
 def check() -> ConsistencyCheck:
-    return ConsistencyCheck(ConsistencyConfig())
+    return ConsistencyCheck()
 
 
 def fit(check: ConsistencyCheck, scans: list[Scan], truth: Trajectory, error: list[float]) -> Consistency:

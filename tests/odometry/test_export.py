@@ -10,15 +10,14 @@ import torch
 from torch.nn import functional
 
 from lidarslam.core.errors import ConfigError, InputError
-from odometry.images.image_config import ImageConfig
+from odometry.config import ImageConfig, NetworkConfig
+from odometry.network.candidates import CorrelationSearch
 from odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of
 from odometry.network.export import export_onnx
-from odometry.network.exported import DESCRIPTION, read_exported
-from odometry.network.network_config import CorrelationConfig, NetworkConfig
+from odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, onnx_search, read_exported
 from odometry.network.networks import make_network
-from odometry.network.onnx_graphs import OnnxGraphs, onnx_search
 from odometry.network.shipped import default_weights, shipped_folder
-from odometry.network.torch_graphs import TorchGraphs, torch_search
+from odometry.network.torch_graphs import torch_search
 
 SHAPE = (16, 96)
 # Sums in another order differ in the last digits of float32.
@@ -26,8 +25,7 @@ TOLERANCE = 1e-4
 
 
 def untrained(name: str) -> Checkpoint:
-    small = CorrelationConfig(rows=16, widths=(8, 16, 16), bird_width=8, bird_features=4)
-    config = NetworkConfig.model_validate({"name": name, "correlation": small})
+    config = NetworkConfig.model_validate({"name": name})
     torch.manual_seed(5)
     network = make_network(config)
     with torch.no_grad():
@@ -46,20 +44,20 @@ def test_the_shipped_graphs_are_the_shipped_weights() -> None:
     """Else they were exported from others: `lidarslam export --out odometry/weights/correlation` makes them again."""
     checkpoint, exported = load_checkpoint(default_weights()), read_exported(shipped_folder())
     assert (exported.network, exported.images) == (checkpoint.network, checkpoint.images)
-    given, expected = OnnxGraphs(exported.folder, 1), TorchGraphs(network_of(checkpoint))
+    searches = onnx_search(exported, 1), torch_search(network_of(checkpoint))
+    assert all(isinstance(search, CorrelationSearch) for search in searches)
+    given, expected = (search._parts for search in searches)  # type: ignore[attr-defined]
     points, normals = a_scan(0, (checkpoint.images.rows, checkpoint.images.columns))
     rng = np.random.default_rng(0)
     grid = rng.normal(size=(1, 8, 96, 96)).astype(np.float32) * (rng.random((1, 1, 96, 96)) > 0.6)
     shifts = 5.0 * rng.normal(size=(1, 37, 37)).astype(np.float32)
-    features = expected.columns(points[None], normals[None])
+    (features,) = expected.columns(points[None], normals[None])
     other = np.ascontiguousarray(np.roll(features, 7, -1))
-    np.testing.assert_allclose(given.columns(points[None], normals[None]), features, atol=TOLERANCE)
-    turns = expected.turn_scores(features, other)
-    np.testing.assert_allclose(given.turn_scores(features, other), turns, atol=TOLERANCE * np.abs(turns).max())
-    cells = expected.bird(grid)
-    np.testing.assert_allclose(given.bird(grid), cells, atol=TOLERANCE * np.abs(cells).max())
-    for one, same in zip(given.peaks(turns, shifts), expected.peaks(turns, shifts), strict=True):
-        np.testing.assert_allclose(one, same, atol=TOLERANCE)
+    (turns,) = expected.turns(features, other)
+    inputs = {"columns": (points[None], normals[None]), "turns": (features, other), "bird": (grid,)}
+    for part, values in {**inputs, "peaks": (turns, shifts)}.items():
+        for one, same in zip(getattr(given, part)(*values), getattr(expected, part)(*values), strict=True):
+            np.testing.assert_allclose(one, same, atol=TOLERANCE * max(1.0, float(np.abs(same).max())))
 
 
 @pytest.mark.slow
@@ -85,9 +83,9 @@ def test_damaged_folders_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="lidarslam export"):
             read_exported(tmp_path)
     (tmp_path / DESCRIPTION).write_bytes((shipped_folder() / DESCRIPTION).read_bytes())
-    with pytest.raises(InputError, match=r"columns\.onnx is missing"):
-        read_exported(tmp_path)
-    for name in read_exported(shipped_folder()).graphs:
+    with pytest.raises(InputError, match=r"columns\.onnx: cannot be used"):
+        onnx_search(read_exported(tmp_path), 1)
+    for name in (COLUMNS, TURNS, BIRD, PEAKS):
         (tmp_path / name).write_bytes(b"no graph")
     with pytest.raises(InputError, match=r"columns\.onnx: cannot be used"):
         onnx_search(read_exported(tmp_path), 1)

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
-from odometry.alignment.alignment_config import AlignmentConfig
-from odometry.config import OdometryConfig
-from odometry.images.image_config import ImageConfig
+from odometry.alignment import search
+from odometry.config import ImageConfig, LearnedConfig, OdometryConfig
 from odometry.interface import Motion
+from odometry.methods import learned
 from odometry.methods.learned import LearnedOdometry
-from odometry.methods.learned_config import LearnedConfig
 from odometry.network.candidates import Candidate, Described
 from odometry.registry import make_odometry
 
@@ -48,8 +47,8 @@ class Told:
         return (Candidate(guess, np.diag(np.full(6, self.sigma**2)), 0.0),), self.describe(points, normals)
 
 
-def estimates(scans: list[Scan], network: Told, **options: object) -> list[Motion]:
-    odometry = LearnedOdometry(network, IMAGES, LearnedConfig.model_validate(options))
+def estimates(scans: list[Scan], network: Told, is_aligned: bool = True) -> list[Motion]:
+    odometry = LearnedOdometry(network, IMAGES, is_aligned)
     return [odometry.estimate(scan) for scan in scans]
 
 
@@ -124,9 +123,10 @@ def test_another_place_is_a_failure_and_the_next_pair_works_again(box_room):
     assert_close(motions[5], moved())
 
 
-def test_too_few_points_are_a_failure(box_room):
+def test_too_few_points_are_a_failure(box_room, monkeypatch):
+    monkeypatch.setattr(learned, "_LEAST_INLIERS", 100_000)
     scans = box_room.scans(2, TWIST)
-    motions = estimates(scans, Told(moved()), least_points=100_000)
+    motions = estimates(scans, Told(moved()))
     assert motions[1].failure is not None
     assert "points do" in motions[1].failure
 
@@ -137,22 +137,24 @@ def test_a_scan_that_is_not_later_is_a_failure(box_room):
     assert motions[1].failure == "the scan is not later than the one before"
 
 
-def test_a_bad_guess_gives_way_to_the_last_motion(box_room):
+def test_a_bad_guess_gives_way_to_the_last_motion(box_room, monkeypatch):
+    monkeypatch.setattr(search, "STEPS_M", ())
     fast = (0.0, 0.0, math.radians(150.0), 3.0, 0.0, 0.0)
     far_off = exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0))
     scans = box_room.scans(4, fast)
-    motions = estimates(scans, Told(moved(fast), moved(fast), far_off), alignment={"search_m": ()})
+    motions = estimates(scans, Told(moved(fast), moved(fast), far_off))
     assert_close(motions[3], moved(fast), 0.3, 0.02)
-    alone = estimates(scans[2:], Told(far_off), alignment={"search_m": ()})  # there is no last motion
+    alone = estimates(scans[2:], Told(far_off))  # there is no last motion
     assert alone[1].failure is not None or errors(alone[1], moved(fast))[0] > 10.0
 
 
-def test_the_last_motion_is_scaled_to_the_time_that_went_by(box_room):
+def test_the_last_motion_is_scaled_to_the_time_that_went_by(box_room, monkeypatch):
+    monkeypatch.setattr(search, "STEPS_M", ())
     fast = (0.0, 0.0, math.radians(100.0), 1.5, 0.0, 0.0)
     far_off = exp((0.0, 0.0, 1.5, 2.0, 0.0, 0.0))
     scans = box_room.scans(5, fast)
     received = [*scans[:3], scans[4]]  # one was dropped
-    motions = estimates(received, Told(moved(fast), moved(fast), far_off), alignment={"search_m": ()})
+    motions = estimates(received, Told(moved(fast), moved(fast), far_off))
     assert_close(motions[3], moved(fast) @ moved(fast), 0.5, 0.04)
 
 
@@ -315,8 +317,7 @@ def test_a_guess_that_is_no_motion_is_a_failure_and_the_next_pair_works_again(bo
 
 
 def test_a_sensor_of_many_rings_is_aligned_with_all_of_them(box_room):
-    scans = replace(box_room, rows=64).scans(3, TWIST)
-    many, few = (estimates(scans, Told(moved(wrong=WRONG)), alignment_rows=rows) for rows in (None, 16))
+    many, few = (estimates(replace(box_room, rows=rows).scans(3, TWIST), Told(moved(wrong=WRONG))) for rows in (64, 16))
     assert_close(many[2], moved())
     assert many[2].points_used > 2 * few[2].points_used
 
@@ -334,8 +335,10 @@ def test_a_device_that_is_not_there_is_named():
         make_odometry(OdometryConfig(learned=LearnedConfig(device="nowhere")))
 
 
-def test_alignment_is_set_by_the_configuration(box_room):
+def test_without_alignment_the_motion_is_the_networks(box_room):
     guess = moved(wrong=(0.0, 0.0, 0.0, 0.02, 0.0, 0.0))
-    options = {"alignment": AlignmentConfig(iterations=0), "least_explained": 0.0}
-    motions = estimates([stamped(scan, 0.5) for scan in box_room.scans(2, TWIST)], Told(guess), **options)
+    scans = [stamped(scan, 0.5) for scan in box_room.scans(2, TWIST)]
+    motions = estimates(scans, Told(guess), is_aligned=False)
     np.testing.assert_allclose(motions[1].T_prev_curr, guess, atol=1e-6)
+    assert motions[1].covariance is not None
+    assert motions[1].points_used > 1000

@@ -9,7 +9,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
-from odometry.config import ConsistencyConfig, OdometryConfig
+from odometry.config import OdometryConfig
 from odometry.interface import Motion, Odometry
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.external import ExternalOdometry
@@ -88,11 +88,11 @@ def test_constant_velocity_and_kiss_have_their_say() -> None:
 
 def test_the_check_goes_on(scans: list[Scan], room_truth: Trajectory, through_disk: ThroughDisk) -> None:
     motions = np.concatenate([np.eye(4)[None], room_truth.relative_motions()])
-    check = ConsistencyCheck(ConsistencyConfig())
+    check = ConsistencyCheck()
     expected = [check.check(scan.points, T) for scan, T in zip(scans, motions, strict=False)]
     assert len({consistency.status for consistency in expected}) > 1
     for after in range(9):
-        first, second = ConsistencyCheck(ConsistencyConfig()), ConsistencyCheck(ConsistencyConfig())
+        first, second = ConsistencyCheck(), ConsistencyCheck()
         for scan, T in zip(scans[:after], motions, strict=False):
             first.check(scan.points, T)
         second.restore(through_disk(first.state()))

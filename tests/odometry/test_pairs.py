@@ -2,26 +2,38 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from odometry.training.pairs import PairBatch, Pairs, augmented, pair_of
+from odometry.network.torch_geometry import inverse, log, rotate, skew, transform_points
+from odometry.training.augmentation import Augmentation, PairBatch, augmented
+from odometry.training.pairs import Pairs, pair_of
 from odometry.training.preparation import PreparedRecording
-from odometry.training.torch_geometry import exp, inverse, log, rotate, rotation_angle, transform_points
-from odometry.training.training_config import AugmentationConfig
+from odometry.training.torch_images import RecordedImages
 
 TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
-NONE = AugmentationConfig(
+NONE = Augmentation(
     max_gap=1, reverse=0.0, roll=0.0, roll_deg=0.0, any_roll=0.0, mirror=0.0, scale=0.0, drop_beams=0.0,
     drop_points=0.0, hide_sector=0.0, range_noise_m=0.0, wet_ground=0.0, glass=0.0,
 )  # fmt: skip
 WORN = {"drop_beams": 1.0, "drop_points": 0.5, "hide_sector": 1.0, "range_noise_m": 0.05}
 
 
-def only(**options: object) -> AugmentationConfig:
-    return AugmentationConfig.model_validate({**NONE.model_dump(), **options})
+def only(**options: Any) -> Augmentation:
+    return NONE._replace(**options)
+
+
+def exp(xi: Tensor) -> Tensor:
+    """SE(3) exponential (..., 4, 4) of tangents (..., 6), rotation first."""
+    top = torch.cat([skew(xi[..., :3]), xi[..., 3:, None]], dim=-1)
+    return torch.linalg.matrix_exp(torch.nn.functional.pad(top, (0, 0, 0, 1)))
+
+
+def rotation_angle(T: Tensor) -> Tensor:
+    return log(T)[..., :3].norm(dim=-1)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +73,7 @@ def test_a_pair_as_it_is(recording):
     for images, number in ((pair.previous, 1), (pair.current, 2)):
         assert torch.equal(images[0, :3], recording.images.points[number])
         assert torch.equal(images[0, 3:], recording.images.normals[number])
-    assert pair.believed.tolist() == [True]
+    assert pair.valid.tolist() == [True]
     plain = pair_of(recording, 1, 2, surfaces=False)
     assert plain.previous_surfaces is None
     assert plain.current_surfaces is None
@@ -109,14 +121,14 @@ def test_a_sweep_is_as_fast_as_the_motions_around_it(recording, motion_number, p
     assert torch.equal(changed.current_surfaces, same_as.current_surfaces) == current_is_same
 
 
-def test_the_believed_alone_tell_how_fast_a_sweep_was(small_room):
+def test_the_valid_alone_tell_how_fast_a_sweep_was(small_room):
     good = small_room.recording(3, TWIST)
     bad = small_room.recording(3, TWIST)
     bad.T_prev_curr[0] = exp(torch.tensor([0.5, 0.0, 1.0, 3.0, 0.0, 0.0]))
-    bad.believed[0] = False
+    bad.valid[0] = False
     for mine, truth in zip(_surfaces(pair_of(bad, 1, 2)), _surfaces(pair_of(good, 1, 2)), strict=True):
         torch.testing.assert_close(mine, truth, rtol=0, atol=1e-5)
-    bad.believed[1] = False
+    bad.valid[1] = False
     still = pair_of(bad, 1, 2)
     assert torch.equal(still.previous, still.previous_surfaces)
 
@@ -125,17 +137,16 @@ def _surfaces(pair: PairBatch) -> tuple[Tensor | None, Tensor | None]:
     return pair.previous_surfaces, pair.current_surfaces
 
 
-def test_a_pair_is_believed_if_all_motions_between_are(recording):
+def test_a_pair_is_valid_if_all_motions_between_are(recording):
     doubtful = PreparedRecording(
         recording.images, recording.interval_s, recording.T_prev_curr, torch.tensor([True, False, True]),
-        recording.explained,
     )  # fmt: skip
     pairs = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
-    assert [bool(pair_of(doubtful, *pair).believed) for pair in pairs] == [True, False, True, False, False]
+    assert [bool(pair_of(doubtful, *pair).valid) for pair in pairs] == [True, False, True, False, False]
 
 
 def test_the_same_step_gives_the_same_pairs(recording):
-    a, b = (Pairs([recording], AugmentationConfig(), seed=3) for _ in range(2))
+    a, b = (Pairs([recording], seed=3) for _ in range(2))
     a.batch(8, 2)
     assert same(a.batch(7, 3), b.batch(7, 3))
 
@@ -143,37 +154,37 @@ def test_the_same_step_gives_the_same_pairs(recording):
 @pytest.mark.parametrize("other", [{"step": 8}, {"process": 1}, {"seed": 4}])
 def test_other_steps_processes_and_seeds_give_others(recording, other):
     def batch(seed: int = 3, step: int = 7, process: int = 0) -> PairBatch:
-        return Pairs([recording], AugmentationConfig(), seed).batch(step, 3, process)
+        return Pairs([recording], seed).batch(step, 3, process)
 
     assert not torch.equal(batch(**other).T_prev_curr, batch().T_prev_curr)
     assert not torch.equal(batch(**other).previous, batch().previous)
 
 
 def test_seeds_may_be_large(recording):
-    assert len(Pairs([recording], NONE, 2**40).batch(0, 1).previous) == 1
+    assert len(Pairs([recording], 2**40, augmentation=NONE).batch(0, 1).previous) == 1
 
 
 def test_no_recordings_are_told():
     with pytest.raises(ValueError, match="recording"):
-        Pairs([], NONE, 0)
+        Pairs([], 0, augmentation=NONE)
 
 
 def test_recordings_are_equally_likely(small_room, recording):
     short = small_room.recording(2, (0.0, 0.0, 0.0, 3.0, 0.0, 0.0))
-    batch = Pairs([recording, short], NONE, 0, surfaces=False).batch(0, 200)
+    batch = Pairs([recording, short], 0, surfaces=False, augmentation=NONE).batch(0, 200)
     forwards = (batch.T_prev_curr[:, :3, 3].norm(dim=1) - 0.3).abs() < 1e-4
     assert 75 < int(forwards.sum()) < 125
 
 
 def test_gaps_are_drawn_up_to_the_greatest_and_the_recordings_length(small_room, recording):
-    steps = Pairs([recording], only(max_gap=2), 0, surfaces=False).batch(0, 60)
+    steps = Pairs([recording], 0, surfaces=False, augmentation=only(max_gap=2)).batch(0, 60)
     angles = rotation_angle(steps.T_prev_curr) / rotation_angle(motion())
     assert set(angles.round(decimals=2).tolist()) == {1.0, 2.0}
-    short = Pairs([small_room.recording(2, TWIST)], only(max_gap=5), 0, surfaces=False).batch(0, 10)
+    short = Pairs([small_room.recording(2, TWIST)], 0, surfaces=False, augmentation=only(max_gap=5)).batch(0, 10)
     assert len(short.previous) == 10
 
 
-AUGMENTATIONS: dict[str, dict[str, object]] = {
+AUGMENTATIONS: dict[str, dict[str, Any]] = {
     "turned_alike": {},
     "roll": {"roll": 1.0, "roll_deg": 20.0},
     "any_roll": {"roll": 1.0, "any_roll": 1.0},
@@ -191,10 +202,10 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
     as_it_is = pair_of(recording, 0, gap)
     if name == "reverse":
         two = pair_of(recording, 0, 1)
-        batch = Pairs([_first_two(recording)], only(reverse=1.0), 0).batch(0, 3)
+        batch = Pairs([_first_two(recording)], 0, augmentation=only(reverse=1.0)).batch(0, 3)
         expected = fit(PairBatch(
             two.current, two.previous, two.current_surfaces, two.previous_surfaces, inverse(two.T_prev_curr),
-            two.believed,
+            two.valid,
         ), 0)  # fmt: skip
     else:
         several = PairBatch(*(None if v is None else torch.cat([v] * 3) for v in vars(as_it_is).values()))
@@ -208,15 +219,16 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
         torch.testing.assert_close(cosine.mean(), expected[1].mean(), rtol=0, atol=1e-3)
         wrong = PairBatch(
             batch.previous, batch.current, batch.previous_surfaces, batch.current_surfaces,
-            exp(torch.tensor([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])) @ batch.T_prev_curr, batch.believed,
+            exp(torch.tensor([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])) @ batch.T_prev_curr, batch.valid,
         )  # fmt: skip
         assert (fit(wrong, item)[0] - expected[0]).abs().max() > 1e-5
 
 
 def _first_two(recording: PreparedRecording) -> PreparedRecording:
     return PreparedRecording(
-        recording.images.select(slice(0, 2)), recording.interval_s[:1], recording.T_prev_curr[:1],
-        recording.believed[:1], recording.explained[:1],
+        RecordedImages(*(part[:2] for part in vars(recording.images).values())), recording.interval_s[:1],
+        recording.T_prev_curr[:1],
+        recording.valid[:1],
     )  # fmt: skip
 
 
@@ -224,15 +236,14 @@ def test_what_the_network_sees_is_changed_like_the_surfaces(recording):
     """Raw sweeps and compensated ones go the same way; seen here where they are the same."""
     still = PreparedRecording(
         recording.images, recording.interval_s, recording.T_prev_curr, torch.zeros(3, dtype=torch.bool),
-        recording.explained,
     )  # fmt: skip
-    batch = Pairs([still], only(**AUGMENTATIONS["all"], reverse=0.5), 0).batch(0, 8)
+    batch = Pairs([still], 0, augmentation=only(**AUGMENTATIONS["all"], reverse=0.5)).batch(0, 8)
     assert torch.equal(batch.previous, batch.previous_surfaces)
     assert torch.equal(batch.current, batch.current_surfaces)
 
 
 def test_mirrors_turn_the_other_way_round(recording):
-    batch = Pairs([recording], only(mirror=0.5), 0, surfaces=False).batch(0, 40)
+    batch = Pairs([recording], 0, surfaces=False, augmentation=only(mirror=0.5)).batch(0, 40)
     yaw = log(batch.T_prev_curr)[:, 2]
     torch.testing.assert_close(yaw.abs(), yaw[0].abs().expand(40), rtol=0, atol=1e-5)
     assert 10 < int((yaw < 0.0).sum()) < 30
@@ -240,14 +251,14 @@ def test_mirrors_turn_the_other_way_round(recording):
 
 def test_rolls_are_of_whole_columns_and_of_the_size_asked_for(small_room):
     rest = small_room.recording(2, (0.0,) * 6)
-    batch = Pairs([rest], only(roll=0.75, roll_deg=20.0), 0, surfaces=False).batch(0, 300)
+    batch = Pairs([rest], 0, surfaces=False, augmentation=only(roll=0.75, roll_deg=20.0)).batch(0, 300)
     columns = log(batch.T_prev_curr)[:, 2] * (96 / (2.0 * math.pi))
     torch.testing.assert_close(columns, columns.round(), rtol=0, atol=1e-3)
     assert float(columns.std()) == pytest.approx(math.sqrt(0.75) * 20.0 * 96 / 360.0, rel=0.15)
 
 
 def test_scales_are_as_often_up_as_down(recording):
-    batch = Pairs([recording], only(scale=0.3), 0, surfaces=False).batch(0, 200)
+    batch = Pairs([recording], 0, surfaces=False, augmentation=only(scale=0.3)).batch(0, 200)
     scale = batch.T_prev_curr[:, :3, 3].norm(dim=1) / motion()[:3, 3].norm()
     assert scale.max() < 1.3
     assert scale.max() > 1.25
@@ -259,7 +270,7 @@ def test_scales_are_as_often_up_as_down(recording):
 def _with_holes(recording: PreparedRecording) -> PairBatch:
     pair = pair_of(recording, 0, 1)
     holes = torch.rand(1, 1, 16, 96, generator=torch.Generator().manual_seed(0)) < 0.2
-    return pair.with_images(lambda images: images * ~holes, pair.T_prev_curr)
+    return pair.changed(lambda images: images * ~holes, lambda images: images * ~holes, pair.T_prev_curr)
 
 
 @pytest.mark.parametrize("name", WORN)
@@ -280,7 +291,7 @@ def test_worn_scans_gain_nothing_and_surfaces_are_spared(recording, name):
 
 def _worn(recording: PreparedRecording, **options: object) -> Tensor:
     """(B, H, W) the pixels that are left of full images."""
-    batch = Pairs([recording], only(**options), 0, surfaces=False).batch(0, 60)
+    batch = Pairs([recording], 0, surfaces=False, augmentation=only(**options)).batch(0, 60)
     return batch.current[:, :3].square().sum(1) > 0.0
 
 
@@ -322,6 +333,6 @@ def test_noise_is_along_the_rays_and_of_the_size_asked_for(recording):
 
 
 def test_a_batch_moves_between_devices(recording):
-    batch = Pairs([recording], NONE, 0, surfaces=False).batch(0, 2)
+    batch = Pairs([recording], 0, surfaces=False, augmentation=NONE).batch(0, 2)
     assert same(batch.to(torch.device("cpu")), batch)
     assert batch.to(torch.device("meta")).previous.device.type == "meta"

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from odometry.images import projection
 from odometry.images.projection import ImageGrid
-from odometry.training.torch_images import mirror, place, rotate_columns
+from odometry.training.torch_images import mirror, rotate_columns
 
 GRID = ImageGrid(16, 90, math.radians(-15.0), math.radians(15.0))
 
@@ -22,9 +22,16 @@ class Shown(NamedTuple):
     index: Tensor
 
 
-def project(points: Tensor, grid: ImageGrid, rings: Tensor | None = None) -> Shown:
-    found = projection.project(points.numpy(), grid, None if rings is None else rings.numpy())
+def project(points: Tensor, grid: ImageGrid) -> Shown:
+    (found,) = projection.project(points.numpy(), [grid])
     return Shown(torch.from_numpy(found.image)[None], torch.from_numpy(found.index)[None])
+
+
+def place(points: Tensor, grid: ImageGrid = GRID) -> tuple[Tensor, Tensor]:
+    """Continuous row and column of points (N, 3): rows are centred on whole numbers, columns begin at them."""
+    x, y, z = points.double().unbind(-1)
+    row = (torch.atan2(z, torch.hypot(x, y)) - grid.elevation_low) * grid.rows_per_radian
+    return row, torch.atan2(y, x).remainder(2.0 * math.pi) * (grid.columns / (2.0 * math.pi))
 
 
 def polar(azimuth: Tensor, elevation: Tensor, ranges: Tensor) -> Tensor:
@@ -44,7 +51,7 @@ def random_cloud(count: int, seed: int = 0, grid: ImageGrid = GRID) -> Tensor:
     column = torch.randint(grid.columns, (count,), generator=generator) + inside[0]
     row = torch.randint(grid.rows, (count,), generator=generator) + inside[1] - 0.5
     height = math.degrees(grid.elevation_high - grid.elevation_low)
-    elevation = math.degrees(grid.elevation_low) + row * height / max(grid.rows - 1, 1)
+    elevation = math.degrees(grid.elevation_low) + row * height / (grid.rows - 1)
     ranges = 1.0 + 49.0 * torch.rand(count, generator=generator)
     return polar(column * 360.0 / grid.columns, elevation, ranges)
 
@@ -67,13 +74,6 @@ def test_a_point_is_in_the_pixel_of_its_angles() -> None:
     # 2 degrees to a row, 4 to a column
     points = torch.cat([one(2.0, -15.0, 5.0), one(6.0, 15.0, 5.0), one(91.0, -0.1, 5.0), one(-1.0, 0.1, 5.0)])
     assert pixel_of(points) == [(0, 0), (15, 1), (7, 22), (8, 89)]
-
-
-def test_columns_begin_at_whole_coordinates_and_rows_are_centred_on_them() -> None:
-    points = torch.cat([one(0.0, -15.0, 3.0), one(10.0, 15.0, 3.0), one(359.0, -14.0, 3.0)])
-    for row, column in (GRID.place(points.numpy()), place(points, GRID)):
-        np.testing.assert_allclose(row, [0.0, 15.0, 0.5], atol=1e-9)
-        np.testing.assert_allclose(column, [0.0, 2.5, 89.75], atol=1e-9)
 
 
 def test_the_nearest_point_is_kept() -> None:
@@ -128,7 +128,7 @@ def test_a_turn_by_columns_rolls_the_image(shift: int, dtype: torch.dtype) -> No
     before = project(points.to(dtype), GRID)
     after = project(turned(points, shift * 2.0 * math.pi / GRID.columns).to(dtype), GRID)
     assert torch.equal(after.index, before.index.roll(shift, dims=2))
-    torch.testing.assert_close(rotate_columns(before.images, shift), after.images, rtol=1e-5, atol=2e-5)
+    torch.testing.assert_close(rotate_columns(before.images, torch.tensor([shift])), after.images, rtol=1e-5, atol=2e-5)
 
 
 def test_the_image_has_no_seam() -> None:
@@ -145,11 +145,10 @@ def test_columns_are_inside_the_image_however_close_to_the_seam(dtype: torch.dty
     points = torch.stack([torch.ones_like(y), y, torch.zeros_like(y)], dim=1)
     points = torch.cat([points, points * torch.tensor([-1.0, 1.0, 1.0], dtype=dtype)])
     for columns in (1, 7, 90, 720, 1800, 2083):
-        grid = ImageGrid(2, columns, -0.2, 0.2)
-        for _, column in (grid.place(points.numpy()), place(points, grid)):
-            assert column.min() >= 0.0
-            assert column.max() < columns
-            assert int(column[0]) == int(column[1]) == 0
+        for number, point in enumerate(points):
+            ((_, column),) = pixel_of(point[None], ImageGrid(2, columns, -0.2, 0.2))
+            assert 0 <= column < columns
+            assert column == 0 or number >= 2
 
 
 def test_points_above_and_below_are_left_out() -> None:
@@ -163,10 +162,9 @@ def test_invalid_points_are_left_out() -> None:
     bad = torch.tensor([[0.0, 0.0, 0.0], [nan, 1.0, 0.0], [1.0, nan, 0.0], [1.0, 0.0, nan], [inf, 0.0, 0.0]])
     bad = torch.cat([bad, torch.tensor([[1.0, -inf, 0.0], [nan, nan, nan], [3e38, 3e38, 0.0]])])
     assert pixel_of(bad) == []
-    for rings in (None, torch.full((9,), 3)):
-        result = project(torch.cat([bad, torch.tensor([[4.0, 0.1, 0.0]])]), GRID, rings=rings)
-        assert result.index[result.index >= 0].tolist() == [len(bad)]
-        assert result.images.isfinite().all()
+    result = project(torch.cat([bad, torch.tensor([[4.0, 0.1, 0.0]])]), GRID)
+    assert result.index[result.index >= 0].tolist() == [len(bad)]
+    assert result.images.isfinite().all()
 
 
 @pytest.mark.parametrize("point", [[4.0, 0.0, 0.5], [0.0, 4.0, 0.5], [4.0, 1.0, 0.0], [-4.0, 0.0, 0.0]])
@@ -175,31 +173,9 @@ def test_a_point_with_a_coordinate_of_zero_stays(point: list[float]) -> None:
 
 
 def test_no_points_give_empty_images() -> None:
-    for rings in (None, torch.empty(0, dtype=torch.int64)):
-        result = project(torch.empty(0, 3), GRID, rings=rings)
-        assert torch.equal(result.images, torch.zeros(1, 4, 16, 90))
-        assert torch.equal(result.index, torch.full((1, 16, 90), -1))
-
-
-@pytest.mark.parametrize(
-    ("rings", "rows"),
-    [
-        ([0, 5, 15], [0, 5, 15]),
-        ([0, 5, 9], [0, 5, 9]),
-        ([0, 1, 2, 31], [0, 0, 1, 15]),
-        ([0, 3, 4, 62], [0, 0, 1, 15]),  # the last of 64 rings saw nothing
-        ([0, 2, 3, 39], [0, 0, 1, 13]),
-        ([-1, 3], [3]),
-    ],
-)
-def test_rings_are_rows(rings: list[int], rows: list[int]) -> None:
-    # All at one elevation, far above the grid, which must not matter; and each in a column of its own.
-    count = len(rings)
-    points = polar(4.0 * torch.arange(count) + 2.0, torch.full((count,), 60.0), torch.full((count,), 5.0))
-    for dtype in (torch.int64, torch.int32):
-        result = project(points, GRID, rings=torch.tensor(rings, dtype=dtype))
-        filled = (result.index[0] >= 0).T.nonzero()
-        assert filled[:, 1].tolist() == rows
+    result = project(torch.empty(0, 3), GRID)
+    assert torch.equal(result.images, torch.zeros(1, 4, 16, 90))
+    assert torch.equal(result.index, torch.full((1, 16, 90), -1))
 
 
 def test_a_grid_around_a_scan_puts_its_rings_in_rows() -> None:
@@ -210,7 +186,7 @@ def test_a_grid_around_a_scan_puts_its_rings_in_rows() -> None:
     grid = ImageGrid.around(torch.cat([points, strays]).numpy(), 16, 90)
     assert math.degrees(grid.elevation_low) == pytest.approx(-15.0, abs=1e-9)
     assert math.degrees(grid.elevation_high) == pytest.approx(15.0, abs=1e-9)
-    row, _ = grid.place(points.numpy())
+    row, _ = place(points, grid)
     np.testing.assert_allclose(row, rings, atol=1e-9)
 
 
@@ -224,12 +200,6 @@ def test_a_grid_around_few_points_holds_them(count: int) -> None:
     result = project(points, grid)
     assert (result.index[0, 0] >= 0).sum() == min(count, 50)
     assert (result.index[0, 1:] == -1).all()
-
-
-def test_a_single_row_covers_all_elevations_of_its_grid() -> None:
-    grid = ImageGrid(1, 90, math.radians(-10.0), math.radians(10.0))
-    points = polar(torch.full((4,), 2.0), torch.tensor([-9.9, 9.9, 10.1, -10.1]), torch.full((4,), 5.0))
-    assert pixel_of(points, grid) == [(0, 0), (0, 0)]
 
 
 def test_grids_without_pixels_or_height_are_refused() -> None:
@@ -252,7 +222,7 @@ def test_each_image_is_rotated_by_its_own_shift() -> None:
 
 def test_rotation_takes_images_of_normals_too() -> None:
     normals = torch.randn(2, 3, 4, 12, generator=torch.Generator().manual_seed(0))
-    quarter = rotate_columns(normals, 3)
+    quarter = rotate_columns(normals, torch.tensor([3, 3]))
     moved = normals.roll(3, dims=3)
     expected = torch.stack([-moved[:, 1], moved[:, 0], moved[:, 2]], dim=1)
     torch.testing.assert_close(quarter, expected, rtol=0.0, atol=1e-6)
@@ -269,11 +239,7 @@ def test_mirrored_images_are_of_mirrored_clouds() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_two_images_made_in_one_go_are_those_made_one_by_one(dtype: torch.dtype) -> None:
     points, fine = random_cloud(5000).to(dtype).numpy(), ImageGrid(40, 90, GRID.elevation_low, GRID.elevation_high)
-    times = np.linspace(0.0, 0.1, 5000)
-    both = projection.project_sweep(points, times, 0.05, (GRID, fine))
-    for found, grid in zip(both, (GRID, fine), strict=True):
-        alone = projection.project(points, grid)
+    for found, grid in zip(projection.project(points, [GRID, fine]), (GRID, fine), strict=True):
+        (alone,) = projection.project(points, [grid])
         assert np.array_equal(found.index, alone.index)
         assert np.array_equal(found.image, alone.image)
-        expected = np.where(found.index >= 0, times[found.index] - 0.05, 0.0)
-        np.testing.assert_allclose(found.offsets, expected, atol=1e-8)

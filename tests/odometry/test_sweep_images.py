@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.scan import Scan
-from odometry.images.image_config import ImageConfig
-from odometry.images.sweep_images import Imager, middle_offset_s
-from odometry.images.sweeps import SweepImages
+from odometry.config import ImageConfig
+from odometry.images.sweep_images import Imager, SweepImages, middle_offset_s
 
 CONFIG = ImageConfig(rows=16, columns=360)
 TWIST = (0.0, 0.0, 0.5, 1.0, 0.0, 0.0)
@@ -105,8 +104,8 @@ def test_an_imager_begins_anew(box_room):
     assert np.rad2deg(narrow.high) == pytest.approx(math.degrees(math.atan(0.1)), abs=1e-4)
 
 
-def rows_for(scan: Scan, asked: int | None = None) -> int:
-    return Imager(CONFIG, asked).images(scan).alignment.points.shape[1]
+def rows_for(scan: Scan) -> int:
+    return Imager(CONFIG).images(scan).alignment.points.shape[1]
 
 
 @pytest.mark.parametrize("with_rings", [True, False])
@@ -126,14 +125,11 @@ def test_points_that_lie_in_no_rows_are_shown_to_alignment_as_to_the_network(azi
     assert images.alignment is images.network
 
 
-def test_the_rows_of_alignment_may_be_asked_for(box_room):
-    (scan,) = box_room.scans(1, TWIST)
-    assert [rows_for(scan, asked) for asked in (8, 16, 40)] == [8, 16, 40]
-
-
-def test_more_rows_for_alignment_leave_the_images_of_the_network_as_they_are(box_room):
+def test_more_rows_for_alignment_leave_the_images_of_the_network_as_they_are(box_room, monkeypatch):
     (scan,) = replace(box_room, rows=64, columns=720).scans(1, TWIST)
-    both, alone = Imager(CONFIG).images(scan), Imager(CONFIG, CONFIG.rows).images(scan)
+    both = Imager(CONFIG).images(scan)
+    monkeypatch.setattr("odometry.images.sweep_images.rows_of_sensor", lambda *_: CONFIG.rows)
+    alone = Imager(CONFIG).images(scan)
     assert both.alignment.points.shape == (3, 64, 360)
     for name in ("points", "normals", "offsets"):
         assert np.array_equal(getattr(both.network, name), getattr(alone.network, name))
@@ -148,25 +144,3 @@ def test_the_rows_are_remembered(box_room, through_disk):
     one, other = first.images(few).alignment, second.images(few).alignment
     assert np.array_equal(one.points, other.points)
     assert one.points.shape[1] == 64
-
-
-def _two_rings():
-    """Ring 12 lies lower than ring 3, as no elevation would have it."""
-    return Scan(np.array([[5.0, 0.1, 0.0], [5.0, 0.1, 0.5]]), 0.0, None, np.array([12, 3], dtype=np.int32))
-
-
-def test_rows_are_rings_where_asked_for():
-    images = images_of(_two_rings(), Imager(ImageConfig(columns=360, order="ring")))
-    rows, _ = images.points.any(axis=0).nonzero()
-    assert rows.tolist() == [3, 12]
-    assert images.points[2, 3].max() == 0.5
-    by_elevation = images_of(_two_rings(), Imager(ImageConfig(columns=360)))
-    rows, _ = by_elevation.points.any(axis=0).nonzero()
-    assert rows.tolist() == [0, 15]
-
-
-def test_rings_that_are_not_there_leave_elevations():
-    scan = _two_rings()
-    images = images_of(Scan(scan.points, 0.0), Imager(ImageConfig(columns=360, order="ring")))
-    rows, _ = images.points.any(axis=0).nonzero()
-    assert rows.tolist() == [0, 15]

@@ -1,66 +1,163 @@
-"""A figure: panels, a legend that names the methods, and a caption."""
+"""A figure: panels drawn by plotly, a legend, and a caption; a method has one colour and dash in all of them."""
 
+import html
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from evaluation.report.figures.palette import Style, swatch
-from evaluation.report.markup import Markup, element, escape, join
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import ArrayLike, NDArray
+from plotly.io.json import to_json_plotly
+
+from evaluation.report.plain_text import printable
+from lidarslam.core.geometry import FloatArray
+
+# After Okabe and Ito (blue, vermilion, green, purple), then four more; contrast of 3 or more on white and on dark.
+_COLOURS = ("#1a80c4", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#3a9bd1", "#aa3377", "#7f7f7f")
+# Eight colours and five dashes are 40 combinations.
+_DASHES = {"solid": "", "dash": "7 3", "dot": "2 2", "dashdot": "9 3 2 3", "longdash": "13 4"}
+_SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x")
+_LONGEST_NAME = 40
+MOST_POINTS = 1000
+
+EQUAL_AXES: Mapping[str, Any] = {
+    "xaxis": {"automargin": False},
+    "yaxis": {"automargin": False, "scaleanchor": "x"},
+    "margin": {"l": 52, "r": 8, "t": 6, "b": 40},
+}
+"""Layout of axes with one scale, whose margins plotly cannot find by itself."""
 
 
 @dataclass(frozen=True)
-class Figure:
-    """What stands under one number.
+class Style:
+    """Line style of a method.
 
     Attributes:
-        title: a few words, the caption's beginning.
+        order: of the method in the report, from 0.
+    """
+
+    order: int
+
+    @property
+    def key(self) -> str:
+        """Identifies the method's traces in all figures."""
+        return f"m{self.order}"
+
+    @property
+    def colour(self) -> str:
+        """As #rrggbb."""
+        return _COLOURS[self.order % len(_COLOURS)]
+
+    @property
+    def dash(self) -> str:
+        """SVG's stroke-dasharray; empty for a solid line."""
+        return list(_DASHES.values())[self.order % len(_DASHES)]
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """The line in plotly's terms."""
+        return {"color": self.colour, "dash": list(_DASHES)[self.order % len(_DASHES)], "width": 1.8}
+
+    @property
+    def marker(self) -> dict[str, Any]:
+        """The marker in plotly's terms."""
+        return {"color": self.colour, "symbol": _SYMBOLS[self.order % len(_SYMBOLS)], "size": 7}
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One plot.
+
+    Attributes:
+        title: quantity and unit.
+        traces: plotly's.
+        layout: what differs from the page's.
+        height: in pixels; the width is the page's.
+        log: whether the vertical axis starts logarithmic; None where it cannot be.
+    """
+
+    title: str
+    traces: Sequence[Any]
+    layout: Mapping[str, Any]
+    height: int
+    log: bool | None = None
+
+    @property
+    def json(self) -> str:
+        """Data and layout; safe in a script element, as <, > and / are written as escapes."""
+        layout = {**self.layout, "template": "none"}
+        if self.log:
+            layout["yaxis"] = {**layout.get("yaxis", {}), "type": "log"}
+        return str(to_json_plotly(go.Figure(list(self.traces), layout)))
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """Panels under one number.
+
+    Attributes:
+        title: a few words, the beginning of the caption.
         caption: what is shown, in which units and frames.
-        panels: SVG elements.
-        legend: entries above the panels.
-        columns: how many panels stand beside one another on a wide page.
+        panels: of the same methods.
+        methods: entries of the legend.
+        reference: name of the reference in the legend; empty where it is not drawn.
+        columns: number of panels beside one another on a wide page.
     """
 
     title: str
     caption: str
-    panels: Sequence[Markup]
-    legend: Sequence[Markup] = ()
+    panels: Sequence[Panel]
+    methods: Sequence[str] = ()
+    reference: str = ""
     columns: int = 2
 
 
-def figure_html(figure: Figure, number: int) -> Markup:
-    """The figure as an element of a page."""
-    entries = [element("li", entry) for entry in figure.legend]
-    panels = element("div", *figure.panels, class_=f"panels panels-{figure.columns}")
-    caption = element(
-        "figcaption", element("b", escape(f"Figure {number}. {figure.title}.")), Markup(" "), escape(figure.caption)
-    )
-    legend = [element("ul", *entries, class_="legend")] if entries else []
-    return element("figure", *legend, panels, caption, id=f"figure-{number}")
+Styles = Mapping[str, Style]
 
 
-def method_keys(names: Iterable[str], styles: Mapping[str, Style]) -> list[Markup]:
-    """Legend entries of methods."""
-    return [join([swatch(styles[name]), element("span", escape(name), class_="name")]) for name in names]
+def method_styles(names: Iterable[str]) -> dict[str, Style]:
+    """A style for each name, in order of first appearance."""
+    return {name: Style(order) for order, name in enumerate(dict.fromkeys(names))}
 
 
-def reference_key(name: str) -> Markup:
-    """Legend entry of the reference, a broad grey line."""
-    line = element("path", d="M1,6H33", class_="reference", stroke="#b4b4b4", stroke_width=4.5)
-    return join([_key_picture(line), escape(name)])
+def plot_text(text: str) -> str:
+    """The text as plotly shows it unchanged, which else interprets some tags; shortened."""
+    text = printable(text)
+    return html.escape(text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 1]}…", quote=False)
 
 
-def lost_key() -> Markup:
-    """Legend entry of stretches where tracking was lost."""
-    halo = element(
-        "path", d="M4,6H30", class_="lost-halo axis", stroke="#5c5c5c", stroke_width=7.0, stroke_opacity=0.35
-    )
-    return join([_key_picture(join([halo, lost_cross(17, 6)])), escape("tracking lost")])
+def line_trace(name: str, style: Style, x: ArrayLike, y: ArrayLike, **more: Any) -> Any:
+    """A method's curve, or markers; NaN interrupts it."""
+    given = {"mode": "lines", "line": style.line, "legendgroup": style.key, **more}
+    y = y if isinstance(y, list) else np.asarray(y, np.float32)
+    return go.Scatter(x=np.asarray(x, np.float32), y=y, name=plot_text(name), **given)
 
 
-def lost_cross(x: float, y: float) -> Markup:
-    """The sign for the beginning of a lost stretch."""
-    d = f"M{x - 3.5:.1f},{y - 3.5:.1f}l7,7m0,-7l-7,7"
-    return element("path", d=d, class_="lost-cross", stroke="#111111", stroke_width=1.8, fill="none")
+def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles, **more: Any) -> Panel:
+    """A horizontal bar a method; further arguments, of the same methods in order, are those of the bars."""
+    bars = [
+        go.Bar(
+            x=[value],
+            y=[plot_text(name)],
+            orientation="h",
+            name=plot_text(name),
+            legendgroup=styles[name].key,
+            marker={"color": styles[name].colour},
+            hovertemplate=f"%{{x:.4g}} {unit}",
+            **{key: of[name] for key, of in more.items()},
+        )
+        for name, value in values.items()
+    ]
+    axes = {"xaxis": {"title": {"text": f"[{unit}]" if unit else ""}}, "yaxis": {"autorange": "reversed"}}
+    return Panel(title, bars, {**axes, "hovermode": "closest", "barmode": "overlay"}, 70 + 30 * len(bars))
 
 
-def _key_picture(content: Markup) -> Markup:
-    return element("svg", content, class_="swatch", width="34", height="12", viewBox="0 0 34 12", aria_hidden="true")
+def thin_curve(y: FloatArray, most: int = MOST_POINTS) -> NDArray[np.intp]:
+    """At most `most` rows of a curve (N,): the lowest and the highest of each of equal pieces, so that peaks stay."""
+    if len(y) <= most:
+        return np.arange(len(y))
+    piece = np.arange(len(y)) * (most // 2 - 1) // len(y)
+    order = np.lexsort((y, piece))
+    ends = np.flatnonzero(np.diff(piece[order])) + 1
+    return np.unique(np.r_[0, len(y) - 1, order[np.r_[0, ends]], order[np.r_[ends - 1, len(y) - 1]]])

@@ -1,0 +1,5 @@
+"""`python -m lidarslam`."""
+
+from lidarslam.cli import entry_point
+
+entry_point()

@@ -1,0 +1,104 @@
+"""Files that are whole or absent, directories with one writer."""
+
+import contextlib
+import errno
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from lidarslam.core.errors import OutputError
+
+_PARTIAL = ".partial-"
+_LOCKED = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+
+
+@contextlib.contextmanager
+def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
+    """Write a file atomically: a temporary path beside it, renamed to it when the block ends without an error.
+
+    Args:
+        path: the file; an earlier one stays until then.
+        durable: flush content and name to the disk, so that a power failure leaves the earlier file or the new one.
+
+    Raises:
+        OutputError: the path is a folder or a device, or the temporary file cannot take its name.
+    """
+    if path.exists() and not path.is_file():  # a device would be replaced by a file of its name
+        raise OutputError(f"{path}: is {'a folder' if path.is_dir() else 'no ordinary file'}; name another file")
+    partial = path.with_name(f"{_PARTIAL}{os.getpid()}-{path.name}")
+    partial.unlink(missing_ok=True)  # a link there is not followed
+    try:
+        yield partial
+        try:
+            if durable:
+                _sync(partial)
+            partial.replace(path)
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        if durable:
+            with contextlib.suppress(OSError):  # not every file system syncs directories
+                _sync(path.parent)
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def remove_partial_files(directory: Path) -> None:
+    """Remove what `replacing` left in a directory when the process was killed."""
+    for partial in directory.glob(f"{_PARTIAL}*"):
+        if not partial.is_dir():
+            partial.unlink(missing_ok=True)
+
+
+def make_directory(path: Path) -> None:
+    """Make a directory with its parents, unless it exists, and check that files can be written to it.
+
+    Raises:
+        OutputError: they cannot.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path, prefix=_PARTIAL):
+            pass
+    except (FileExistsError, NotADirectoryError) as error:
+        raise OutputError(f"{path}: a file is in the way; name another directory") from error
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+@contextlib.contextmanager
+def only_writer(directory: Path) -> Iterator[None]:
+    """Hold an advisory lock on an existing directory; it ends with the process, however that ends.
+
+    Where the file system has no locks, nothing is locked.
+
+    Raises:
+        OutputError: another process holds it.
+    """
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in _LOCKED:
+                raise OutputError(
+                    f"{directory}: another lidarslam is writing there; wait until it is done, or name another directory"
+                ) from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def cannot_write(path: Path, error: Exception, remedy: str = "") -> OutputError:
+    """The error for the user when a file cannot be written."""
+    return OutputError(f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}){remedy}")
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

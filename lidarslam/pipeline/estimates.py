@@ -1,0 +1,126 @@
+"""A scan on its way through the pipeline: with its odometry, with its pose, done."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from mapping.deskew import body_velocity, deskew
+from mapping.pose_graph.graph_scan import GraphScan
+from odometry.interface import Motion
+
+STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """A scan with its odometry.
+
+    Attributes:
+        scan: as read.
+        motion: the estimated motion since the previous scan.
+        interval_s: time between the two stamps; None when no motion was measured.
+        stage_ms: wall time of reading and odometry.
+    """
+
+    scan: Scan
+    motion: Motion
+    interval_s: float | None
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def velocity(self) -> FloatArray | None:
+        """(6,) body velocity since the previous stamp, rotation first; None when no motion was measured."""
+        return None if self.interval_s is None else body_velocity(self.motion.T_prev_curr, self.interval_s)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepMotion:
+    """Body velocities (6,) before and after the stamp of a scan, rotation first; None where unknown."""
+
+    before: FloatArray | None
+    after: FloatArray | None
+
+    def compensate(self, scan: Scan) -> FloatArray:
+        """Deskew: the scan's points (N, 3) in the LiDAR frame at its stamp.
+
+        Most recordings stamp a sweep at its start, so that most of it moves with the velocity after the stamp.
+        """
+        known = [velocity for velocity in (self.before, self.after) if velocity is not None]
+        if scan.time_offsets is None or not known:
+            return scan.points
+        return deskew(scan.points, scan.time_offsets, known[0], known[-1])
+
+    def mean(self, scan: Scan) -> FloatArray | None:
+        """One velocity (6,) for the sweep: both, weighted by how much of it lies before and after the stamp."""
+        if self.before is None or self.after is None or scan.time_offsets is None or not len(scan):
+            return self.before if self.after is None else self.after
+        begin, end = float(scan.time_offsets.min()), float(scan.time_offsets.max())
+        share_after = 1.0 if end <= begin else np.clip(end / (end - begin), 0.0, 1.0)
+        return np.asarray(share_after * self.after + (1.0 - share_after) * self.before, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Localised:
+    """The pose of a scan.
+
+    Attributes:
+        T_world_lidar: (4, 4) at the stamp; the world is the LiDAR frame of the first scan.
+        T_odom_lidar: (4, 4), the odometry alone; where it measured nothing, the predicted motion.
+        covariance: (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none.
+        motion: of the sensor during the sweep.
+        status, message: the tracking status, and its reason unless it is ok.
+        belongs_in_map: whether the pose is accurate enough to add the scan to the map.
+        points_used: number of correspondences that the pose was estimated from.
+        residual_m, inlier_ratio: of the fit to the map or the previous scan; None when it could not be computed.
+        degenerate: axes along which the scan does not constrain the motion.
+        stage_ms: wall time of the stages, see `STAGES`.
+        is_connected: whether the pose follows from that of the previous scan; not when lost or relocalised.
+    """
+
+    T_world_lidar: FloatArray
+    T_odom_lidar: FloatArray
+    covariance: FloatArray | None
+    motion: SweepMotion
+    status: Status
+    message: str
+    belongs_in_map: bool
+    points_used: int
+    residual_m: float | None
+    inlier_ratio: float | None
+    degenerate: tuple[str, ...]
+    stage_ms: dict[str, float]
+    is_connected: bool = True
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanResult(Localised):
+    """A scan that is done: its pose, and beside `Localised`:
+
+    Attributes:
+        stamp: seconds.
+        points: (N, 3) in the LiDAR frame at the stamp, deskewed, within the map's range, one a voxel.
+        points_read, points_dropped: valid points of the raw scan, and invalid ones that were left out.
+    """
+
+    stamp: float
+    points: FloatArray
+    points_read: int
+    points_dropped: int
+
+
+def graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -> GraphScan:
+    """A scan as the pose graph takes it, with its deskewed points (N, 3) in the LiDAR frame."""
+    is_lost = localised.status is Status.LOST
+    measured = estimated.interval_s is not None and (localised.is_connected or is_lost)
+    return GraphScan(
+        T_world_lidar=localised.T_world_lidar,
+        points=points,
+        covariance=localised.covariance,
+        T_prev_curr=estimated.motion.T_prev_curr if measured else None,
+        motion_covariance=estimated.motion.covariance if measured else None,
+        lost=is_lost or not localised.is_connected,
+        belongs_in_map=localised.belongs_in_map,
+    )

@@ -1,0 +1,95 @@
+"""Building the global map: each scan is added one scan late, once the motion it was deskewed with is confirmed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from lidarslam.core.state import Stateful
+from lidarslam.core.thinning import one_per_cell
+from lidarslam.pipeline.estimates import Localised, SweepMotion
+from mapping.config import GlobalMapConfig
+from mapping.global_map.global_map import GlobalMap, voxel_size_for
+from mapping.global_map.moved_points import Views
+from mapping.slides.slides import SlideCheck
+
+
+@dataclass(frozen=True, eq=False)
+class PendingScan:
+    """A scan on its way into the global map.
+
+    Attributes:
+        number: its index in the run, from 0.
+        thinned: its points within the map's range, one a voxel, as read.
+        motion: the motion it was deskewed with.
+        points: (N, 3) of those, deskewed, in the LiDAR frame at the stamp.
+        T_world_lidar: (4, 4).
+    """
+
+    number: int
+    thinned: Scan
+    motion: SweepMotion
+    points: FloatArray
+    T_world_lidar: FloatArray
+
+
+class MapBuilder(Stateful):
+    """Adds scans to the global map, and keeps what later tells moving objects and slips of registration.
+
+    Attributes:
+        voxel_size_m: of the map; derived from the first scan with points unless it is configured, None until then.
+        global_map: None until a scan was added.
+        views: range images of some scans, for the removal of moving objects.
+        slides: pairs of scans, for the detection of slips.
+    """
+
+    voxel_size_m: float | None
+    global_map: GlobalMap | None
+    views: Views
+    slides: SlideCheck
+    _pending: PendingScan | None
+    _scans: int
+
+    def __init__(self, config: GlobalMapConfig) -> None:
+        self._config = config
+        self._pending = None
+        self._scans = 0
+        self.voxel_size_m = config.voxel_size_m
+        self.global_map = None
+        self.views = Views()
+        self.slides = SlideCheck()
+
+    def thin(self, scan: Scan) -> Scan:
+        """The points within the map's range, one a voxel of the map: more would not change it."""
+        if not len(scan):
+            return scan
+        if self.voxel_size_m is None:
+            self.voxel_size_m = voxel_size_for(scan.points)
+        thinned = scan.select(one_per_cell(scan.points, self.voxel_size_m))
+        squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
+        return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
+
+    def add(self, thinned: Scan, points: FloatArray, localised: Localised) -> None:
+        """Take the next scan; it enters the map with `add_pending`, if its pose is good enough."""
+        if localised.belongs_in_map:
+            self._pending = PendingScan(self._scans, thinned, localised.motion, points, localised.T_world_lidar)
+        self._scans += 1
+
+    def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray] | None:
+        """Add the scan before; its points (N, 3) and pose as they were added, None where there is none.
+
+        Where tracking was lost right after it, the motion after its stamp is unknown: it is deskewed again with the
+        motion before.
+        """
+        scan, self._pending = self._pending, None
+        if scan is None or self.voxel_size_m is None:  # no scan had a point so far
+            return None
+        points = SweepMotion(scan.motion.before, None).compensate(scan.thinned) if next_is_lost else scan.points
+        if self.global_map is None:
+            self.global_map = GlobalMap(self.voxel_size_m)
+        self.global_map.add(points, scan.T_world_lidar)
+        self.slides.add(points, scan.number, scan.T_world_lidar)
+        if self._config.leave_out_moved:
+            self.views.add(points, scan.number)
+        return points, scan.T_world_lidar

@@ -1,0 +1,45 @@
+"""The configuration of a training, composed of the libraries' own; light, so that reading it imports no torch."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from lidarslam.config.settings import dump_yaml, load_model
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.train.directory import SOURCES_SECTION
+from odometry.training.config import SimulatedConfig, TrainingConfig
+
+# What `--losses` stands for, as settings.
+LOSSES = {
+    "both": ("training.geometric={}", "training.alignment_weight=0"),
+    "point-to-plane": ("training.geometric={plane_to_plane: false}", "training.alignment_weight=0"),
+    "plane-to-plane": ("training.geometric={point_to_plane: false}", "training.alignment_weight=0"),
+    "paper": ("training.geometric={robust: false}", "training.alignment_weight=0"),
+    "alignment": ("training.geometric=null", "training.alignment_weight=1"),
+}
+
+
+class TrainConfig(BaseModel):
+    """Everything that decides what a training computes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    training: TrainingConfig = TrainingConfig()
+    reader: ReaderConfig = ReaderConfig()
+    simulated: SimulatedConfig = SimulatedConfig()
+
+
+def load_train_config(path: Path | None = None, settings: Sequence[str] = ()) -> TrainConfig:
+    """The defaults, changed by a YAML file and then by settings such as `training.batch=8`.
+
+    Raises:
+        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    """
+    return load_model(TrainConfig, path, settings, "training.batch=8")
+
+
+def dump_train_yaml(config: TrainConfig, trained_on: dict[str, Any]) -> str:
+    """The configuration as YAML, after the section that names the recordings."""
+    return dump_yaml(config, trained_on, SOURCES_SECTION)

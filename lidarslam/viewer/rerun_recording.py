@@ -1,0 +1,156 @@
+"""Rerun recordings: to a file, a window or a browser; the colours and sizes they share.
+
+Rerun 0.41 waits without end for a file on a full disk. Its file writer is therefore given a pipe, and the file is
+written here; on failure it is emptied, which frees its space, and the rest of the pipe is discarded.
+"""
+
+import contextlib
+import logging
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import OutputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plain_text import one_line
+from lidarslam.core.tracking import Status
+from lidarslam.viewer import rerun_environment
+from lidarslam.viewer.picture import height_colours
+
+_log = logging.getLogger(__name__)
+
+# How a complete .rrd file of this version ends, before the four bytes of its flags.
+_FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
+# Timeouts against a writer that died; there is hardly anything left to write by then.
+FLUSH_S, _DISCONNECT_S, _PIPE_S = 20.0, 10.0, 60.0
+# Where an open file of this process has a path, and how much is written at a time.
+_OPEN_FILES = Path("/dev/fd")
+_PIECE = 1 << 20
+
+# Okabe and Ito's palette, distinguishable under every common colour blindness.
+STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
+REFERENCE_COLOUR = (0, 158, 115)
+_LOOP_COLOUR = (204, 121, 167)
+# Negative radii are in points on the screen, whatever the zoom.
+PATH_RADIUS, SCAN_RADIUS, MAP_RADIUS = -3.0, -1.5, -1.0
+
+
+class IncompleteRecordingError(OutputError):
+    """A Rerun recording was not written to its end."""
+
+
+@contextlib.contextmanager
+def rerun_recording(
+    path: Path | None, sinks: Sequence[rr.GrpcSink | rr.GrpcServerSink] = (), blueprint: rrb.Blueprint | None = None
+) -> Iterator[rr.RecordingStream]:
+    """A recording that goes to a file, to other sinks or both; it is written when the block ends.
+
+    Raises:
+        IncompleteRecordingError: it was not written to its end.
+        OutputError: it cannot be begun.
+        OSError: the file cannot be made.
+    """
+    recording = rr.RecordingStream("lidarslam")
+    file = None if path is None else _PipedFile(path)
+    try:
+        files = [] if file is None else [rr.FileSink(file.entrance)]
+        try:
+            recording.set_sinks(*files, *sinks, default_blueprint=blueprint)
+        except RuntimeError as error:
+            raise OutputError(f"the Rerun recording cannot be begun ({one_line(str(error))})") from error
+        finally:
+            if file is not None:
+                file.close_entrance()
+        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        yield recording
+        try:
+            recording.flush(timeout_sec=FLUSH_S)
+        except RuntimeError as error:  # a window that went away; whether the file is complete is checked below
+            _log.info("Rerun: %s", one_line(str(error)))
+            rerun_environment.abandoned = True
+    finally:
+        _disconnect(recording, file)
+    if path is not None:
+        require_complete(path)
+
+
+def require_complete(path: Path) -> None:
+    """Check that a recording was written to its end.
+
+    Raises:
+        IncompleteRecordingError: it was not.
+    """
+    footer = b""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        file.seek(-len(_FOOTER) - _FLAG_BYTES, os.SEEK_END)
+        footer = file.read(len(_FOOTER))
+    if footer != _FOOTER:
+        raise IncompleteRecordingError("the Rerun recording was not written to its end; is the disk full?")
+
+
+def log_map(recording: rr.RecordingStream, entity: str | list[object], points: FloatArray, count: int) -> None:
+    """A cloud (N, 3) coloured by height, thinned to this many points; static where the entity is a list."""
+    points = every_nth(points, count)
+    cloud = rr.Points3D(points, colors=height_colours(points), radii=MAP_RADIUS)
+    recording.log(entity, cloud, static=isinstance(entity, list))
+
+
+def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3D:
+    """A line between the scans of each of the loops (L, 2)."""
+    return rr.LineStrips3D(list(positions[loops]), colors=[_LOOP_COLOUR], radii=PATH_RADIUS)
+
+
+def every_nth(points: FloatArray, count: int) -> FloatArray:
+    """So many points (N, 3) at most."""
+    return points[:: max(1, -(-len(points) // count))]
+
+
+def _disconnect(recording: rr.RecordingStream, file: "_PipedFile | None") -> None:
+    """Close the sinks; one that does not close in time is abandoned."""
+    thread = threading.Thread(target=recording.disconnect, name="disconnect", daemon=True)
+    thread.start()
+    thread.join(_DISCONNECT_S)
+    if thread.is_alive() or not (file is None or file.finish()):
+        rerun_environment.abandoned = True
+
+
+class _PipedFile:
+    """A file that is written through a pipe, whose other end never fails; empty where it could not be written."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb", buffering=0)
+        self._outlet, self._inlet = os.pipe()
+        self.entrance = _OPEN_FILES / str(self._inlet)
+        self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
+        self._thread.start()
+
+    def close_entrance(self) -> None:
+        """The other writer has opened the entrance by now; when it closes it, the file ends."""
+        os.close(self._inlet)
+
+    def finish(self) -> bool:
+        """Wait until all is written; whether it came to that."""
+        self._thread.join(_PIPE_S)
+        return not self._thread.is_alive()
+
+    def _write(self) -> None:
+        failed = False
+        try:
+            with self._file as file:
+                while piece := os.read(self._outlet, _PIECE):
+                    try:
+                        left = memoryview(b"" if failed else piece)
+                        while left:  # a disk that fills up first writes a part
+                            left = left[os.write(file.fileno(), left) :]
+                    except OSError:
+                        failed = True
+                        with contextlib.suppress(OSError):  # a failing disk, or no file on one
+                            file.truncate(0)
+        finally:
+            os.close(self._outlet)

@@ -1,1 +1,0 @@
-"""LOAM features."""

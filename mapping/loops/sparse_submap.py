@@ -1,0 +1,137 @@
+"""A keyframe's submap as loop detection keeps it: a few thousand points with normals, and a range image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lidarslam.core.geometry import FloatArray, skew
+from lidarslam.core.thinning import one_per_cell
+
+PLANE, LINE = 1, 2
+# Nearer points are mostly the carrier itself.
+_MIN_RANGE_M = 0.5
+_MAX_POINTS = 2500
+# The cell, the unit of most gates, is this part of the median range, within bounds.
+_CELLS_PER_RANGE = 30.0
+_CELL_BOUNDS_M = (0.08, 0.5)
+_NEIGHBOURS = 10
+# Ratios of eigenvalues: thinner than this share of its width is a plane, narrower than this of its length a line.
+_THIN = 0.08
+_NARROW = 0.06
+_POLE = 0.7
+# Pixels of the range image: 3 degrees of azimuth and elevation.
+_PIXELS = (120, 60)
+# From the sensor's axis, "up" may be so far.
+_LARGEST_TILT = np.cos(np.deg2rad(45.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SparseSubmap:
+    """What is kept of a keyframe's submap, about 55 kB, all in its LiDAR frame.
+
+    Attributes:
+        points: (N, 3) float32, thinned.
+        axes: (N, 3) float16, of planes the normals, towards the sensor, of lines the directions.
+        tilt: (N,) float16, standard deviation of the axes, radians.
+        kinds: (N,) uint8, `PLANE`, `LINE` or 0 for neither.
+        range_image: (azimuth, elevation) float16, the nearest range seen in each direction; 0 where nothing was.
+        range_m: the median range.
+        cell_m: the size of detail that suits it.
+        R_level_lidar: (3, 3) that stands the sensor upright: "up", or if it hangs upside down "down", becomes z.
+    """
+
+    points: NDArray[np.float32]
+    axes: NDArray[np.float16]
+    tilt: NDArray[np.float16]
+    kinds: NDArray[np.uint8]
+    range_image: NDArray[np.float16]
+    range_m: float
+    cell_m: float
+    R_level_lidar: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def of(cls, points: FloatArray, max_range_m: float) -> "SparseSubmap":
+        """Thin a submap (N, 3), and estimate what its points lie on."""
+        ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
+        kept = (ranges >= _MIN_RANGE_M) & (ranges <= max_range_m)
+        points, ranges = points[kept], ranges[kept]
+        range_m = float(np.median(ranges)) if len(ranges) else 1.0
+        cell_m = float(np.clip(range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
+        fine = points[one_per_cell(points, 0.5 * cell_m)]
+        chosen = one_per_cell(fine, 2.0 * cell_m)
+        if len(chosen) > _MAX_POINTS:
+            chosen = chosen[np.linspace(0, len(chosen) - 1, _MAX_POINTS).astype(np.intp)]
+        kinds, axes, tilt = _shapes(fine, fine[chosen])
+        image = np.full(_PIXELS[0] * _PIXELS[1], np.inf)
+        np.minimum.at(image, _pixels(points, ranges), ranges)
+        image[np.isinf(image)] = 0.0
+        return cls(
+            fine[chosen].astype(np.float32), axes.astype(np.float16), tilt.astype(np.float16), kinds,
+            image.astype(np.float16).reshape(_PIXELS), range_m, cell_m, _level_rotation(axes[kinds == PLANE]),
+        )  # fmt: skip
+
+    def nearest_ranges(self, points: FloatArray) -> FloatArray:
+        """(N,) the nearest range that the keyframe saw in the directions of points (N, 3); 0 where nothing was."""
+        flat = self.range_image.ravel()
+        return flat[_pixels(points, np.linalg.norm(points, axis=1))].astype(np.float64)
+
+
+def _pixels(points: FloatArray, ranges: FloatArray) -> NDArray[np.intp]:
+    """(N,) flat indices into a range image."""
+    azimuth = (np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5) * _PIXELS[0]
+    sine = np.clip(points[:, 2] / np.maximum(ranges, 1e-9), -1.0, 1.0)
+    elevation = (np.arcsin(sine) / np.pi + 0.5) * _PIXELS[1]
+    rows = np.minimum(azimuth.astype(np.intp), _PIXELS[0] - 1)
+    return rows * _PIXELS[1] + np.minimum(elevation.astype(np.intp), _PIXELS[1] - 1)
+
+
+def principal_components(
+    cloud: FloatArray, tree: cKDTree, points: FloatArray, neighbours: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Centroids (N, 3), eigenvalues (N, 3) ascending and eigenvectors (N, 3, 3) of the cloud around points (N, 3)."""
+    _, nearest = tree.query(points, k=neighbours, workers=1)
+    around = cloud[nearest]
+    centroids = around.mean(axis=1)
+    around -= centroids[:, None]
+    spread, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return centroids, spread, directions
+
+
+def _shapes(cloud: FloatArray, points: FloatArray) -> tuple[NDArray[np.uint8], FloatArray, FloatArray]:
+    """Kinds (N,), axes (N, 3) and their deviations (N,) of the cloud around each point."""
+    if len(cloud) < _NEIGHBOURS:
+        return np.zeros(len(points), dtype=np.uint8), np.zeros((len(points), 3)), np.ones(len(points))
+    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)
+    _, spread, directions = principal_components(cloud, tree, points, _NEIGHBOURS)
+    spread = np.maximum(spread, 1e-12)
+    narrow = spread[:, 1] < _NARROW * spread[:, 2]
+    # A single ring of the sensor on a wall is as narrow as a pole, but lies across the axis it turns about.
+    line = narrow & (np.abs(directions[:, 2, 2]) > _POLE)
+    plane = ~narrow & (spread[:, 0] < _THIN * spread[:, 1])
+    kinds = np.where(plane, PLANE, np.where(line, LINE, 0)).astype(np.uint8)
+    axes = np.where(line[:, None], directions[:, :, 2], directions[:, :, 0])
+    axes[np.einsum("ij,ij->i", axes, points) > 0.0] *= -1.0
+    tilt = np.sqrt(np.where(line, spread[:, 1] / spread[:, 2], spread[:, 0] / spread[:, 1]) / _NEIGHBOURS)
+    return kinds, axes, tilt
+
+
+def _level_rotation(normals: FloatArray) -> FloatArray:
+    """The smallest rotation (3, 3) that takes the mean of the normals (N, 3) near the sensor's z axis to z.
+
+    Floor and ceiling count alike, so z may end up pointing down.
+    """
+    axis = np.array([0.0, 0.0, 1.0])
+    for least in (_LARGEST_TILT, 0.9, 0.97, 0.99):
+        along = normals @ axis
+        near = np.abs(along) > least
+        if near.sum() < 20:
+            break
+        mean = (normals[near] * np.sign(along[near])[:, None]).sum(axis=0)
+        axis = mean / np.linalg.norm(mean)
+    K = skew(np.array([axis[1], -axis[0], 0.0]))  # the cross product of the axis and z
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + axis[2]), dtype=np.float64)

@@ -1,0 +1,131 @@
+"""Point-to-plane correspondences of points with surfels: the compiled loops of `SurfelMap.match`.
+
+The columns of surfels (M, 15) are as in `mapping.surfels.grid`: mean, normal, direction, standard deviations
+(three each), standard deviation of the elevation, number of points, whether it is a plane.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+from mapping.surfels.surfel_kernels import is_steep
+
+# A single ring bent around a corner spans a plane too, that of its own rays. A plane seen at a grazing angle counts
+# only when its points differ so much in height across the rings.
+_LEAST_HEIGHT_M = 0.05
+_FEWEST_POINTS = 6
+# Largest cosine between the axis of a compact object and the direction from ring to ring.
+_MOST_ACROSS = 0.5
+
+
+class Rows(NamedTuple):
+    """Arrays of correspondences, one a row, and the index of each point; see `mapping.surfels.surfel_map`."""
+
+    number: NDArray[np.intp]
+    points: FloatArray
+    normals: FloatArray
+    thickness_m: FloatArray
+    tilt: FloatArray
+
+    @classmethod
+    def empty(cls, count: int) -> "Rows":
+        """Uninitialised rows."""
+        vectors, numbers = np.empty((2, count, 3)), np.empty((2, count))
+        return cls(np.empty(count, dtype=np.intp), *vectors, *numbers)
+
+
+@compiled
+def match_planes(
+    points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray, sensor: FloatArray,
+    found: Rows, begin: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Write a correspondence, from row `begin` on, for every unmatched point (N, 3) whose cell has a plane.
+
+    `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
+    without a plane are moved to the beginning of `unmatched`.
+
+    Returns:
+        Numbers of correspondences and of unmatched points.
+    """
+    count, left = begin, 0
+    for w in range(len(unmatched)):
+        n, row = unmatched[w], rows[w]
+        if row >= 0:
+            p = surfels[row]
+            x, y, z = points[n, 0] - sensor[0], points[n, 1] - sensor[1], points[n, 2] - sensor[2]
+            distance = math.sqrt(x * x + y * y + z * z)
+            along = x * p[3] + y * p[4] + z * p[5]
+            faced, behind = is_steep(-along, distance), is_steep(along, distance)
+            if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
+                tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
+                _write(found, count, n, p[0:3], p[3], p[4], p[5], p[9], tilt)
+                count += 1
+                continue
+        unmatched[left] = n
+        left += 1
+    return count, left
+
+
+@compiled
+def match_compact(
+    points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray,
+    T_world_lidar: FloatArray, largest_m: float, found: Rows, begin: int,
+) -> int:  # fmt: skip
+    """Write correspondences of unmatched points with the mean of a surfel that is no plane, along its short axes.
+
+    The mean of a surfel is a point on the object only where the object ends within it, not in grass. Across the rings a
+    surfel is as short as its rings are close: these axes are left out, or the map would follow the sensor.
+
+    `unmatched` (W,) has the indices of the points (N, 3), `rows` (N,) the cells of all points, or -1. Axes are short
+    below a standard deviation of `largest_m`. Returns the number of correspondences.
+    """
+    count = begin
+    sensor = T_world_lidar[:3, 3]
+    ax, ay, az = T_world_lidar[0, 2], T_world_lidar[1, 2], T_world_lidar[2, 2]
+    for n in unmatched:
+        if rows[n] < 0:
+            continue
+        p = surfels[rows[n]]
+        x, y, z = points[n, 0] - sensor[0], points[n, 1] - sensor[1], points[n, 2] - sensor[2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if p[14] > 0.0 or p[13] < _FEWEST_POINTS or not p[12] * distance > _LEAST_HEIGHT_M:
+            continue
+        distance = max(distance, 1e-9)
+        x, y, z = x / distance, y / distance, z / distance
+        # From one ring to the next: the axis of rotation, less its part along the ray.
+        along = x * ax + y * ay + z * az
+        rx, ry, rz = ax - along * x, ay - along * y, az - along * z
+        length = max(math.sqrt(rx * rx + ry * ry + rz * rz), 1e-9)
+        for axis in range(3):
+            u, v, w = _axis(p, axis)
+            across_rings = abs(u * rx + v * ry + w * rz) / length
+            if p[9 + axis] < largest_m and across_rings < _MOST_ACROSS:
+                _write(found, count, n, p[0:3], u, v, w, p[9 + axis], 0.0)
+                count += 1
+    return count
+
+
+@compiled
+def _axis(p: FloatArray, axis: int) -> tuple[float, float, float]:
+    """A principal axis of a surfel (15,), by ascending extent."""
+    if axis == 0:
+        return p[3], p[4], p[5]
+    if axis == 1:
+        return p[7] * p[5] - p[8] * p[4], p[8] * p[3] - p[6] * p[5], p[6] * p[4] - p[7] * p[3]
+    return p[6], p[7], p[8]
+
+
+@compiled
+def _write(
+    found: Rows, row: int, n: int, point: FloatArray, u: float, v: float, w: float, thickness_m: float, tilt: float
+) -> None:
+    found.number[row] = n
+    for axis in range(3):
+        found.points[row, axis] = point[axis]
+    found.normals[row, 0], found.normals[row, 1], found.normals[row, 2] = u, v, w
+    found.thickness_m[row] = thickness_m
+    found.tilt[row] = tilt

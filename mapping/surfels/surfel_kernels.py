@@ -1,0 +1,141 @@
+"""Surfels from the moments of a cell and its neighbours: the compiled loops of `SurfelGrid.surfels`.
+
+The columns of surfels are as in `mapping.surfels.grid`.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+from mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
+from mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
+
+# A surfel is computed again when its cell has grown by this factor.
+_GROWTH = np.float32(1.3)
+# Weight of a neighbouring cell's points, by the number of coordinates in which it differs.
+_NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
+# Fewer points make no plane.
+_FEWEST_POINTS = 6
+# Sine of the least angle to a plane at which one of its sides is seen.
+_LEAST_SINE = 0.17
+# Largest ratio of thickness to width, and least ratio of width to length, of a plane (standard deviations).
+_MOST_THICKNESS = 0.4
+_LEAST_WIDTH = 0.15
+
+
+@compiled
+def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32]) -> None:
+    """Compute the surfels (M, 15) of the cells in these rows (N,), or -1, that have grown since the last computation.
+
+    `counts` (M,) has the numbers of points at the last computation.
+    """
+    scratch = np.empty(15), np.empty(6), np.empty(3)
+    for n in range(len(rows)):
+        row = rows[n]
+        if row >= 0 and outdated(row, cells.sums, counts):
+            refresh_one(row, cells, surfels, counts, scratch)
+
+
+@compiled
+def is_steep(along: float, distance: float) -> bool:
+    """Whether a ray of some length meets a plane at no grazing angle, from the side of its normal."""
+    return along > _LEAST_SINE * distance
+
+
+@compiled
+def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -> bool:
+    """Whether the cell in a row has grown since its surfel was computed."""
+    return bool(counts[row] * _GROWTH <= sums[row, 0])
+
+
+@compiled
+def refresh_one(
+    row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
+    scratch: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:  # fmt: skip
+    """Compute the surfel of one cell, with scratch arrays of 15, 6 and 3 numbers."""
+    total, covariance, values = scratch
+    counts[row] = cells.sums[row, 0]
+    _gather(row, cells, total)
+    count, x, y, z = total[0], total[1] / total[0], total[2] / total[0], total[3] / total[0]
+    covariance[0], covariance[1], covariance[2] = -x * x, -x * y, -x * z
+    covariance[3], covariance[4], covariance[5] = -y * y, -y * z, -z * z
+    for column in range(6):
+        covariance[column] += total[4 + column] / count
+    write_eigenvalues(covariance, values)
+    i, j, k = middle_of(cells.keys[row])
+    surfel = surfels[row]
+    surfel[0], surfel[1], surfel[2] = (i + x) * cells.cell_m, (j + y) * cells.cell_m, (k + z) * cells.cell_m
+    write_eigenvector(covariance, values[0], surfel[3:6])
+    if surfel[3] * total[12] + surfel[4] * total[13] + surfel[5] * total[14] < 0.0:  # towards where it was seen from
+        surfel[3], surfel[4], surfel[5] = -surfel[3], -surfel[4], -surfel[5]
+    write_eigenvector(covariance, values[2], surfel[6:9])
+    for axis in range(3):
+        surfel[9 + axis] = math.sqrt(max(values[axis], 0.0)) * cells.cell_m
+    elevation = total[10] / count
+    surfel[12] = math.sqrt(max(total[11] / count - elevation * elevation, 0.0))
+    surfel[13] = count
+    thickness, width, length = surfel[9], surfel[10], surfel[11]
+    enough = surfel[13] >= _FEWEST_POINTS
+    surfel[14] = enough and thickness < _MOST_THICKNESS * width and width > _LEAST_WIDTH * length
+
+
+@compiled
+def _gather(row: int, cells: Cells, total: FloatArray) -> None:
+    """Write the weighted sums (15,) of a cell and its 26 neighbours, about its own centre.
+
+    Neighbours seen from the other side are another surface: a thin wall has two.
+    """
+    total[:] = 0.0
+    own = cells.sums[row]
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                key = neighbour_key(cells.keys[row], i, j, k)
+                other = find_one(key, cells.bits, cells.table_keys, cells.table_rows)
+                if other < 0:
+                    continue
+                if cells.others[other] >= 0:
+                    other = row if i == j == k == 0 else _same_side(own, other, cells)
+                sums = cells.sums[other]
+                if own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14] >= 0.0:
+                    _add_shifted(sums, i, j, k, total)
+
+
+@compiled
+def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
+    """The row of that side of a cell whose view direction is nearer to that of the sums (15,)."""
+    other = cells.others[row]
+    if _view_cosine(own, cells.sums[other]) > _view_cosine(own, cells.sums[row]):
+        return int(other)
+    return row
+
+
+@compiled
+def _view_cosine(own: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
+    """Cosine between the view directions of two cells, times the length of the first."""
+    length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
+    return float((own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9))
+
+
+@compiled
+def _add_shifted(sums: NDArray[np.float32], i: int, j: int, k: int, total: FloatArray) -> None:
+    """Add moments about the centre of a cell at an offset of (i, j, k) cells to moments about the own centre."""
+    weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]
+    n, x, y, z = np.float64(sums[0]), np.float64(sums[1]), np.float64(sums[2]), np.float64(sums[3])
+    total[0] += weight * n
+    total[1] += weight * (x + i * n)
+    total[2] += weight * (y + j * n)
+    total[3] += weight * (z + k * n)
+    total[4] += weight * (sums[4] + 2 * i * x + i * i * n)
+    total[5] += weight * (sums[5] + i * y + j * x + i * j * n)
+    total[6] += weight * (sums[6] + i * z + k * x + i * k * n)
+    total[7] += weight * (sums[7] + 2 * j * y + j * j * n)
+    total[8] += weight * (sums[8] + j * z + k * y + j * k * n)
+    total[9] += weight * (sums[9] + 2 * k * z + k * k * n)
+    total[10] += weight * sums[10]
+    for column in range(11, 15):
+        total[column] += weight * sums[column]

@@ -1,0 +1,176 @@
+"""Global relocalisation from above: correlation of bird's-eye views of a scan and of the map, for every yaw.
+
+Only upright structure is drawn: columns of space that are occupied at several heights. Columns that rays of the scan
+passed through should be empty in the map. All shifts are compared at once by FFT, as in RING++ (Xu et al., IEEE T-RO
+2023) and in Olson's correlative scan matching (ICRA 2009).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.thinning import one_per_cell
+
+_YAWS = 72
+# Correlation peaks that are kept for each yaw, and their least distance, in cells and radians.
+_PEAKS = 3
+_APART = 3.0
+_APART_RAD = np.deg2rad(12.0)
+# Occupied heights of a column beyond those of a floor and a ceiling, up to a limit, make its value.
+_FLAT, _TALL = 2, 8
+_HEIGHT_BINS = 2  # of a cell's edge
+# Weight of free space, and where along a nearly level ray it is drawn.
+_FREE_WEIGHT = 0.25
+_ALONG_RAYS = np.linspace(0.1, 0.85, 12)
+_LEVEL_SINE = 0.2
+# Largest extent of the map's image, in cells to either side of the middle.
+_MOST_CELLS = 512
+
+
+@dataclass(frozen=True, eq=False)
+class BirdsEyeMap:
+    """Image of the map from above, levelled.
+
+    Attributes:
+        R_level_world: (3, 3) rotation that takes the vertical to z.
+        points: (M, 3) of the map, levelled.
+        corner: (2,) of the image, levelled.
+        cell_m: edge of a cell.
+        columns: (X, Y) image of the upright structure.
+    """
+
+    R_level_world: FloatArray
+    points: FloatArray
+    corner: FloatArray
+    cell_m: float
+    columns: FloatArray
+
+    @classmethod
+    def of(cls, points: FloatArray, up: FloatArray, cell_m: float) -> "BirdsEyeMap":
+        """Draw points (N, 3) of the world, with the vertical `up` (3,)."""
+        R_level_world = _levelling(up)
+        level = points @ R_level_world.T
+        middle = np.median(level[:, :2], axis=0) if len(level) else np.zeros(2)
+        near = (np.abs(level[:, :2] - middle) < _MOST_CELLS * cell_m).all(axis=1)
+        level = level[near]
+        corner = level[:, :2].min(axis=0) if len(level) else np.zeros(2)
+        return cls(R_level_world, level, corner, cell_m, _columns(level, corner, cell_m))
+
+    def find(self, points: FloatArray, T_world_lidar: FloatArray, reach_m: float, most: int) -> FloatArray:
+        """Poses (K, 4, 4) of a scan by descending correlation, with the roll and pitch of a given pose.
+
+        Args:
+            points: (N, 3) of the scan, compensated.
+            T_world_lidar: (4, 4), of which only the rotation counts.
+            reach_m: radius of the scan's image.
+            most: largest K.
+        """
+        level = points @ (self.R_level_world @ T_world_lidar[:3, :3]).T
+        level = level[np.einsum("ij,ij->i", level[:, :2], level[:, :2]) < reach_m**2]
+        level = level[one_per_cell(level, self.cell_m / _HEIGHT_BINS)]
+        size = next_fast_len(max(self.columns.shape) + 2 * int(np.ceil(reach_m / self.cell_m)) + 2, real=True)
+        spectrum = rfft2(self.columns, s=(size, size))
+        peaks = []
+        for yaw in np.arange(_YAWS) * (2.0 * np.pi / _YAWS):
+            c, s = np.cos(yaw), np.sin(yaw)
+            image = _image(level @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), reach_m, self.cell_m)
+            norm = float(np.linalg.norm(image))
+            if norm == 0.0:
+                return np.empty((0, 4, 4))
+            correlation = irfft2(spectrum * np.conj(rfft2(image, s=(size, size))), s=(size, size)) / norm
+            peaks += [(score, yaw, self._position(shift, size, reach_m)) for score, shift in _peaks(correlation)]
+        chosen = _apart(sorted(peaks, key=lambda peak: -peak[0]), _APART * self.cell_m, most)
+        return np.array([self._pose(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
+
+    def _position(self, shift: NDArray[np.intp], size: int, reach_m: float) -> FloatArray:
+        """Position (2,) of the sensor for a shift (2,) of its image, in cells modulo the size."""
+        shift = np.where(shift < max(self.columns.shape), shift, shift - size)
+        return np.asarray(self.corner + self.cell_m * shift + reach_m, dtype=np.float64)
+
+    def _pose(
+        self, yaw: float, xy: FloatArray, level: FloatArray, T_world_lidar: FloatArray, reach_m: float
+    ) -> FloatArray:
+        c, s = np.cos(yaw), np.sin(yaw)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        around = self.points[np.einsum("ij,ij->i", self.points[:, :2] - xy, self.points[:, :2] - xy) < reach_m**2]
+        z = _height(around[:, 2], level[:, 2], self.cell_m / _HEIGHT_BINS)
+        R = self.R_level_world.T @ turn @ self.R_level_world @ T_world_lidar[:3, :3]
+        return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
+
+
+def _levelling(up: FloatArray) -> FloatArray:
+    """The smallest rotation (3, 3) that takes a unit vector (3,) near z to z."""
+    v = np.array([up[1], -up[0], 0.0])
+    K = np.array([[0.0, 0.0, v[1]], [0.0, 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + up[2]), dtype=np.float64)
+
+
+def _columns(level: FloatArray, corner: FloatArray, cell_m: float) -> FloatArray:
+    """(X, Y) image of points (N, 3): square root of the number of occupied heights, clipped."""
+    if not len(level):
+        return np.zeros((1, 1))
+    cells = np.floor((level - [*corner, level[:, 2].min()]) / (cell_m / np.array([1.0, 1.0, _HEIGHT_BINS])))
+    i, j, k = cells.astype(np.intp).T
+    wide, deep, high = int(i.max()) + 1, int(j.max()) + 1, int(k.max()) + 1
+    occupied = np.unique((i * deep + j) * high + k)
+    counts = np.bincount(occupied // high, minlength=wide * deep).reshape(wide, deep)
+    return np.asarray(np.sqrt(np.clip(counts - _FLAT, 0.0, _TALL)), dtype=np.float64)
+
+
+def _image(level: FloatArray, reach_m: float, cell_m: float) -> FloatArray:
+    """Image of a scan (N, 3) around the sensor: columns, negative where rays passed through."""
+    corner = np.array([-reach_m, -reach_m])
+    side = 2 * int(np.ceil(reach_m / cell_m)) + 1
+    occupied = _columns(level, corner, cell_m)
+    image = np.zeros((side, side))
+    image[: occupied.shape[0], : occupied.shape[1]] = occupied
+    ranges = np.linalg.norm(level, axis=1)
+    flat = level[np.abs(level[:, 2]) < _LEVEL_SINE * ranges, :2]
+    through = (flat[:, None] * _ALONG_RAYS[:, None]).reshape(-1, 2)
+    cells = np.floor((through - corner) / cell_m).astype(np.intp)
+    seen = np.zeros_like(image, dtype=np.bool_)
+    seen[cells[:, 0], cells[:, 1]] = True
+    image[seen & (image == 0.0)] = -_FREE_WEIGHT * float(image.max(initial=0.0))
+    return image
+
+
+def _peaks(correlation: FloatArray) -> list[tuple[float, NDArray[np.intp]]]:
+    """The highest few values that are apart, each with its cell (2,)."""
+    found = []
+    size, reach = len(correlation), int(_APART)
+    around = np.arange(-reach, reach + 1)
+    for _ in range(_PEAKS):
+        i, j = np.unravel_index(int(correlation.argmax()), correlation.shape)
+        found.append((float(correlation[i, j]), np.array([i, j], dtype=np.intp)))
+        correlation[np.ix_((i + around) % size, (j + around) % size)] = -np.inf
+    return found
+
+
+def _apart(
+    peaks: list[tuple[float, float, FloatArray]], distance_m: float, most: int
+) -> list[tuple[float, FloatArray]]:
+    """Yaws and positions (2,) of the first peaks, no two of one pose."""
+    chosen: list[tuple[float, FloatArray]] = []
+    for _, yaw, xy in peaks:
+        if all(
+            np.linalg.norm(xy - other) > distance_m
+            or abs((yaw - chosen_yaw + np.pi) % (2.0 * np.pi) - np.pi) > _APART_RAD
+            for chosen_yaw, other in chosen
+        ):
+            chosen.append((yaw, xy))
+            if len(chosen) == most:
+                break
+    return chosen
+
+
+def _height(there: FloatArray, here: FloatArray, bin_m: float) -> float:
+    """Height of the sensor: shift between the heights of the map (M,) and of the scan (N,) that correlates best."""
+    if not len(there) or not len(here):
+        return 0.0
+    low, high = min(there.min(), here.min()), max(there.max(), here.max())
+    bins = int((high - low) / bin_m) + 1
+    a, b = (np.sqrt(np.histogram(h, bins, (low, low + bins * bin_m))[0]) for h in (there, here))
+    return (int(np.correlate(a, b, mode="full").argmax()) - (bins - 1)) * bin_m

@@ -1,0 +1,242 @@
+"""Tracking policy: which registrations of a scan are attempted, and whether their best result is accepted."""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse
+from lidarslam.core.state import Stateful
+from lidarslam.core.tracking import Status
+from mapping.config import MappingConfig
+from mapping.deskew import body_velocity
+from mapping.prediction import (
+    LARGEST_PROCESS_NOISE,
+    LOST_MOTION,
+    MotionState,
+    OdometryNoise,
+    Prediction,
+    Prior,
+    ProcessNoise,
+    predict,
+)
+from mapping.sampling import SampledScan
+from mapping.surfels.surfel_map import SurfelMap
+from mapping.tracking.archived_maps import ArchivedMaps
+from mapping.tracking.attempts import Attempt, ScanMatcher, best_of
+from mapping.tracking.fit import Fit
+from mapping.tracking.pose_status import judge
+from mapping.tracking.tracking_state import TrackingState
+
+# Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
+# error is forgotten by a factor a scan.
+_FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
+# Factors on the quality by which a result that is less consistent with the prediction must be better: with any
+# acceleration, and with any displacement.
+_BETTER, _CLEARLY_BETTER = 1.05, 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class MappedScan:
+    """Result of a scan.
+
+    Attributes:
+        state: pose at the stamp and velocity during the sweep, with their covariance.
+        T_world_predicted: (4, 4) predicted pose.
+        registered: whether the pose is that of a registration; else it is the predicted one.
+        status, message: tracking status, and its reason.
+        fit: to the map; None where the scan was not compared with it.
+        degenerate: names of the directions along which the prediction was kept.
+        iterations: of the registration.
+        added: whether the scan is good enough for the map, and was inserted.
+        is_connected: whether the sensor was tracked from the scan before; else it was relocalised, or only predicted.
+    """
+
+    state: MotionState
+    T_world_predicted: FloatArray
+    registered: bool
+    status: Status
+    message: str = ""
+    fit: Fit | None = None
+    degenerate: tuple[str, ...] = ()
+    iterations: int = 0
+    added: bool = False
+    is_connected: bool = True
+
+
+class Tracker(Stateful):
+    """Tracks the sensor through one local map after another."""
+
+    _state: TrackingState
+    _archive: ArchivedMaps
+    _process_noise: ProcessNoise
+    _odometry_noise: OdometryNoise
+    _prediction_error_m: float
+
+    def __init__(self, config: MappingConfig) -> None:
+        self._config = config
+        self._state = TrackingState()
+        self._archive = ArchivedMaps()
+        self._process_noise = ProcessNoise()
+        self._odometry_noise = OdometryNoise()
+        self._prediction_error_m = _UNKNOWN_ERROR_M
+
+    def predict(
+        self, scan: SampledScan, prior: Prior, last: MotionState, process_noise: ProcessNoise | None = None
+    ) -> Prediction:
+        """Predict a scan's state from the last one and the odometry."""
+        noise = process_noise or self._process_noise
+        return predict(last, scan.stamp, prior, noise, self._config, scan.seen_from_s, self._odometry_noise)
+
+    def register(
+        self, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState, surfel_map: SurfelMap
+    ) -> Attempt:
+        """Register a scan near its prediction, else relocalise it; the status is lost where neither is reliable."""
+        matcher = ScanMatcher(scan, last, surfel_map, self._config)
+        uncertain = self._state.is_uncertain(scan.stamp - last.stamp)
+        near = matcher.register(prediction, self._begins_coarse(scan))
+        if not uncertain:
+            near = self._improve(matcher, prior, prediction, near)
+        unconfirmed = self._state.is_unconfirmed
+        if near.status is Status.LOST or ((uncertain or unconfirmed) and not near.is_reliable):
+            best = self._relocalise(matcher, near)
+        elif near.status is Status.DEGRADED and self._state.searches_nearby:
+            best = best_of(filter(None, (near, matcher.search_yaw(near.prediction))))
+        elif near.status is Status.OK and not unconfirmed:
+            best = self._archive.relocalise(scan, near.prediction, last, self._config) or near
+        else:
+            best = near
+        rejected = best is near and unconfirmed and self._contradicts_motion(near, prior, last)
+        return replace(near, status=Status.LOST) if best is None or rejected else best
+
+    def accept(
+        self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
+    ) -> MappedScan:
+        """Judge a registration, and update noise and tracking state with it."""
+        registration, interval_s, jumped = attempt.registration, scan.stamp - last.stamp, attempt.has_jumped
+        assert registration is not None
+        self._state.registered(attempt.status, attempt.relocalised, attempt.quality, scan.stamp)
+        if not attempt.relocalised:
+            self._update_noise(attempt, prior, last, interval_s)
+        error_m = displacement_m(attempt.correction, scan.range_m)
+        self._prediction_error_m = max(_ERROR_DECAY * self._prediction_error_m, error_m)
+        self._state.velocity_known = not (jumped or attempt.relocalised)
+        T_world_lidar, velocity = registration.T_world_lidar, registration.velocity
+        if self._state.velocity_known:
+            covariance = registration.covariance
+            state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
+        else:
+            state = MotionState(scan.stamp, T_world_lidar, self._uncertain_velocity(attempt, scan, last), LOST_MOTION)
+        unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
+        status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
+        return MappedScan(
+            state=state,
+            T_world_predicted=attempt.prediction.T_world_lidar,
+            registered=True,
+            status=status,
+            message=message,
+            fit=attempt.fit,
+            degenerate=registration.degeneracy.names,
+            iterations=registration.iterations,
+            added=attempt.status is Status.OK and not jumped and not self._state.is_unconfirmed,
+            is_connected=not attempt.relocalised,
+        )
+
+    def lose(self, surfel_map: SurfelMap, has_points: bool) -> bool:
+        """Update with a scan that was not registered; true where the map is archived and a new one must begin."""
+        self._prediction_error_m = _UNKNOWN_ERROR_M
+        self._state.lost(has_points)
+        if not (has_points and self._state.gives_up):
+            return False
+        self._archive.add(surfel_map)
+        self._state.map_restarted()
+        return True
+
+    def snapshot(self) -> "Tracker":
+        """A copy to `rewind` to."""
+        copied = copy(self)
+        copied._state = copy(self._state)
+        return copied
+
+    def rewind(self, earlier: "Tracker") -> None:
+        """Take the last registration back, but for the observed error of the predictions."""
+        self._state = copy(earlier._state)
+        self._process_noise, self._odometry_noise = earlier._process_noise, earlier._odometry_noise
+
+    def _begins_coarse(self, scan: SampledScan) -> bool:
+        return self._prediction_error_m > _FINE_ERROR_CELLS * scan.cell_m
+
+    def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
+        """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""
+        best = self._or_turning(matcher, prior, prediction, near)
+        if prediction.contradicted and self._state.velocity_known:
+            alone = self.predict(matcher.scan, Prior(), matcher.last)
+            other = matcher.register(alone, self._begins_coarse(matcher.scan))
+            other = self._or_turning(matcher, Prior(), alone, other)
+            best = max(best, other, key=lambda attempt: attempt.quality)
+        misled = prior.T_prev_curr is not None and best.status is not Status.OK
+        if misled or not self._state.velocity_known:
+            rotations = prediction.T_world_lidar, matcher.last.T_world_lidar
+            best = self._or_displaced(best, matcher.register_displaced(rotations))
+        return best
+
+    def _or_turning(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
+        """A registration, or where it fits poorly and that is better, one with any acceleration.
+
+        An unexpected motion bends the sweep, which then fits halfway at a wrong pose and velocity.
+        """
+        if not self._state.fits_poorly(near.status, near.quality):
+            return near
+        turning = matcher.register_turning(self.predict(matcher.scan, prior, matcher.last, LARGEST_PROCESS_NOISE))
+        if turning.is_reliable and turning.quality > _BETTER * near.quality:
+            return replace(turning, prediction=prediction)
+        return near
+
+    def _or_displaced(self, best: Attempt, others: Sequence[Attempt]) -> Attempt:
+        """The best of an attempt and those from displacements, marked as ambiguous where another fits as well."""
+        for other in others:
+            eligible = other.is_reliable or not self._state.velocity_known
+            if eligible and other.quality > _CLEARLY_BETTER * best.quality:
+                best = other
+        if best.registration is None or self._state.velocity_known:
+            return best
+        return replace(best, ambiguous=best.has_rivals(others))
+
+    def _relocalise(self, matcher: ScanMatcher, near: Attempt) -> Attempt | None:
+        """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none."""
+        sufficient = near.is_reliable if self._state.is_unconfirmed else near.is_plausible
+        attempts = [near] if near.status is not Status.LOST and sufficient else []
+        attempts += filter(None, [matcher.search_yaw(near.prediction)])
+        if not any(attempt.is_reliable for attempt in attempts) and self._state.searches_map:
+            attempts += filter(None, [matcher.search_map(near.prediction)])
+        return best_of(attempts)
+
+    def _contradicts_motion(self, attempt: Attempt, prior: Prior, last: MotionState) -> bool:
+        """Whether the motion since the last scan is improbable, which contradicts the relocalisation before."""
+        motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
+        return attempt.has_jumped or self._odometry_noise.rejects(prior, motion, self._config)
+
+    def _update_noise(self, attempt: Attempt, prior: Prior, last: MotionState, interval_s: float) -> None:
+        assert attempt.registration is not None
+        if interval_s > 0.0 and self._state.velocity_known:
+            variance = np.diag(attempt.registration.covariance + last.covariance)[6:]
+            change = attempt.registration.velocity - last.velocity
+            self._process_noise = self._process_noise.updated(change, interval_s, variance)
+        motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
+        self._odometry_noise = self._odometry_noise.updated(prior, motion, self._config)
+
+    def _uncertain_velocity(self, attempt: Attempt, scan: SampledScan, last: MotionState) -> FloatArray:
+        """Velocity (6,) after a jump or a relocalisation.
+
+        After a relocalisation only the estimate within the sweep is known. After a jump one of two sweeps was bent by a
+        wrong velocity: the mean velocity between the two poses.
+        """
+        interval_s = scan.stamp - last.stamp
+        if not attempt.relocalised:
+            if interval_s > 0.0:
+                return body_velocity(inverse(last.T_world_lidar) @ attempt.T_world_lidar, interval_s)
+            return np.zeros(6)
+        assert attempt.registration is not None
+        observed = self._config.continuous_time and scan.sweep.times is not None
+        return attempt.registration.velocity if observed else np.zeros(6)

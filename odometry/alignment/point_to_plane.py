@@ -1,0 +1,138 @@
+"""Point-to-plane normal equations of a pair of sweeps, and how well the two lie on one another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.compiled import compiled
+from lidarslam.core.geometry import FloatArray
+from odometry.alignment.residuals import Motion, Planes, accumulate
+from odometry.alignment.sweep_motion import SweepPair
+from odometry.images.projection import Floats
+from odometry.images.sweep_images import SweepImages
+
+# Twice as many rows add hardly any information if half as many points are taken of each.
+_FULL_ROWS = 32
+# How far along its row a pixel without a normal looks for one. A point is held against a plane, which goes on beyond
+# its pixel; the gate sees to it that it does not go too far.
+_FILL_COLUMNS = 4
+# Scale of the residuals of inliers.
+FINE_M = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Sums over the inliers of a motion, which have residuals within twice the finest scale.
+
+    Attributes:
+        H: (12, 12) of the normal equations, each inlier with a weight of 1.
+        in_view, inlier: (3, 3) of the squares of normals in the previous frame: of all points in view, and of inliers.
+        share_in_view, inlier_share: of the points with a normal.
+        inliers: how many.
+        squared_residuals: their sum.
+    """
+
+    H: FloatArray
+    in_view: FloatArray
+    inlier: FloatArray
+    share_in_view: float
+    inlier_share: float
+    inliers: int
+    squared_residuals: float
+
+
+class PointToPlane:
+    """The points of the current sweep against the planes of the previous one.
+
+    Args:
+        sweeps: the pair.
+        column_step: every so-manieth column's points are used.
+    """
+
+    def __init__(self, sweeps: SweepPair, column_step: int) -> None:
+        self._points = _points(sweeps.current, column_step)
+        self._planes = _planes(sweeps.previous)
+
+    def normal_equations(
+        self, T_prev_curr: FloatArray, velocity: FloatArray, change: FloatArray, scale_m: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """H (12, 12) and g (12,) of squared residuals with Geman and McClure's weights of this scale.
+
+        The unknowns are a change of T_prev_curr (4, 4) from the left, rotation first, and the change (6,) of velocity.
+        """
+        total, unused = np.zeros((13, 13)), np.zeros((3, 3))
+        motion = _motion(T_prev_curr, velocity, change)
+        accumulate(self._points, self._planes, motion, scale_m, True, total, unused, unused)
+        return total[:12, :12], total[:12, 12]
+
+    def fit(self, T_prev_curr: FloatArray, velocity: FloatArray, change: FloatArray) -> Fit:
+        """How the sweeps lie on one another."""
+        total, in_view, inlier = np.zeros((13, 13)), np.zeros((3, 3)), np.zeros((3, 3))
+        motion = _motion(T_prev_curr, velocity, change)
+        seen, count = accumulate(self._points, self._planes, motion, FINE_M, False, total, in_view, inlier)
+        points = max(len(self._points), 1)
+        return Fit(total[:12, :12], in_view, inlier, seen / points, count / points, count, float(total[12, 12]))
+
+
+def _points(images: SweepImages, column_step: int) -> Floats:
+    """(N, 7) point, normal and seconds of pixels that have a normal; the more rows, the fewer of each."""
+    height, width = images.offsets.shape
+    fewer = max(1, height // _FULL_ROWS)
+    room = np.empty((height * (width // (fewer * column_step) + 1), 7), dtype=np.float32)
+    return room[: _sample(images.points, images.normals, images.offsets, column_step, fewer, room)]
+
+
+def _planes(images: SweepImages) -> Planes:
+    height, width = images.offsets.shape
+    pixels = np.empty((height * width, 7), dtype=np.float32)
+    _fill(images.points, images.normals, images.offsets, min(_FILL_COLUMNS, width - 1), pixels)
+    return Planes(pixels, height, width, images.low, images.high, bool(images.offsets.any()))
+
+
+def _motion(T_prev_curr: FloatArray, velocity: FloatArray, change: FloatArray) -> Motion:
+    return Motion(np.ascontiguousarray(T_prev_curr), velocity - change, velocity + change)
+
+
+@compiled
+def _sample(points: Floats, normals: Floats, offsets: Floats, step: int, fewer: int, chosen: Floats) -> int:
+    """Write (N, 7) point, normal and seconds of one of `step * fewer` pixels of each row, if it has a normal; N.
+
+    So many rows in turn begin a step later.
+    """
+    height, width = offsets.shape
+    count = 0
+    for i in range(height):
+        for j in range(i % fewer * step, width, step * fewer):
+            u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
+            if u * u + v * v + w * w > 0.5:
+                point = chosen[count]
+                point[0], point[1], point[2] = points[0, i, j], points[1, i, j], points[2, i, j]
+                point[3], point[4], point[5], point[6] = u, v, w, offsets[i, j]
+                count += 1
+    return count
+
+
+@compiled
+def _fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels: Floats) -> None:
+    """Write the pixels (H * W, 7) of images (3, H, W), (3, H, W), (H, W).
+
+    Those without a normal get the nearest one in their row, up to so many columns away.
+    """
+    height, width = offsets.shape
+    there = np.empty(width, dtype=np.bool_)
+    for i in range(height):
+        for j in range(width):
+            u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
+            there[j] = u * u + v * v + w * w > 0.5
+        for j in range(width):
+            source = j
+            if not there[j]:
+                for distance in range(1, columns + 1):
+                    left, right = (j - distance) % width, (j + distance) % width
+                    if there[left] or there[right]:
+                        source = left if there[left] else right
+                        break
+            pixel = pixels[i * width + j]
+            for axis in range(3):
+                pixel[axis], pixel[3 + axis] = points[axis, i, source], normals[axis, i, source]
+            pixel[6] = offsets[i, source]

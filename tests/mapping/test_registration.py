@@ -1,0 +1,303 @@
+"""Registrations of known truth: noise-free where poses are asked for, noisy where the covariance is."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
+from mapping.deskew import Sweep
+from mapping.prediction import Prediction
+from mapping.registration import Registration
+from mapping.registration import register as register_sweep
+from mapping.surfels.surfel_map import SurfelMap
+
+CELL = 0.2
+HALF = np.array([4.0, 3.0, 1.5])
+T_TRUE = exp([0.02, -0.03, 0.5, 0.6, -0.4, 0.1])
+TURNING = np.concatenate([np.deg2rad([0.0, 0.0, 120.0]), [1.5, 0.0, 0.0]])
+
+
+def sides(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2), margin: float = 0.0) -> FloatArray:
+    """Points (N, 3) on the sides of a box across these axes, as far from its edges as the margin."""
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
+    axis = rng.choice(axes, count)
+    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
+    return points
+
+
+def map_of(planes: FloatArray, seen_from: FloatArray | None = None) -> SurfelMap:
+    sensor = np.zeros(3) if seen_from is None else seen_from
+    local_map = SurfelMap(CELL, 100.0)
+    rays = planes - sensor
+    local_map.insert(planes, np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)), sensor)
+    return local_map
+
+
+def seen(world: FloatArray, T_world_lidar: FloatArray, times: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Points (N, 3) of the world as measured from where the sensor was at their times (N,)."""
+    T_lidar_world = inverse(T_world_lidar @ exp(times[:, None] * velocity))
+    return np.asarray(np.einsum("nij,nj->ni", T_lidar_world[:, :3, :3], world) + T_lidar_world[:, :3, 3])
+
+
+def sweep_of(
+    rng: np.random.Generator, velocity: FloatArray, T_world_lidar: FloatArray = T_TRUE, count: int = 2_000,
+    stamp_at: float = 0.0, axes: tuple[int, ...] = (0, 1, 2),
+) -> Sweep:  # fmt: skip
+    """A rolling sweep of a tenth of a second, without noise."""
+    times = 0.1 * rng.uniform(-stamp_at, 1.0 - stamp_at, count)
+    return Sweep(seen(sides(rng, count, axes, margin=2.1 * CELL), T_world_lidar, times, velocity), times)
+
+
+def snapshot(rng: np.random.Generator, T_world_lidar: FloatArray = T_TRUE, **wanted: Any) -> Sweep:
+    return replace(sweep_of(rng, np.zeros(6), T_world_lidar, **wanted), times=None)
+
+
+def predicted(
+    T_world_lidar: FloatArray, velocity: FloatArray | None = None, rotation_deg: float = 60.0, metres: float = 2.0
+) -> Prediction:
+    """A prediction that is hardly trusted."""
+    variances = np.array([np.deg2rad(rotation_deg)] * 3 + [metres] * 3) ** 2
+    motion = np.zeros(6) if velocity is None else velocity
+    return Prediction(0.0, T_world_lidar, motion, np.diag(np.concatenate([variances, 100.0 * variances])))
+
+
+def register(sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap, coarse_first: bool = True) -> Registration:
+    registration = register_sweep(sweep, prediction, surfel_map, with_velocity=True, coarse_first=coarse_first)
+    assert registration is not None
+    return registration
+
+
+def assert_at(T_found: FloatArray, T_true: FloatArray, metres: float, degrees: float) -> None:
+    error = inverse(T_true) @ T_found
+    assert np.linalg.norm(error[:3, 3]) < metres
+    assert np.rad2deg(rotation_angle(error)) < degrees
+
+
+@pytest.fixture(scope="module")
+def box_map() -> SurfelMap:
+    rng = np.random.default_rng(5)
+    return map_of(sides(rng, 60_000))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_pose_is_found_from_ten_degrees_and_thirty_centimetres_away(box_map: SurfelMap, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    axes = rng.normal(size=(2, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    off = exp(np.concatenate([np.deg2rad(10.0) * axes[0], 0.3 * axes[1]]))
+    refined = register(snapshot(rng), predicted(T_TRUE @ off), box_map)
+    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    assert len(refined.degeneracy) == 0
+
+
+def test_fine_cells_alone_suffice_nearby(box_map: SurfelMap, rng: np.random.Generator) -> None:
+    off = exp([0.01, -0.01, 0.01, 0.03, -0.03, 0.02])
+    refined = register(snapshot(rng), predicted(T_TRUE @ off), box_map, coarse_first=False)
+    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+
+
+def test_the_true_pose_stays(box_map: SurfelMap, rng: np.random.Generator) -> None:
+    refined = register(snapshot(rng), predicted(T_TRUE), box_map, coarse_first=False)
+    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    assert refined.iterations <= 2
+
+
+@pytest.mark.parametrize("stamp_at", [0.0, 0.5, 1.0])
+def test_pose_and_velocity_of_a_rolling_sweep_are_found_from_rest(
+    box_map: SurfelMap, rng: np.random.Generator, stamp_at: float
+) -> None:
+    """At 120 deg/s and 1.5 m/s the sweep is bent by 12 degrees and 15 cm."""
+    refined = register(sweep_of(rng, TURNING, stamp_at=stamp_at), predicted(T_TRUE), box_map)
+    assert_at(refined.T_world_lidar, T_TRUE, 2e-4, 0.005)
+    np.testing.assert_allclose(refined.velocity[:3], TURNING[:3], atol=np.deg2rad(0.1))
+    np.testing.assert_allclose(refined.velocity[3:], TURNING[3:], atol=0.005)
+
+
+def test_a_rolling_sweep_of_known_velocity_is_registered_as_a_snapshot_is(
+    box_map: SurfelMap, rng: np.random.Generator
+) -> None:
+    off = exp([0.0, 0.0, 0.05, 0.1, 0.0, 0.0])
+    prediction = predicted(T_TRUE @ off, TURNING)
+    refined = register_sweep(sweep_of(rng, TURNING), prediction, box_map, with_velocity=False)
+    assert refined is not None
+    assert_at(refined.T_world_lidar, T_TRUE, 1e-4, 0.002)
+    np.testing.assert_array_equal(refined.velocity, TURNING)
+
+
+@pytest.fixture(scope="module")
+def corridor_map() -> SurfelMap:
+    return map_of(sides(np.random.default_rng(5), 60_000, axes=(1, 2)))
+
+
+@pytest.mark.parametrize("along_m", [0.3, -0.7])
+def test_along_a_corridor_the_prediction_is_kept_and_the_rest_corrected(
+    corridor_map: SurfelMap, rng: np.random.Generator, along_m: float
+) -> None:
+    """The corridor goes along x of the world; sensor and prediction look elsewhere."""
+    shift = np.eye(4)
+    shift[0, 3] = along_m
+    off = exp([0.02, -0.01, 0.03, 0.0, 0.0, 0.0])
+    off[1:3, 3] = [0.08, -0.05]
+    T_predicted = shift @ off @ T_TRUE
+    refined = register(snapshot(rng, axes=(1, 2)), predicted(T_predicted), corridor_map)
+    # Turned about the origin, the prediction has been moved along x as well.
+    assert refined.T_world_lidar[0, 3] == pytest.approx(T_predicted[0, 3], abs=2e-3)
+    np.testing.assert_allclose(refined.T_world_lidar[1:3, 3], T_TRUE[1:3, 3], atol=2e-4)
+    assert np.rad2deg(rotation_angle(inverse(T_TRUE) @ refined.T_world_lidar)) < 0.005
+    assert refined.degeneracy.names == ("x",)
+
+
+def test_the_noise_of_a_corridors_walls_does_not_pull_along_it(rng: np.random.Generator) -> None:
+    """Their normals are off by a little, and each would pull along the corridor a little."""
+    noisy = sides(rng, 60_000, axes=(1, 2))
+    local_map = map_of(noisy + rng.normal(0.0, 0.02, noisy.shape))
+    sweep = snapshot(rng, axes=(1, 2))
+    sweep = replace(sweep, points=sweep.points + rng.normal(0.0, 0.02, sweep.points.shape))
+    refined = register(sweep, predicted(T_TRUE, metres=20.0), local_map)
+    assert refined.degeneracy.names == ("x",)
+    assert refined.T_world_lidar[0, 3] == pytest.approx(T_TRUE[0, 3], abs=2e-3)
+
+
+def test_along_a_corridor_the_predicted_speed_is_kept_and_the_turn_found(
+    corridor_map: SurfelMap, rng: np.random.Generator
+) -> None:
+    T_level = np.eye(4)
+    truth = np.concatenate([np.deg2rad([0.0, 0.0, 20.0]), [1.0, 0.3, 0.0]])
+    sweep = sweep_of(rng, truth, T_level, axes=(1, 2))
+    guess = np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0])
+    refined = register(sweep, predicted(T_level, guess), corridor_map)
+    assert refined.velocity[3] == pytest.approx(0.4, abs=0.02)
+    np.testing.assert_allclose(refined.velocity[:3], truth[:3], atol=np.deg2rad(0.5))
+    np.testing.assert_allclose(refined.velocity[4:], truth[4:], atol=0.02)
+
+
+@pytest.mark.parametrize("off_m", [0.05, 0.1])
+def test_a_few_points_on_its_end_hold_a_corridor(off_m: float) -> None:
+    """All others fit perfectly wherever along it the sensor is, and must not make outliers of them."""
+    rng = np.random.default_rng(1)
+    local_map = map_of(np.concatenate([sides(rng, 60_000, axes=(1, 2)), sides(rng, 3_000, axes=(0,))]))
+    world = np.concatenate([sides(rng, 2_000, (1, 2), 2.1 * CELL), sides(rng, 150, (0,), 2.1 * CELL)])
+    T_predicted = T_TRUE.copy()
+    T_predicted[0, 3] += off_m
+    prediction = predicted(T_predicted, rotation_deg=5.0, metres=0.3)
+    refined = register(Sweep(transform_points(inverse(T_TRUE), world)), prediction, local_map, True)
+    assert len(refined.degeneracy) == 0
+    assert_at(refined.T_world_lidar, T_TRUE, 2e-3, 0.02)
+
+
+@pytest.mark.parametrize(("count", "suffices"), [(59, False), (100, True)])
+def test_too_few_points_make_no_pose(box_map: SurfelMap, rng: np.random.Generator, count: int, suffices: bool) -> None:
+    few = snapshot(rng, count=count)
+    assert (register_sweep(few, predicted(T_TRUE), box_map, with_velocity=False) is not None) == suffices
+
+
+@pytest.mark.parametrize("count", [0, 500])
+def test_nothing_to_meet_makes_no_pose(rng: np.random.Generator, count: int) -> None:
+    assert register_sweep(snapshot(rng, count=count), predicted(T_TRUE), SurfelMap(CELL, 10.0), False) is None
+
+
+def test_no_more_iterations_than_allowed(
+    box_map: SurfelMap, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    off = exp([0.0, 0.0, 0.03, 0.05, -0.05, 0.0])
+    assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations > 2
+    monkeypatch.setattr("mapping.registration._ITERATIONS", (3, 2))
+    assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations == 2
+
+
+def test_outliers_do_not_move_the_pose(box_map: SurfelMap, rng: np.random.Generator) -> None:
+    """A third of the points stands away from the walls, all on one side of them, as people and furniture do."""
+    world = sides(rng, 3_000, margin=2.1 * CELL)
+    world[::3] *= rng.uniform(0.8, 0.98, (1_000, 1))
+    sweep = Sweep(transform_points(inverse(T_TRUE), world))
+    off = exp([0.0, 0.01, 0.02, 0.05, -0.05, 0.0])
+    assert_at(register(sweep, predicted(T_TRUE @ off), box_map).T_world_lidar, T_TRUE, 0.01, 0.1)
+
+
+def test_the_covariance_has_its_order_and_its_frame(corridor_map: SurfelMap, rng: np.random.Generator) -> None:
+    """Turned left by 90 degrees, the sensor sees the corridor go along its own y."""
+    T_turned = exp([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0])
+    prediction = predicted(T_turned, rotation_deg=3.0, metres=0.5)
+    refined = register(snapshot(rng, T_turned, axes=(1, 2)), prediction, corridor_map)
+    sigmas = np.sqrt(np.diag(refined.covariance)[:6])
+    assert refined.degeneracy.names == ("y",)
+    assert sigmas[4] == pytest.approx(0.5, rel=0.5), "the prediction's where nothing is seen"
+    assert max(sigmas[3], sigmas[5]) < 0.02
+    assert sigmas[:3].max() < np.deg2rad(1.0)
+
+
+def test_rotations_come_first_in_the_covariance(rng: np.random.Generator) -> None:
+    """A floor leaves yaw open, x and y, and holds roll, pitch and z."""
+    floor = np.column_stack([rng.uniform(-4, 4, (60_000, 2)), np.full(60_000, -1.5)])
+    sweep = Sweep(np.column_stack([rng.uniform(-3, 3, (2_000, 2)), np.full(2_000, -1.5)]))
+    prediction = predicted(np.eye(4), rotation_deg=10.0, metres=0.5)
+    sigmas = np.sqrt(np.diag(register(sweep, prediction, map_of(floor)).covariance)[:6])
+    assert sigmas[2] > 10.0 * sigmas[:2].max()
+    assert sigmas[3:5].min() > 10.0 * sigmas[5]
+
+
+def test_the_covariance_is_symmetric_and_positive(box_map: SurfelMap, rng: np.random.Generator) -> None:
+    covariance = register(sweep_of(rng, TURNING), predicted(T_TRUE), box_map).covariance
+    assert covariance.shape == (12, 12)
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() > 0.0
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Squared errors of N registrations, normalised by their covariance: pose, and velocity."""
+
+    pose: FloatArray
+    velocity: FloatArray
+
+
+def noisy_scan(
+    room: Any, seed: int, T_world_lidar: FloatArray, velocity: FloatArray, sigma_m: float, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Points (N, 3) as measured and their times (N,)."""
+    rng = np.random.default_rng(seed)
+    directions, fraction = room.directions(seed)
+    chosen = rng.choice(len(directions), count, replace=False)
+    directions, times = directions[chosen], 0.1 * fraction[chosen]
+    T = T_world_lidar @ exp(times[:, None] * velocity)
+    ranges = room.cast(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], directions))
+    return directions * (ranges + rng.normal(0.0, sigma_m, count))[:, None], times
+
+
+def registrations(room: Any, sigma_m: float, count: int = 20) -> Consistency:
+    """Of a noisy sweep with a map of three noisy sweeps from known poses along a way, all anew each time."""
+    velocity = np.array([0.0, 0.0, 0.3, 0.8, 0.05, 0.0])
+    start = exp([0.0, 0.0, 0.3, -4.0, 0.0, -0.4])
+    found = []
+    for seed in range(count):
+        local_map = SurfelMap(CELL, 100.0)
+        for k in range(3):
+            T = start @ exp(0.1 * k * velocity)
+            points, times = noisy_scan(room, 100 * seed + k, T, velocity, sigma_m, 6_000)
+            moved = exp(times[:, None] * velocity)
+            straight = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
+            elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
+            local_map.insert(transform_points(T, straight), elevations, T[:3, 3])
+        T_true = start @ exp(0.3 * velocity)
+        points, times = noisy_scan(room, 100 * seed + 3, T_true, velocity, sigma_m, 2_500)
+        rng = np.random.default_rng(seed)
+        off = exp(rng.normal(0.0, [np.deg2rad(1.0)] * 3 + [0.05] * 3))
+        refined = register(Sweep(points, times), predicted(T_true @ off, velocity), local_map)
+        xi = log(inverse(refined.T_world_lidar) @ T_true)
+        dv = velocity - refined.velocity
+        P = refined.covariance
+        found.append([xi @ np.linalg.solve(P[:6, :6], xi), dv @ np.linalg.solve(P[6:, 6:], dv)])
+    pose, motion = np.array(found).T
+    return Consistency(pose, motion)
+
+
+def test_errors_are_as_large_as_the_covariance_says(room: Any) -> None:
+    """The mean of six squared normal variables is six. Errors are never understated, and not overstated sevenfold.
+
+    Here all errors are independent and the covariance is cautious; on rough ground they are not, and it is about right.
+    """
+    found = registrations(room, sigma_m=0.02)
+    assert 6.0 / 7.0**2 < found.pose.mean() < 6.0
+    assert 6.0 / 7.0**2 < found.velocity.mean() < 6.0

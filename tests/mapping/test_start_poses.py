@@ -1,0 +1,95 @@
+"""Starts all around, and the right one among them."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
+from mapping.deskew import Sweep, move
+from mapping.surfels.surfel_map import SurfelMap
+from mapping.tracking.start_poses import best_starts, best_velocity, turned_poses
+
+RoomPoints = Callable[[np.random.Generator, int], FloatArray]
+
+UP = np.array([0.0, 0.0, 1.0])
+T_GIVEN = exp([0.1, -0.2, 0.7, 3.0, -2.0, 0.5])
+
+
+def test_the_given_pose_comes_first() -> None:
+    np.testing.assert_allclose(turned_poses(T_GIVEN, UP, 15.0)[0], T_GIVEN, atol=1e-12)
+
+
+@pytest.mark.parametrize(("step_deg", "count"), [(15.0, 24), (90.0, 4), (50.0, 7), (400.0, 1)])
+def test_turns_are_even_and_go_all_around(step_deg: float, count: int) -> None:
+    starts = turned_poses(T_GIVEN, UP, step_deg)
+    assert len(starts) == count
+    turns = starts[:, :3, :3] @ T_GIVEN[:3, :3].T
+    yaw_deg = np.sort(np.rad2deg(np.arctan2(turns[:, 1, 0], turns[:, 0, 0])) % 360.0)
+    np.testing.assert_allclose(np.diff(yaw_deg), 360.0 / count, atol=1e-9)
+
+
+def test_small_turns_come_before_large_ones() -> None:
+    starts = turned_poses(T_GIVEN, UP, 15.0)
+    angles = rotation_angle(inverse(T_GIVEN) @ starts)
+    assert all(after >= before - 1e-9 for before, after in pairwise(angles))
+
+
+def test_all_starts_are_rigid_and_at_the_same_place() -> None:
+    starts = turned_poses(T_GIVEN, UP, 15.0)
+    assert is_rigid(starts, 1e-12)
+    np.testing.assert_array_equal(starts[:, :3, 3], np.tile(T_GIVEN[:3, 3], (len(starts), 1)))
+
+
+def test_turns_are_about_the_given_vertical() -> None:
+    """In a world that is tilted, as the first scan was, the sensor keeps its lean against the true vertical."""
+    up = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
+    starts = turned_poses(T_GIVEN, up, 15.0)
+    np.testing.assert_allclose(up @ starts[:, :3, 2].T, up @ T_GIVEN[:3, 2], atol=1e-12)
+
+
+@pytest.fixture
+def l_map(rng: np.random.Generator, l_shaped_room: RoomPoints) -> SurfelMap:
+    points = l_shaped_room(rng, 20_000)
+    local_map = SurfelMap(0.2, 100.0)
+    elevations = np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
+    local_map.insert(points, elevations, np.zeros(3))
+    return local_map
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0, 100.0, 180.0, -97.0, 40.0])
+def test_the_right_yaw_is_found_in_an_l_shaped_room(
+    rng: np.random.Generator, l_shaped_room: RoomPoints, l_map: SurfelMap, turned_deg: float
+) -> None:
+    """The sensor was turned on the spot by some angle that nobody knows."""
+    before = exp([0.0, 0.0, 0.2, 0.5, -0.5, 0.1])
+    after = before @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
+    points = transform_points(inverse(after), l_shaped_room(rng, 3_000))
+    best = best_starts(points, turned_poses(before, UP, 15.0), l_map)
+    assert (
+        np.rad2deg(rotation_angle(inverse(best[0]) @ after)) < 9.0
+    )  # of steps of 15; -97 lies 7 from one and 8 from the next
+    assert 1 < len(best) < 6
+
+
+def test_no_points_choose_no_start_in_particular(l_map: SurfelMap) -> None:
+    starts = turned_poses(T_GIVEN, UP, 90.0)
+    assert best_starts(np.empty((0, 3)), starts, l_map).shape[1:] == (4, 4)
+
+
+@pytest.mark.parametrize("true_deg", [-250.0, -50.0, 0.0, 200.0, 400.0])
+def test_the_rate_of_turning_that_bent_a_sweep_is_found(
+    rng: np.random.Generator, l_shaped_room: RoomPoints, l_map: SurfelMap, true_deg: float
+) -> None:
+    """Points of the room as a sweep of 0.1 s sees them that turns so fast; the best of steps of 50 deg/s."""
+    velocities = np.zeros((17, 6))
+    velocities[:, 2] = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
+    true = np.zeros(6)
+    true[2] = np.deg2rad(true_deg)
+    points, times = l_shaped_room(rng, 3_000), rng.uniform(0.0, 0.1, 3_000 * 2)
+    times = np.resize(times, len(points))
+    T_lidar_moment = exp(true * times[:, None])
+    seen = np.einsum("nji,nj->ni", T_lidar_moment[:, :3, :3], points - T_lidar_moment[:, :3, 3])
+    np.testing.assert_allclose(move(seen, times, true), points, atol=1e-9)
+    np.testing.assert_allclose(best_velocity(Sweep(seen, times), velocities, np.eye(4), l_map), true, atol=1e-12)

@@ -1,0 +1,242 @@
+"""Correspondences of points with surfaces that have formulas."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, make_transform
+from lidarslam.core.state import Saved
+from mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
+
+CELL = 0.4
+HALF = np.array([7.0, 5.0, 2.0])
+ORIGIN = np.zeros(3)
+HERE = np.eye(4)
+
+
+def elevations_of(points: FloatArray) -> FloatArray:
+    return np.asarray(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
+
+
+def map_of(points: FloatArray, cell_m: float = CELL) -> SurfelMap:
+    local_map = SurfelMap(cell_m, 100.0)
+    local_map.insert(points, elevations_of(points), ORIGIN)
+    return local_map
+
+
+def box_points(rng: np.random.Generator, count: int, margin: float = 0.0) -> FloatArray:
+    """Points (N, 3) on the six sides of a box, as far from its edges as the margin."""
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - margin)
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * HALF[axis]
+    return points
+
+
+def floor_points(rng: np.random.Generator, count: int, half_size: float = 4.0, z: float = -1.0) -> FloatArray:
+    return np.column_stack([rng.uniform(-half_size, half_size, (count, 2)), np.full(count, z)])
+
+
+def ring(elevation_deg: float, walls: tuple[float, float] | None = None, z: float | None = None) -> FloatArray:
+    """Where one laser meets two walls around a corner, at x and y, or the floor at height z."""
+    azimuth = np.deg2rad(np.linspace(0.0, 90.0, 901)[1:-1])
+    tangent = np.tan(np.deg2rad(elevation_deg))
+    if walls is not None:
+        distance = np.minimum(walls[0] / np.cos(azimuth), walls[1] / np.sin(azimuth))
+    else:
+        assert z is not None
+        distance = np.full(len(azimuth), z / tangent)
+    return np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), distance * tangent])
+
+
+def distances(points: FloatArray, matches: Correspondences) -> FloatArray:
+    offsets = points[matches.index] - matches.points
+    return np.abs(np.einsum("ij,ij->i", offsets, matches.normals))
+
+
+def test_a_wall_pulls_nobody_who_looks_at_its_back(rng: np.random.Generator) -> None:
+    """What is seen from the other side of a thin wall is its other side."""
+    wall = np.column_stack([np.full(20_000, 2.0), rng.uniform(-3.0, 3.0, (20_000, 2))])
+    local_map, asked = map_of(wall), np.column_stack([np.full(200, 2.1), rng.uniform(-2.0, 2.0, (200, 2))])
+    behind = HERE.copy()
+    behind[0, 3] = 4.0
+    assert len(local_map.match(asked, HERE)) == len(asked)
+    assert len(local_map.match(asked, behind)) == 0
+
+
+def test_both_sides_of_a_thin_wall_pull_those_who_see_them(rng: np.random.Generator) -> None:
+    """Though they lie in neighbouring cells, and in the same one of the coarser grids; seen more across than along."""
+    sides = [np.column_stack([np.full(20_000, x), rng.uniform(-1.3, 1.3, (20_000, 2))]) for x in (1.93, 2.02)]
+    sensors = [np.array([x, 0.0, 0.0]) for x in (0.0, 4.0)]
+    local_map = SurfelMap(0.07, 100.0)
+    for wall, sensor in zip(sides, sensors, strict=True):
+        local_map.insert(wall, rng.uniform(-0.3, 0.3, len(wall)), sensor)
+    for wall, sensor in zip(sides, sensors, strict=True):
+        asked = wall[np.abs(wall[:, 1:]).max(axis=1) < 1.0]
+        matches = local_map.match(asked, make_transform(np.eye(3), sensor))
+        assert len(np.unique(matches.index)) > 0.95 * len(asked)
+        assert distances(asked, matches).max() < 0.005
+
+
+def test_points_on_walls_meet_the_walls(rng: np.random.Generator) -> None:
+    local_map, asked = map_of(box_points(rng, 40_000)), box_points(rng, 2_000, margin=2 * CELL)
+    matches = local_map.match(asked, HERE)
+    np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
+    assert distances(asked, matches).max() < 1e-5
+    assert matches.thickness_m.max() < 1e-3
+    side = (np.abs(np.abs(asked) - HALF) < 1e-9).argmax(axis=1)[matches.index]
+    np.testing.assert_allclose(np.abs(matches.normals[np.arange(len(side)), side]), 1.0, atol=1e-9)
+
+
+def test_the_finest_grid_that_shows_a_plane_decides(rng: np.random.Generator) -> None:
+    """Two floors, one above the other: only fine cells keep them apart."""
+    lower, upper = floor_points(rng, 20_000, z=-1.0), floor_points(rng, 20_000, z=-1.0 + 3.2 * CELL)
+    local_map = map_of(np.concatenate([lower, upper]))
+    inner = np.abs(lower[:, :2]).max(axis=1) < 2.0
+    fine = local_map.match(lower[inner], HERE)
+    assert len(fine) == inner.sum()
+    assert distances(lower[inner], fine).max() < 1e-5
+
+
+def test_where_fine_cells_show_nothing_coarse_ones_do(rng: np.random.Generator) -> None:
+    sparse = floor_points(rng, 150)
+    asked = floor_points(rng, 300, half_size=3.0)
+    local_map = map_of(sparse)
+    matches = local_map.match(asked, HERE)
+    np.testing.assert_array_equal(np.sort(matches.index), np.arange(len(asked)))
+    assert distances(asked, matches).max() < 1e-5
+
+
+@pytest.mark.parametrize("first_level", range(len(LEVELS)))
+def test_coarse_grids_reach_farther(rng: np.random.Generator, first_level: int) -> None:
+    """Alone they reach at least as far above the floor as their own cells, and not three times as far."""
+    local_map = map_of(floor_points(rng, 40_000, z=-0.01))
+    cell_m = CELL * LEVELS[first_level]
+    above = floor_points(rng, 100, half_size=1.0, z=0.9 * cell_m)
+    assert len(local_map.match(above, make_transform(np.eye(3), [0.0, 0.0, 5.0]), first_level)) == 100
+    beyond = above + np.array([0.0, 0.0, 3.0 * CELL * LEVELS[-1]])
+    assert len(local_map.match(beyond, make_transform(np.eye(3), [0.0, 0.0, 9.0]), first_level)) == 0
+
+
+def test_finer_grids_are_left_out_on_request(rng: np.random.Generator) -> None:
+    """Of floors half a coarse cell apart, fine cells show each, coarse ones something between."""
+    low, high = floor_points(rng, 30_000, z=-1.0), floor_points(rng, 5_000, z=-1.0 + 3.2 * CELL)
+    local_map = map_of(np.concatenate([low, high]))
+    asked = floor_points(rng, 200, half_size=2.0)
+    assert distances(asked, local_map.match(asked, HERE, 0)).max() < 1e-5
+    assert distances(asked, local_map.match(asked, HERE, len(LEVELS) - 1)).min() > 0.01
+
+
+@pytest.mark.parametrize("elevation_deg", [-4.0, 0.5, 8.0])
+def test_a_ring_bent_around_a_corner_is_no_plane(elevation_deg: float) -> None:
+    points = ring(elevation_deg, walls=(4.0, 5.0))
+    assert len(map_of(points).match(points, HERE)) == 0
+
+
+def test_a_ring_on_the_ground_far_away_is_no_plane() -> None:
+    points = ring(-5.7, z=-1.0)
+    assert len(map_of(points).match(points, HERE)) == 0
+
+
+def test_two_rings_on_the_ground_show_it() -> None:
+    points = np.concatenate([ring(-5.7, z=-1.0), ring(-6.7, z=-1.0)])
+    matches = map_of(points).match(points, HERE)
+    assert len(np.unique(matches.index)) > 0.95 * len(points)
+    np.testing.assert_allclose(np.abs(matches.normals[:, 2]), 1.0, atol=1e-6)
+
+
+def test_two_rings_on_walls_show_them() -> None:
+    points = np.concatenate([ring(3.0, walls=(4.0, 5.0)), ring(6.0, walls=(4.0, 5.0))])
+    away = np.abs(points[:, 0] - points[:, 1] * 4.0 / 5.0) > 2.5  # from the corner
+    matches = map_of(points).match(points[away], HERE)
+    assert len(np.unique(matches.index)) > 0.9 * away.sum()
+    assert distances(points[away], matches).max() < 1e-5
+
+
+def test_nothing_is_matched_in_an_empty_map(rng: np.random.Generator) -> None:
+    empty = SurfelMap(CELL, 100.0)
+    assert len(empty.match(floor_points(rng, 10), HERE)) == 0
+
+
+def test_no_points_have_no_matches(rng: np.random.Generator) -> None:
+    local_map = map_of(floor_points(rng, 2_000))
+    assert len(local_map.match(np.empty((0, 3)), HERE)) == 0
+
+
+def test_memory_does_not_grow_along_the_way(rng: np.random.Generator) -> None:
+    local_map = SurfelMap(0.5, 50.0)
+    sizes = []
+    for step in range(200):
+        sensor = np.array([10.0 * step, 0.0, 0.0])
+        points = sensor + rng.uniform(-30.0, 30.0, (300, 3)) * [1.0, 1.0, 0.1]
+        local_map.insert(points, np.zeros(300), sensor)
+        sizes.append(len(local_map))
+    assert max(sizes[100:]) < 1.2 * max(sizes[:30])
+    assert min(sizes[100:]) > 0.5 * max(sizes[:30])
+
+
+def test_the_map_stays_around_the_sensor(rng: np.random.Generator) -> None:
+    local_map = SurfelMap(CELL, 20.0)
+    floor = floor_points(rng, 20_000, half_size=3.0)
+    local_map.insert(floor, elevations_of(floor), ORIGIN)
+    away = floor + np.array([30.0, 0.0, 0.0])
+    local_map.insert(away, elevations_of(floor), np.array([30.0, 0.0, 0.0]))
+    assert len(local_map.match(floor[:200], HERE)) == 0
+    assert len(local_map.match(away[:200], make_transform(np.eye(3), [30.0, 0.0, 0.0]))) == 200
+
+
+@pytest.mark.parametrize("factor", [0.45, 0.5, 0.8, 1.5, 2.0, 2.2])
+def test_planes_stay_in_place_when_cells_change_their_size(rng: np.random.Generator, factor: float) -> None:
+    """By more than two it changes when the sensor leaves a hall for a corridor, or the other way round."""
+    resized = map_of(box_points(rng, 60_000)).resized(CELL * factor)
+    assert resized.cell_m == CELL * factor
+    asked = box_points(rng, 2_000, margin=max(1.0, 2 * CELL * factor))
+    matches = resized.match(asked, HERE)
+    assert len(np.unique(matches.index)) > 0.95 * len(asked)
+    off = distances(asked, matches)
+    assert np.median(off) < 1e-3
+    assert np.percentile(off, 90) < 0.03
+
+
+def test_grazed_ground_is_still_known_when_cells_change_their_size(rng: np.random.Generator) -> None:
+    azimuth, elevation_deg = rng.uniform(-np.pi, np.pi, 20_000), rng.uniform(-8.0, -4.0, 20_000)
+    distance = 1.0 / np.tan(np.deg2rad(-elevation_deg))
+    ground = np.column_stack([distance * np.cos(azimuth), distance * np.sin(azimuth), np.full(20_000, -1.0)])
+    local_map = map_of(ground)
+    before, after = (len(m.match(ground[:500], HERE)) for m in (local_map, local_map.resized(2.0 * CELL)))
+    assert after > 0.8 * before > 350
+
+
+@pytest.mark.parametrize("roll_deg", [0.0, 10.0, -35.0])
+@pytest.mark.parametrize("pitch_deg", [0.0, 25.0])
+def test_the_vertical_of_a_tilted_map_is_that_of_its_floor(
+    rng: np.random.Generator, roll_deg: float, pitch_deg: float
+) -> None:
+    R = exp(np.deg2rad([roll_deg, pitch_deg, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
+    vertical = map_of(box_points(rng, 40_000) @ R.T).vertical()
+    tilt_deg = np.hypot(roll_deg, pitch_deg)  # the corners of a room as small as this pull at it
+    assert np.rad2deg(np.arccos(vertical @ R[:, 2])) < 1.0 + 0.16 * tilt_deg
+    assert np.linalg.norm(vertical) == pytest.approx(1.0)
+
+
+def test_without_a_floor_the_vertical_is_the_worlds(rng: np.random.Generator) -> None:
+    wall = np.column_stack([np.full(4_000, 3.0), rng.uniform(-3, 3, (4_000, 2))])
+    np.testing.assert_array_equal(map_of(wall).vertical(), [0.0, 0.0, 1.0])
+
+
+def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    monkeypatch.setattr("mapping.surfels.surfel_map._TIDIED_AFTER", 3)
+    tidied: list[float] = []
+    monkeypatch.setattr("mapping.surfels.grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
+
+    def add(local_map: SurfelMap) -> int:
+        tidied.clear()
+        local_map.insert(rng.uniform(-1.0, 1.0, (50, 3)), np.zeros(50), np.zeros(3))
+        return len(tidied)
+
+    local_map = SurfelMap(0.1, 30.0)
+    assert [add(local_map) for _ in range(5)] == [0, 0, 3, 0, 0]
+    restored = SurfelMap(0.1, 30.0)
+    restored.restore(Saved(local_map.state()))
+    assert [add(restored) for _ in range(4)] == [3, 0, 0, 3]
+    assert [add(local_map.resized(0.2)), add(local_map)] == [3, 3]

@@ -1,0 +1,112 @@
+"""The hash table of cells against a dictionary."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps, point_keys
+
+Cell = tuple[int, int, int]
+near = st.integers(-3, 3)
+anywhere = st.integers(-(1 << 19), (1 << 19) - 1)
+cells_anywhere = st.lists(st.tuples(anywhere, anywhere, anywhere), min_size=1, max_size=40)
+cells_near = st.lists(st.tuples(near, near, near), min_size=1, max_size=40)
+
+
+def keys_of(cells: list[Cell]) -> NDArray[np.int64]:
+    return cell_keys(np.array(cells, dtype=np.int64).reshape(-1, 3))
+
+
+def random_cells(rng: np.random.Generator, count: int, reach: int = 1000) -> NDArray[np.int64]:
+    return rng.integers(-reach, reach, (count, 3))
+
+
+@given(st.lists(st.one_of(cells_near, cells_anywhere), max_size=6), cells_near)
+def test_equals_a_dictionary_after_any_insertions(batches: list[list[Cell]], asked: list[Cell]) -> None:
+    table, oracle = VoxelHash(), {}
+    for batch in batches:
+        rows = table.insert(keys_of(batch))
+        for cell, row in zip(batch, rows.tolist(), strict=True):
+            assert oracle.setdefault(cell, row) == row
+    assert len(table) == len(oracle)
+    assert sorted(oracle.values()) == list(range(len(oracle)))
+    wanted = [*asked, *oracle]
+    assert table.find(keys_of(wanted)).tolist() == [oracle.get(cell, ABSENT) for cell in wanted]
+
+
+@given(cells_anywhere)
+def test_cells_come_back_from_their_keys(cells: list[Cell]) -> None:
+    assert [tuple(cell) for cell in key_cells(keys_of(cells)).tolist()] == cells
+
+
+@given(cells_anywhere, cells_near)
+def test_a_step_leads_to_the_neighbours_key(cells: list[Cell], offsets: list[Cell]) -> None:
+    inside = np.clip(np.array(cells), -(1 << 19) + 3, (1 << 19) - 4)
+    steps = np.array(offsets)
+    np.testing.assert_array_equal(
+        cell_keys(inside)[:, None] + key_steps(steps), cell_keys(inside[:, None] + steps[None])
+    )
+
+
+def test_points_below_zero_lie_in_the_cells_below_zero() -> None:
+    points = np.array([[-0.01, 0.01, 0.49], [-0.51, 0.5, 0.99]])
+    assert key_cells(point_keys(points, 0.5)).tolist() == [[-1, 0, 0], [-2, 1, 1]]
+
+
+def test_a_key_repeated_in_one_insertion_has_one_row() -> None:
+    table = VoxelHash()
+    rows = table.insert(keys_of([(1, 2, 3), (0, 0, 0), (1, 2, 3), (1, 2, 3)]))
+    assert len(table) == 2
+    assert len({rows[0], rows[2], rows[3]}) == 1
+    assert rows[0] != rows[1]
+
+
+def test_rows_of_before_stay_while_the_table_grows(rng: np.random.Generator) -> None:
+    table = VoxelHash()
+    first = cell_keys(random_cells(rng, 3_000))
+    rows = table.insert(first)
+    for _ in range(4):
+        table.insert(cell_keys(random_cells(rng, 15_000)))
+    assert len(table) > 50_000
+    np.testing.assert_array_equal(table.find(first), rows)
+
+
+def test_a_full_neighbourhood_is_told_apart(rng: np.random.Generator) -> None:
+    """Cells side by side, as a wall's are, all find their own row."""
+    cells = np.stack(np.meshgrid(*[np.arange(-15, 15)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    keys = cell_keys(rng.permutation(cells))
+    table = VoxelHash()
+    table.insert(keys)
+    assert np.unique(table.find(keys)).size == len(keys)
+
+
+def test_nothing_is_found_in_an_empty_table() -> None:
+    assert VoxelHash().find(keys_of([(0, 0, 0), (5, -5, 5)])).tolist() == [ABSENT, ABSENT]
+
+
+def test_rows_have_the_shape_of_the_keys(rng: np.random.Generator) -> None:
+    table = VoxelHash()
+    keys = cell_keys(random_cells(rng, 60).reshape(20, 3, 3))
+    table.insert(keys.ravel())
+    assert table.find(keys).shape == (20, 3)
+    np.testing.assert_array_equal(table.find(keys).ravel(), table.find(keys.ravel()))
+
+
+def test_rebuilt_it_holds_the_new_keys_only_in_their_order(rng: np.random.Generator) -> None:
+    table = VoxelHash()
+    before = np.unique(cell_keys(random_cells(rng, 20_000)))
+    table.insert(before)
+    kept, dropped = before[::3], np.setdiff1d(before, before[::3])
+    kept = rng.permutation(kept)
+    table.rebuild(kept)
+    assert len(table) == len(kept)
+    np.testing.assert_array_equal(table.find(kept), np.arange(len(kept)))
+    assert (table.find(dropped) == ABSENT).all()
+
+
+def test_goes_on_counting_after_a_rebuild() -> None:
+    table = VoxelHash()
+    table.insert(keys_of([(k, 0, 0) for k in range(100)]))
+    table.rebuild(keys_of([(7, 0, 0), (3, 0, 0)]))
+    assert table.insert(keys_of([(3, 0, 0), (200, 0, 0), (7, 0, 0)])).tolist() == [1, 2, 0]

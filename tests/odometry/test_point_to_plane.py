@@ -1,0 +1,150 @@
+"""The compiled sums over correspondences against plain NumPy, on noisy sweeps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from odometry.alignment.point_to_plane import FINE_M, PointToPlane
+from odometry.alignment.sweep_motion import SweepPair
+from odometry.images.projection import ImageGrid
+
+STEP, FILL, GATE_M, GATE_PER_M, LEAST_COSINE = 2, 4, 0.2, 0.04, 0.8
+Motion = tuple[FloatArray, FloatArray, FloatArray]  # T_prev_curr, velocity and its change
+TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)
+
+
+def movement(seed: int) -> Motion:
+    """Not quite the sweeps' own, and bent."""
+    rng = np.random.default_rng(seed)
+    velocity = np.array(TWIST) + rng.normal(0.0, 0.1, 6)
+    return exp(0.1 * velocity), velocity, rng.normal(0.0, 0.2, 6)
+
+
+def noisy_pair(scene, rolling: bool) -> SweepPair:
+    """A sweep on the one before; points scattered, some pixels empty, some without a normal."""
+    rng = np.random.default_rng(0)
+    worn = []
+    for sweep in scene.sweeps(2, TWIST, rolling=rolling):
+        points = (sweep.points * (1.0 + 0.002 * rng.normal(size=sweep.points.shape))).astype(np.float32)
+        kept = rng.uniform(size=sweep.offsets.shape)
+        worn.append(replace(sweep, points=points * (kept > 0.05), normals=sweep.normals * (kept > 0.2)))
+    return SweepPair(worn[1], worn[0], 0.1)
+
+
+class SlowSums:
+    """The same point by point, without blocks or tables."""
+
+    def __init__(self, sweeps: SweepPair) -> None:
+        self.target = sweeps.previous
+        height, width = self.target.offsets.shape
+        self.grid = ImageGrid(height, width, self.target.low, self.target.high)
+        chosen = [
+            (sweeps.current.points[:, i, j], sweeps.current.normals[:, i, j], sweeps.current.offsets[i, j])
+            for i in range(sweeps.current.offsets.shape[0])
+            for j in range(0, sweeps.current.offsets.shape[1], STEP)
+        ]
+        chosen = [(p.astype(float), n.astype(float), float(t)) for p, n, t in chosen if n.any()]
+        self.points = chosen
+        self.source = np.array([[self.filled(i, j) for j in range(width)] for i in range(height)])
+
+    def filled(self, i: int, j: int) -> int:
+        """The column of the nearest pixel in the row that has a normal."""
+        width = self.target.offsets.shape[1]
+        for step in range(2 * FILL + 1):
+            distance = (step + 1) // 2 * (1 if step % 2 == 1 else -1)
+            if self.target.normals[:, i, (j - distance) % width].any():
+                return (j - distance) % width
+        return j
+
+    def pixel(self, point: FloatArray) -> tuple[tuple[int, int], bool]:
+        x, y, z = point
+        row = (np.arctan2(z, np.hypot(x, y)) - self.grid.elevation_low) * self.grid.rows_per_radian
+        column = np.arctan2(y, x) % (2.0 * np.pi) * (self.grid.columns / (2.0 * np.pi)) % self.grid.columns
+        whole = int(np.floor(row + 0.5))
+        i = min(max(whole, 0), self.grid.rows - 1)
+        return (i, int(self.source[i, int(column)])), 0 <= whole < self.grid.rows
+
+    def pairs(self, motion: Motion, scale_m: float):
+        """Jacobian (12,), residual, turned normal, and whether the point is in view and kept, of each point."""
+        T, velocity, change = motion
+        late, early = velocity + change, velocity - change
+        for p, n, t in self.points:
+            moved = T[:3, :3] @ seen_at(p, t, late) + T[:3, 3]
+            pixel, _ = self.pixel(moved)
+            time = float(self.target.offsets[pixel])
+            seen = seen_at(moved, -time, early)
+            pixel, inside = self.pixel(seen)
+            plane, difference = (
+                self.target.normals[(slice(None), *pixel)],
+                seen - self.target.points[(slice(None), *pixel)],
+            )
+            distance = np.linalg.norm(seen)
+            across = max(abs(seen @ plane), 0.2 * distance)
+            gate = GATE_M + GATE_PER_M * distance**2 / across + scale_m
+            turned = T[:3, :3] @ n
+            kept = inside and np.linalg.norm(difference) < gate and turned @ plane > LEAST_COSINE
+            J = np.concatenate([np.cross(seen, plane), plane])
+            yield np.concatenate([J, (t + time) * J]), difference @ plane, turned, inside, kept
+
+
+def seen_at(point: FloatArray, seconds: float, velocity: FloatArray) -> FloatArray:
+    T = exp(seconds * velocity)
+    return T[:3, :3] @ point + T[:3, 3]
+
+
+@pytest.mark.parametrize("rolling", [False, True])
+@pytest.mark.parametrize("scale_m", [0.5, 0.05])
+def test_normal_equations_are_those_of_the_slow_sums(box_room, rolling, scale_m):
+    sweeps = noisy_pair(box_room, rolling)
+    H, g = PointToPlane(sweeps, STEP).normal_equations(*movement(1), scale_m)
+    expected_H, expected_g = np.zeros((12, 12)), np.zeros(12)
+    for J, residual, _, _, kept in SlowSums(sweeps).pairs(movement(1), scale_m):
+        weight = kept / (1.0 + (residual / scale_m) ** 2) ** 2
+        expected_H += weight * np.outer(J, J)
+        expected_g += weight * residual * J
+    assert np.trace(H[:6, :6]) > 100.0
+    assert bool(H[6:].any()) == rolling
+    # A point on the border of two pixels may be held against either.
+    np.testing.assert_allclose(H, expected_H, atol=3e-3 * np.abs(expected_H).max())
+    np.testing.assert_allclose(g, expected_g, atol=3e-3 * np.abs(expected_H).max() * scale_m)
+
+
+@pytest.mark.parametrize("rolling", [False, True])
+def test_fits_are_those_of_the_slow_sums(box_room, rolling):
+    sweeps = noisy_pair(box_room, rolling)
+    found = PointToPlane(sweeps, STEP).fit(*movement(2))
+    slow = list(SlowSums(sweeps).pairs(movement(2), FINE_M))
+    seen = [turned for _, _, turned, inside, _ in slow if inside]
+    good = [(J, residual, turned) for J, residual, turned, _, kept in slow if kept and abs(residual) < 2.0 * FINE_M]
+    assert found.inliers > 50
+    assert found.inlier_share < found.share_in_view
+    assert found.inliers == pytest.approx(len(good), abs=5, rel=3e-3)
+    assert found.share_in_view == pytest.approx(len(seen) / len(slow), abs=2e-3)
+    assert found.inlier_share == pytest.approx(len(good) / len(slow), abs=2e-3)
+    assert found.squared_residuals == pytest.approx(sum(residual**2 for _, residual, _ in good), rel=1e-2)
+    for matrix, vectors in (
+        (found.H, [J for J, _, _ in good]),
+        (found.in_view, seen),
+        (found.inlier, [turned for _, _, turned in good]),
+    ):
+        expected = np.array(vectors).T @ np.array(vectors)
+        np.testing.assert_allclose(matrix, expected, atol=4e-3 * np.abs(expected).max())
+
+
+def test_an_image_without_points_says_nothing(box_room):
+    sweeps = noisy_pair(box_room, True)
+    parts = {name: 0.0 * getattr(sweeps.current, name) for name in ("points", "normals", "offsets")}
+    sums = PointToPlane(replace(sweeps, current=replace(sweeps.current, **parts)), STEP)
+    H, g = sums.normal_equations(*movement(1), 0.5)
+    assert not H.any()
+    assert not g.any()
+    assert sums.fit(*movement(1)).inliers == 0
+
+
+def test_a_motion_that_is_none_holds_nothing(box_room):
+    """NaN, as of equations without a solution, must not lead out of the image."""
+    sums = PointToPlane(noisy_pair(box_room, True), STEP)
+    H, _ = sums.normal_equations(np.full((4, 4), np.nan), np.zeros(6), np.zeros(6), 0.5)
+    assert not H.any()
