@@ -10,8 +10,16 @@ from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow,
 from evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD
 
-_BEST, _NOTHING = "*", "-"
-_ALWAYS = ("ate_rotation_rmse_deg", "rpe_translation_rmse_m", "ms_per_scan_median", "peak_rss_mb")
+_BEST = "*"
+# Columns without a value are left out.
+_SHOWN = (
+    "ate_rotation_rmse_deg",
+    "rpe_translation_rmse_m",
+    "ms_per_scan_median",
+    "peak_rss_mb",
+    "map_chamfer_m",
+    "lost_scans",
+)
 
 
 def format_result(recording: str, result: MethodResult, reused: bool = False) -> str:
@@ -52,16 +60,16 @@ def _table(sequence: SequenceComparison) -> Table:
     # KITTI's drift, or that over the longest segments for which the recording is long enough.
     drifts = ["kitti_translation_percent", *(f"segment_{each}_translation_percent" for each in SHORT_LENGTHS_M[::-1])]
     drift = next((name for name in drifts if any(QUANTITIES[name].of(result) is not None for result in results)), None)
-    quantities = [
-        QUANTITIES[name] for name in ("ate_rmse_m", drift or drifts[0], *_ALWAYS, "map_chamfer_m", "lost_scans")
-    ]
+    quantities = [QUANTITIES[name] for name in ("ate_rmse_m", drift or drifts[0], *_SHOWN)]
     columns = [TableColumn("", q.label, q.unit, q.digits, q.lower_is_better) for q in quantities]
     rows = []
     for result in results:
         cells = [TableCell(quantity.of(result), ranked=result.status in WHOLE) for quantity in quantities]
         rows.append(TableRow(result.name, [TableCell(result.status), *cells]))
     against = "" if sequence.reference is None else f", against {sequence.reference_name}"
-    return Table(f"{sequence.sequence}{against}", [TableColumn("", "status", numeric=False), *columns], rows)
+    return Table(
+        f"{sequence.sequence}{against}", [TableColumn("", "status", numeric=False), *columns], rows
+    ).without_empty()
 
 
 def _table_lines(table: Table) -> Iterator[str]:
@@ -77,7 +85,7 @@ def _table_lines(table: Table) -> Iterator[str]:
         texts = [f"{heading}{column.label} {column.unit}".strip() + " " * column.numeric]
         for row, each in enumerate(table.rows):
             cell = each.cells[number]
-            text = _NOTHING if cell.value is None else number_text(cell.value, column.digits)
+            text = number_text(cell.value, column.digits)
             mark = (_BEST if (row, number) in best else " ") if column.numeric else ""
             texts.append(f"{text}{mark}{cell.note and f'({cell.note})'}")
         width = max(map(len, texts))
