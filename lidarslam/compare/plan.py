@@ -31,7 +31,7 @@ class PlannedRecording:
 
 
 def make_plan(request: CompareRequest) -> tuple[list[PlannedRecording], list[MissingRecording]]:
-    """Open every recording and resolve every configuration; the recordings that are there, and those that are not.
+    """Open every recording and resolve every configuration; the planned recordings and the missing ones.
 
     Raises:
         InputError: a recording is not there and may not be skipped, or none is.

@@ -10,7 +10,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 
-# Clock readings count from 1970; what lies outside these years is a number of another kind.
+# Clock readings count from 1970; a number outside these years is none.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
 # Thousands of years are no time in seconds, and nanoseconds would be lost on them.
 _LATEST_S = 1e11

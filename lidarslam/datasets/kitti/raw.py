@@ -113,7 +113,7 @@ class KittiRawRecording(FileRecording):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is missing, and stamps that were mended."""
+        """Stamps that were interpolated, and missing scans."""
         first, last = self._numbers[0], self._numbers[-1]
         gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
         return (*self._timing.notes, *gaps)

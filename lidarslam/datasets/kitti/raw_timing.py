@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.stamps import mend_stamps, read_stamps
 
-# Sweeps of one drive last the same to 0.2 %; what differs by more than this part is a wrong stamp.
+# Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
 _SWEEP_TOLERANCE = 0.25
 
 

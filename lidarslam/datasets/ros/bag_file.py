@@ -193,7 +193,7 @@ class BagFile:
             reader.close()
 
     @contextmanager
-    def _damage(self, what: str) -> Iterator[None]:
+    def _damage(self, place: str) -> Iterator[None]:
         """Damaged files make rosbags raise nearly anything: its own errors, assertions, KeyError, struct.error."""
         try:
             yield
@@ -201,7 +201,7 @@ class BagFile:
             raise
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{self.path}: {what} ({reason}); {self._remedy()}") from error
+            raise InputError(f"{self.path}: {place} ({reason}); {self._remedy()}") from error
 
     def _suffix(self, path: Path) -> str:
         return path.suffix if self._ros2 else ".bag"
