@@ -25,12 +25,7 @@ Counter = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Narrator:
-    """Progress of a comparison.
-
-    Attributes:
-        counting: for the time of one method, given its name.
-        tell: called with a line for each finished method.
-    """
+    """Progress: `counting` for the time of one method, by its name; `tell` with a line for each finished method."""
 
     counting: Callable[[str], AbstractContextManager[Counter]]
     tell: Callable[[str], None]

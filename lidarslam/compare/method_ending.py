@@ -10,9 +10,6 @@ from lidarslam.compare.method_process import LOST
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.run.directory import SUMMARY
 
-# The run came to its end, lost scans or not.
-WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
-
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
 _LONGEST_MESSAGE = 300

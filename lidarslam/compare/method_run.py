@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from evaluation.comparison.comparison import MethodResult
-from lidarslam.compare.method_ending import WHOLE, judge, read_summary
+from evaluation.comparison.comparison import WHOLE, MethodResult
+from lidarslam.compare.method_ending import judge, read_summary
 from lidarslam.compare.method_process import encode
 from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml

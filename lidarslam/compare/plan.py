@@ -21,15 +21,7 @@ RECORDINGS = "recordings"
 
 @dataclass(frozen=True, eq=False)
 class PlannedRecording:
-    """One recording and its runs.
-
-    Attributes:
-        name: unique in the comparison; of its folder too.
-        source: where it lies.
-        entry: as it was asked for.
-        recording: open.
-        runs: one a method, each into a directory with the method's name.
-    """
+    """One recording under a name of its own, and its runs, one a method, each into a directory with its name."""
 
     name: str
     source: Path
@@ -39,7 +31,7 @@ class PlannedRecording:
 
 
 def make_plan(request: CompareRequest) -> tuple[list[PlannedRecording], list[MissingRecording]]:
-    """Open every recording and resolve every configuration; the recordings that are there, and those that are not.
+    """Open every recording and resolve every configuration; the planned recordings and the missing ones.
 
     Raises:
         InputError: a recording is not there and may not be skipped, or none is.

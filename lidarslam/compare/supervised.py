@@ -76,7 +76,6 @@ def supervise(
             stderr=stderr,
             cwd=cwd,
             start_new_session=True,
-            text=True,
             errors="replace",
         ) as process,
     ):

@@ -1,18 +1,25 @@
 """Output of `lidarslam compare`: a line for each finished method, and tables at the end."""
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
-from evaluation.comparison.quantities import QUANTITIES, Quantity
-from evaluation.comparison.table import Table, TableCell, TableColumn
+from evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
+from evaluation.comparison.quantities import QUANTITIES
+from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
 from evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.compare.method_ending import WHOLE
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD
 
-_BEST, _NOTHING = "*", "-"
-_ALWAYS = ("ate_rotation_rmse_deg", "rpe_translation_rmse_m", "ms_per_scan_median", "peak_rss_mb")
+_BEST = "*"
+# Columns without a value are left out.
+_SHOWN = (
+    "ate_rotation_rmse_deg",
+    "rpe_translation_rmse_m",
+    "ms_per_scan_median",
+    "peak_rss_mb",
+    "map_chamfer_m",
+    "lost_scans",
+)
 
 
 def format_result(recording: str, result: MethodResult, reused: bool = False) -> str:
@@ -29,14 +36,17 @@ def format_comparison(comparison: Comparison, out: Path) -> str:
 
 
 def _lines(comparison: Comparison, out: Path) -> Iterator[str]:
-    tables = [list(_sequence_lines(sequence)) for sequence in comparison.sequences]
-    tables += [list(_summary_lines(table)) for table in comparison.tables]
-    for lines in tables:
-        yield from (*lines, "")
+    tables = [_table(sequence) for sequence in comparison.sequences]
+    for sequence, table in zip(comparison.sequences, tables, strict=True):
+        yield from _table_lines(table)
+        yield from (f"{result.name}: {result.message}" for result in sequence.methods if result.message)
+        yield from (*sequence.notes, "")
+    for table in comparison.tables:
+        yield from (*_table_lines(table), "")
     for missing in comparison.missing:
         yield f"left out: {missing.sequence} ({missing.reason})"
     yield from comparison.notes
-    if any(_BEST in line for lines in tables for line in lines):
+    if any(table.best() for table in (*tables, *comparison.tables)):
         yield f"{_BEST} best of its column"
     yield f"report    {out / REPORT_HTML}, {out / REPORT_MD}, {out / COMPARISON}"
     runs = [str(out / result.run) for sequence in comparison.sequences[:1] for result in sequence.methods if result.run]
@@ -44,85 +54,43 @@ def _lines(comparison: Comparison, out: Path) -> Iterator[str]:
         yield f"look      {shlex.join(['lidarslam', 'view', *runs])}"
 
 
-def _sequence_lines(sequence: SequenceComparison) -> Iterator[str]:
-    against = "" if sequence.reference is None else f", against {sequence.reference_name}"
-    yield f"{sequence.sequence}{against}"
+def _table(sequence: SequenceComparison) -> Table:
+    """The methods on one recording; a run that ended early is not compared with others."""
     results = sequence.methods
-    left = [["method", *(result.name for result in results)], ["status", *(result.status for result in results)]]
-    # A run that ended early is not compared with others.
-    whole = [result.status in WHOLE for result in results]
-    right = []
-    for quantity in _shown_quantities(results):
-        cells = _cells([quantity.of(result) for result in results], quantity.digits, quantity.lower_is_better, whole)
-        right.append([f"{_head(quantity.label, quantity.unit)} ", *cells])
-    yield from _grid(left, right)
-    for result in results:
-        if result.message:
-            yield f"{result.name}: {result.message}"
-    yield from sequence.notes
-
-
-def _shown_quantities(results: Sequence[MethodResult]) -> Iterator[Quantity]:
-    yield QUANTITIES["ate_rmse_m"]
     # KITTI's drift, or that over the longest segments for which the recording is long enough.
-    drifts = [QUANTITIES["kitti_translation_percent"]]
-    drifts += [QUANTITIES[f"segment_{length_m}_translation_percent"] for length_m in reversed(SHORT_LENGTHS_M)]
-    yield next((drift for drift in drifts if any(drift.of(result) is not None for result in results)), drifts[0])
-    yield from (QUANTITIES[name] for name in _ALWAYS)
-    chamfer = QUANTITIES["map_chamfer_m"]
-    if any(chamfer.of(result) is not None for result in results):
-        yield chamfer
-    yield QUANTITIES["lost_scans"]
+    drifts = ["kitti_translation_percent", *(f"segment_{each}_translation_percent" for each in SHORT_LENGTHS_M[::-1])]
+    drift = next((name for name in drifts if any(QUANTITIES[name].of(result) is not None for result in results)), None)
+    quantities = [QUANTITIES[name] for name in ("ate_rmse_m", drift or drifts[0], *_SHOWN)]
+    columns = [TableColumn("", q.label, q.unit, q.digits, q.lower_is_better) for q in quantities]
+    rows = []
+    for result in results:
+        cells = [TableCell(quantity.of(result), ranked=result.status in WHOLE) for quantity in quantities]
+        rows.append(TableRow(result.name, [TableCell(result.status), *cells]))
+    against = "" if sequence.reference is None else f", against {sequence.reference_name}"
+    return Table(
+        f"{sequence.sequence}{against}", [TableColumn("", "status", numeric=False), *columns], rows
+    ).without_empty()
 
 
-def _summary_lines(table: Table) -> Iterator[str]:
+def _table_lines(table: Table) -> Iterator[str]:
+    """Lines of columns: words to the left, numbers to the right, the best of a column marked."""
     yield table.title
+    best = table.best()
     sources = list(dict.fromkeys(row.source for row in table.rows if row.source))
     marks = [f" [{sources.index(row.source) + 1}]" if row.source else "" for row in table.rows]
-    left = [["method", *(f"{row.method}{mark}" for row, mark in zip(table.rows, marks, strict=True))]]
-    right = []
+    names = ["method", *(f"{row.method}{mark}" for row, mark in zip(table.rows, marks, strict=True))]
+    columns = [[name.ljust(max(map(len, names))) for name in names]]
     for number, column in enumerate(table.columns):
-        of_column = [row.cells[number] for row in table.rows]
-        cells = _cells([cell.value for cell in of_column], column.digits, column.lower_is_better)
-        cells = [f"{text}{_share(cell, column)}" for text, cell in zip(cells, of_column, strict=True)]
-        right.append([f"{column.heading}: {_head(column.label, column.unit)} ", *cells])
-    yield from _grid(left, right)
+        heading = f"{column.heading}: " if column.heading else ""
+        texts = [f"{heading}{column.label} {column.unit}".strip() + " " * column.numeric]
+        for row, each in enumerate(table.rows):
+            cell = each.cells[number]
+            text = number_text(cell.value, column.digits)
+            mark = (_BEST if (row, number) in best else " ") if column.numeric else ""
+            texts.append(f"{text}{mark}{cell.note and f'({cell.note})'}")
+        width = max(map(len, texts))
+        columns.append([text.rjust(width) if column.numeric else text.ljust(width) for text in texts])
+    yield from ("  ".join(cells).rstrip() for cells in zip(*columns, strict=True))
     if table.note:
         yield table.note
-    for number, source in enumerate(sources, start=1):
-        yield f"[{number}] {source}"
-
-
-def _share(cell: TableCell, column: TableColumn) -> str:
-    """Of how many recordings a mean is, where some are missing."""
-    of = len(column.sequences)
-    return f"({cell.averaged} of {of})" if cell.value is not None and cell.averaged < of else ""
-
-
-def _head(label: str, unit: str) -> str:
-    return f"{label} {unit}".strip()
-
-
-def _cells(
-    values: Sequence[float | str | None],
-    digits: int,
-    lower_is_better: bool | None,
-    comparable: Sequence[bool] | None = None,
-) -> list[str]:
-    """Numbers with the best marked where there is a choice; the mark stands in a place of its own."""
-    texts = [_NOTHING if v is None else v if isinstance(v, str) else f"{v:.{digits}f}" for v in values]
-    compared = comparable or [True] * len(values)
-    numbers = [v for v, counts in zip(values, compared, strict=True) if counts and isinstance(v, int | float)]
-    best = None
-    if lower_is_better is not None and len(numbers) > 1:
-        best = f"{(min if lower_is_better else max)(numbers):.{digits}f}"
-    marks = [_BEST if counts and text == best else " " for text, counts in zip(texts, compared, strict=True)]
-    return [f"{text}{mark}" for text, mark in zip(texts, marks, strict=True)]
-
-
-def _grid(left: Sequence[Sequence[str]], right: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines of columns: words to the left, numbers to the right."""
-    columns = [[text.ljust(max(map(len, texts))) for text in texts] for texts in left]
-    columns += [[text.rjust(max(map(len, texts))) for text in texts] for texts in right]
-    for cells in zip(*columns, strict=True):
-        yield "  ".join(cells).rstrip()
+    yield from (f"[{number}] {source}" for number, source in enumerate(sources, start=1))

@@ -40,7 +40,7 @@ class PointField:
 
 @dataclass(frozen=True, eq=False)
 class RecordingInfo:
-    """What `lidarslam info` prints.
+    """Description of a recording, as `lidarslam info` prints it.
 
     Attributes:
         reader: name of the reader in the registry.
@@ -48,7 +48,7 @@ class RecordingInfo:
         first: the first scan that can be read.
         last_stamp: stamp of the last scan, seconds.
         ground_truth: where the true trajectory was found, if it was.
-        point_time: what was inferred about the time of single points; None without.
+        point_time: as inferred from the values of a time field; None without.
         topics: of a bag, all of them; `topic` is the one that is read.
         fields: of the points as stored.
         notes: further facts for the user, one sentence each.

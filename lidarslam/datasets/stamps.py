@@ -1,4 +1,4 @@
-"""Stamps of scans: read from text, found in file names, mended where they do not increase."""
+"""Time stamps of scans: read from text or file names, interpolated where they do not increase."""
 
 import re
 from bisect import bisect_left
@@ -10,7 +10,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 
-# Clock readings count from 1970; what lies outside these years is a number of another kind.
+# Clock readings count from 1970; a number outside these years is none.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
 # Thousands of years are no time in seconds, and nanoseconds would be lost on them.
 _LATEST_S = 1e11
@@ -72,21 +72,20 @@ def stamps_from_names(stems: Sequence[str]) -> FloatArray | None:
     Understood are seconds with decimals (1311868164.36), integer clock readings in milli-, micro- or nanoseconds
     (1311868164360000000), and seconds and nanoseconds with an underscore between (cloud_1583836591_182590976).
     """
-    stamps = [_stamp_from_name(stem) for stem in stems]
-    if any(stamp is None for stamp in stamps):
-        return None
-    return np.array(stamps, dtype=np.float64)
+    stamps = np.array([_stamp_from_name(stem) for stem in stems], dtype=np.float64)
+    return None if np.isnan(stamps).any() else stamps
 
 
-def _stamp_from_name(stem: str) -> float | None:
+def _stamp_from_name(stem: str) -> float:
+    """NaN where it is none."""
     if _SECONDS_NAME.fullmatch(stem):
-        return seconds if (seconds := float(stem)) < _LATEST_S else None
+        return seconds if (seconds := float(stem)) < _LATEST_S else np.nan
     if _INTEGER_NAME.fullmatch(stem):
-        return _clock_seconds(int(stem))
+        return _clock_seconds(int(stem)) or np.nan
     match = _SECONDS_NANOSECONDS_NAME.fullmatch(stem)
     if match and _EPOCH_1990_S <= int(match[1]) < _EPOCH_2100_S:
         return int(match[1]) + int(match[2]) * 1e-9
-    return None
+    return np.nan
 
 
 def increasing_rows(stamps: FloatArray) -> FloatArray:
@@ -131,10 +130,8 @@ def mend_stamps(stamps: FloatArray, numbers: FloatArray) -> tuple[FloatArray, in
     known, at = stamps[kept], numbers[kept]
     # Between two good stamps the line keeps the order; outside them it goes on at the median rate.
     period = float(np.median(np.diff(known) / np.diff(at)))
-    mended = np.interp(numbers, at, known)
-    mended = np.where(numbers < at[0], known[0] + (numbers - at[0]) * period, mended)
-    mended = np.where(numbers > at[-1], known[-1] + (numbers - at[-1]) * period, mended)
-    return mended, int(len(stamps) - np.count_nonzero(kept))
+    outside = np.minimum(numbers - at[0], 0.0) + np.maximum(numbers - at[-1], 0.0)
+    return np.interp(numbers, at, known) + outside * period, int(len(stamps) - np.count_nonzero(kept))
 
 
 def scan_rate(stamps: FloatArray) -> float | None:

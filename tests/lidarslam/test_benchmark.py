@@ -139,7 +139,7 @@ def test_recordings_are_made_and_missing_ones_said(tmp_path: Path) -> None:
     command = ["compare", "--benchmark", str(file), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(main, command, catch_exceptions=False)
     assert result.exit_code == 0
-    assert "(1 of 2)" in result.stdout
+    assert "(over 1 of 2)" in result.stdout
     assert "left out: gone" in result.stdout
     content = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert content["tables"][0]["rows"][0]["cells"][0]["averaged"] == 1

@@ -1,4 +1,4 @@
-"""Fields of points in a structured array, whatever file it comes from."""
+"""Fields of points in a structured array."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -36,9 +36,9 @@ def scan_indices(count: int, start: int, stop: int | None, step: int) -> range:
 
 
 def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDArray[np.intp]]:
-    """The scan files of a folder whose names are numbers, such as 000004.bin, and those numbers, in their order.
+    """The scan files of a folder with numbers for names, such as 000004.bin, in their order, and the numbers.
 
-    The number says which row of the stamp and pose files belongs to a scan, since recordings may have gaps.
+    The number is the scan's row in the stamp and pose files, since recordings may have gaps.
 
     Raises:
         InputError: there are none, a name is not a number, or a number occurs twice.

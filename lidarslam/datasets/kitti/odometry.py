@@ -102,7 +102,7 @@ class KittiOdometryRecording(FileRecording):
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
-        """T_world_lidar of every pose that has a stamp, those of absent scans included."""
+        """T_world_lidar of every pose with a stamp, also where the scan is absent."""
         path, T_cam_lidar = self._pose_file, self.T_cam_lidar
         if path is None or T_cam_lidar is None:
             return None
@@ -132,7 +132,7 @@ class KittiOdometryRecording(FileRecording):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is missing, or more than it should be."""
+        """Missing and superfluous stamps, scans and poses."""
         return tuple(self._warnings())
 
     def _warnings(self) -> Iterator[str]:

@@ -80,17 +80,14 @@ class KittiRawRecording(FileRecording):
         kept = increasing_rows(stamps)
         if not kept.any():
             return None
-        T_enu_lidar = T_enu_lidar[kept]
-        return Trajectory(stamps[kept], inverse(T_enu_lidar[0]) @ T_enu_lidar)
+        return Trajectory(stamps[kept], inverse(T_enu_lidar[kept][0]) @ T_enu_lidar[kept])
 
     def _oxts_stamps(self, oxts: OxtsPoses) -> FloatArray:
         """Stamps (N,) of the unit's poses on the clock of the scans, NaN where there is none.
 
-        A synchronised drive pairs a scan with a packet of the unit, which sends 100 a second, so a row lies 11 to
-        23 ms after its scan's stamp and jitters. Its own stamp is the right one. Measured on the drives 0005 and
-        0009 against LiDAR odometry from scan to scan: taking rows as simultaneous with the scans, the forward
-        motion deviates by 25 and 54 mm and the yaw by 0.049 and 0.010 degrees (standard deviations); interpolating
-        between the rows' own stamps, by 15 and 12 mm, 0.018 and 0.008 degrees. No constant shift improves on that.
+        A row lies 11 to 23 ms after its scan's stamp, with jitter. Measured on the drives 0005 and 0009 against LiDAR
+        odometry: with rows at the scans' stamps, the forward motion deviates by 25 and 54 mm and the yaw by 0.049 and
+        0.010 degrees (standard deviations); with the rows' own stamps, by 15 and 12 mm, 0.018 and 0.008 degrees.
         """
         if not self._timing.from_clock:
             return oxts.numbers / self._config.rate_hz
@@ -116,7 +113,7 @@ class KittiRawRecording(FileRecording):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is missing, and stamps that were mended."""
+        """Stamps that were interpolated, and missing scans."""
         first, last = self._numbers[0], self._numbers[-1]
         gaps = (f"Of the scans {first} to {last} only {len(self)} are there.",) if len(self) <= last - first else ()
         return (*self._timing.notes, *gaps)

@@ -1,4 +1,4 @@
-"""When the sweeps of a KITTI raw drive took place, and when within its sweep a point was measured."""
+"""Stamps of the sweeps of a KITTI raw drive, and of the points within a sweep by their azimuth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.stamps import mend_stamps, read_stamps
 
-# Sweeps of one drive last the same to 0.2 %; what differs by more than this part is a wrong stamp.
+# Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
 _SWEEP_TOLERANCE = 0.25
 
 
@@ -21,7 +21,7 @@ class SweepTiming:
         stamps: (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras.
         before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end.
         from_clock: whether the stamps are clock readings; else they are made from the rate.
-        notes: what the user should know.
+        notes: facts for the user.
     """
 
     stamps: FloatArray
@@ -42,43 +42,33 @@ def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], rate_hz: float) -
     Raises:
         InputError: a file is damaged.
     """
-    stamps, notes = _read_forward_stamps(folder / "timestamps.txt", numbers)
-    if stamps is None:
+    try:
+        found = _rows(folder / "timestamps.txt", numbers)
+        stamps, replaced = mend_stamps(found, numbers.astype(np.float64))
+    except ValueError:
         half = np.full(len(numbers), 0.5 / rate_hz)
-        notes = (*notes, f"The stamps assume {rate_hz:g} scans a second.")
-        return SweepTiming(numbers / rate_hz, half, half, False, notes)
-    start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
+        note = (
+            f"There is no timestamps.txt with two stamps that increase; the stamps assume {rate_hz:g} scans a second."
+        )
+        return SweepTiming(numbers / rate_hz, half, half, False, (note,))
+    notes = []
+    if replaced:
+        said = "stamps of timestamps.txt are missing, repeat or run backwards and were interpolated."
+        notes.append(f"{replaced} {said}")
     period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / rate_hz
-    if start is None or end is None:
-        notes = (*notes, "There are no timestamps_start.txt and timestamps_end.txt; sweeps are taken to be seamless.")
-        half = np.full(len(numbers), 0.5 * period)
-        return SweepTiming(stamps, half, half, True, notes)
+    start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
     before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
     after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
     if wrong_starts or wrong_ends:
-        notes = (*notes, f"{wrong_starts} starts and {wrong_ends} ends of sweeps are implausible and were replaced.")
-    return SweepTiming(stamps, before_s, after_s, True, notes)
+        said = "ends of sweeps are missing or implausible and were replaced: sweeps are taken to be seamless."
+        notes.append(f"{wrong_starts} starts and {wrong_ends} {said}")
+    return SweepTiming(stamps, before_s, after_s, True, tuple(notes))
 
 
-def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray | None:
-    """The stamps of the rows with these numbers, NaN where the file ends before; None without a file."""
-    if not path.is_file():
-        return None
-    stamps = read_stamps(path)
+def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray:
+    """The stamps of the rows with these numbers, NaN where there is none."""
+    stamps = read_stamps(path) if path.is_file() else np.empty(0)
     return np.append(stamps, np.nan)[np.minimum(numbers, len(stamps))]
-
-
-def _read_forward_stamps(path: Path, numbers: NDArray[np.intp]) -> tuple[FloatArray | None, tuple[str, ...]]:
-    stamps = _rows(path, numbers)
-    if stamps is None:
-        return None, (f"There is no {path.name}.",)
-    try:
-        mended, count = mend_stamps(stamps, numbers.astype(np.float64))
-    except ValueError:
-        return None, (f"{path.name} has no two stamps that increase.",)
-    if not count:
-        return mended, ()
-    return mended, (f"{count} stamps of {path.name} are missing, repeat or run backwards and were interpolated.",)
 
 
 def _plausible(durations: FloatArray, expected: float) -> tuple[FloatArray, int]:

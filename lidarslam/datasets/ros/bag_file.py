@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
 _STORAGE_SUFFIXES = (".db3", ".mcap")
 _LAST_MESSAGES_NS = 1_000_000_000
+_REPAIR = {
+    ".bag": "rosbag reindex {}",
+    ".mcap": "mcap recover {} -o recovered.mcap",
+    ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
+}
 
 
 class BagFile:
@@ -72,7 +78,7 @@ class BagFile:
         if not counts:
             raise error
         self._has_index = False
-        why = f": {reports[0]}" if reports else ""
+        why = "".join(f": {report}" for report in reports[:1])
         self.damage = (
             f"{self.path}: has no index that can be read, so its {counts.total()} messages were read one after another"
             f" as far as they go{why}; {self._remedy()}"
@@ -84,23 +90,18 @@ class BagFile:
         if not self._has_index:
             yield from self._in_sequence(self.path, topic, lambda _: None, {})
             return
-        number = 0
         try:
             with self._opened() as reader:
                 for storage in _storages(reader):
-                    for message in self._of_storage(storage, topic, number, on_damage):
-                        number += 1
-                        yield message
+                    yield from self._of_storage(storage, topic, on_damage)
         except InputError as error:  # gone since its index was read
             on_damage(str(error))
 
-    def _of_storage(
-        self, storage: Any, topic: Topic, before: int, on_damage: Callable[[str], None]
-    ) -> Iterator[BagMessage]:
-        """The messages of one file by its index, and behind damage in sequence; `before` were in the files before."""
+    def _of_storage(self, storage: Any, topic: Topic, on_damage: Callable[[str], None]) -> Iterator[BagMessage]:
+        """The messages of one file by its index, and behind damage in sequence."""
         last_ns, repeated = -1, 0
         try:
-            for message in self._by_index(storage, topic, None, before):
+            for message in self._by_index(storage, topic):
                 repeated = repeated + 1 if message.record_ns == last_ns else 1
                 last_ns = message.record_ns
                 yield message
@@ -117,19 +118,17 @@ class BagFile:
         for damage in reports[1:]:  # the first was met by the index
             on_damage(damage)
 
-    def _by_index(self, storage: Any, topic: Topic, start_ns: int | None, before: int = 0) -> Iterator[BagMessage]:
-        """The messages of one file since a time; `before` of the topic have been read already."""
+    def _by_index(self, storage: Any, topic: Topic, start_ns: int | None = None) -> Iterator[BagMessage]:
+        """The messages of one file since a time."""
         named = (topic.name, topic.message_type)
         connections = [each for each in storage.connections if (each.topic, each.msgtype) == named]
         messages = storage.messages(connections, start=start_ns) if connections else iter(())
-        while True:
-            with self._damage(f"reading stopped after {before} messages of {topic.name}"):
-                try:
-                    _, record_ns, raw = next(messages)
-                except StopIteration:
-                    return
-            before += 1
-            yield self._message(record_ns, raw, topic)
+        for number in count():
+            with self._damage(f"reading stopped after {number} messages of {topic.name}"):
+                found = next(messages, None)
+            if found is None:
+                return
+            yield self._message(found[1], found[2], topic)
 
     def _in_sequence(
         self, path: Path, topic: Topic, report: Callable[[str], None], known: Connections
@@ -144,10 +143,12 @@ class BagFile:
     def _message(self, record_ns: int, raw: bytes, topic: Topic) -> BagMessage:
         try:
             if self._messages_are_compressed:
-                raw = _decompress(raw)
+                with self._damage("a compressed message is damaged"):
+                    raw = DECOMPRESSORS["zstd"](raw, 0)
             header_ns, frame_id = read_header(raw, self._ros2)
-        except ValueError as error:
-            return BagMessage(record_ns, 0, "", topic.message_type, b"", f"{self.path}: {error}")
+        except (InputError, ValueError) as error:
+            damage = str(error) if isinstance(error, InputError) else f"{self.path}: {error}"
+            return BagMessage(record_ns, 0, "", topic.message_type, b"", damage)
         return BagMessage(record_ns, header_ns, frame_id, topic.message_type, raw)
 
     def last_message(self, topic: Topic) -> BagMessage | None:
@@ -192,7 +193,7 @@ class BagFile:
             reader.close()
 
     @contextmanager
-    def _damage(self, what: str) -> Iterator[None]:
+    def _damage(self, place: str) -> Iterator[None]:
         """Damaged files make rosbags raise nearly anything: its own errors, assertions, KeyError, struct.error."""
         try:
             yield
@@ -200,7 +201,7 @@ class BagFile:
             raise
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(f"{self.path}: {what} ({reason}); {self._remedy()}") from error
+            raise InputError(f"{self.path}: {place} ({reason}); {self._remedy()}") from error
 
     def _suffix(self, path: Path) -> str:
         return path.suffix if self._ros2 else ".bag"
@@ -211,21 +212,10 @@ class BagFile:
             if whole is not None:  # decompressed, it is a file that is read as far as it goes
                 return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
             return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files instead of the folder"
-        command = {
-            ".bag": f"rosbag reindex {self.path}",
-            ".mcap": f"mcap recover {self.path} -o recovered.mcap",
-            ".db3": f"sqlite3 {self.path} .recover | sqlite3 recovered.db3",
-        }.get(self._suffix(self.path))
+        command = _REPAIR.get(self._suffix(self.path))
         if command is None:
             return "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml"
-        return f"try `{command}`, or copy the bag again"
-
-
-def _decompress(raw: bytes) -> bytes:
-    try:
-        return DECOMPRESSORS["zstd"](raw, 0)
-    except Exception as error:  # codecs raise nearly anything
-        raise ValueError(f"a compressed message is damaged ({' '.join(str(error).split())})") from error
+        return f"try `{command.format(self.path)}`, or copy the bag again"
 
 
 def _last(messages: Iterator[BagMessage]) -> BagMessage | None:

@@ -54,7 +54,7 @@ def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
     Raises:
         ValueError: it is no such message.
     """
-    if not isinstance(raw, bytes):  # a database holds whatever stands in its rows
+    if not isinstance(raw, bytes):  # a database may hold numbers and text too
         raise ValueError("a message that is no bytes")
     if len(raw) < _SHORTEST_MESSAGE:
         raise ValueError(f"a message of {len(raw)} bytes, too few for its header")

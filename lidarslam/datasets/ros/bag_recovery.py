@@ -1,9 +1,7 @@
-"""The messages of a bag without its index, record after record as they lie in the file.
+"""The messages of a bag without its index, in the order of the file, as after a crash of the recorder.
 
-A recorder that was killed, or a copy that was cut short, leaves no index and half a chunk at the end. Layouts: ROS bag
-format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), and the tables of rosbag2's SQLite plugin. Written here
-because rosbags needs an index, and `StreamReader` of mcap 1.6 loses all of a chunk that is cut off and accepts records
-that are too short.
+Layouts: ROS bag format 2.0 (wiki.ros.org/Bags/Format/2.0), MCAP (mcap.dev/spec), rosbag2's SQLite tables. Written here
+because rosbags needs an index, and `StreamReader` of mcap 1.6 loses a chunk that is cut off and accepts cut records.
 """
 
 import sqlite3
@@ -11,6 +9,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from io import BytesIO
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 from urllib.parse import quote
@@ -161,11 +160,19 @@ def _reason(error: Exception) -> str:
 
 def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
     uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+    with path.open("rb") as file:
+        header = file.read(32)
     with closing(sqlite3.connect(uri, uri=True)) as database:
         # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
         database.execute("PRAGMA writable_schema=ON")
         topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
-        for topic, record_ns, raw in _rows(database, report):
+        # Pages that are missing at the end (sqlite.org/fileformat2.html, 1.3) SQLite may take for zeros.
+        page, pages = struct.unpack_from(">H10xI", header, 16)
+        is_cut = path.stat().st_size < pages * (page if page > 1 else 65536)
+        for row, following in pairwise(chain(_rows(database, report), [None])):
+            if row is None or (following is None and is_cut):
+                return
+            topic, record_ns, raw = row
             if topic in topics and isinstance(record_ns, int) and isinstance(raw, bytes):
                 yield RecoveredMessage(*topics[topic], record_ns, raw)
             else:
