@@ -22,7 +22,7 @@ from lidarslam.train.directory import SOURCES_SECTION
 from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
-# The sections of a run's or a training's config.yaml that are no configuration.
+# Sections of config.yaml that are not settings.
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
 
 _MOST_FAULTS = 5
@@ -76,9 +76,9 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
 
 
 def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
-    """Any configuration: its defaults, changed by a YAML file and then by settings; the example shows what those are.
+    """Any configuration: its defaults, changed by a YAML file and then by settings like the example.
 
-    A section of the file that says what was computed, rather than how, is passed over.
+    The section of a run's or training's config.yaml about its source is ignored.
 
     Raises:
         ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
@@ -100,7 +100,7 @@ def reader_settings(**options: str | None) -> list[str]:
 
 
 def setting(key: str, text: str) -> str:
-    """A setting whose value is a text, whatever it looks like to YAML."""
+    """A setting whose value is a text, even if YAML would read it as a number."""
     quoted = text.replace("'", "''")
     return f"{key}='{quoted}'"
 
@@ -158,9 +158,9 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
     faults = error.errors(include_url=False)
-    told = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
-    told += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
-    return f"configuration ({origin}): {'; '.join(told)}"
+    explained = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
+    explained += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    return f"configuration ({origin}): {'; '.join(explained)}"
 
 
 def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:

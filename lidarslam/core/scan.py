@@ -1,4 +1,4 @@
-"""One sweep of a LiDAR, and what a recording of sweeps can do."""
+"""One sweep of a LiDAR, and the protocol of a recording."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class Scan:
         time_offsets: ArrayLike | None = None,
         rings: ArrayLike | None = None,
     ) -> Self:
-        """Make a scan of what a driver delivers, leaving out invalid points together with their times and rings.
+        """Make a scan of a driver's raw points, leaving out invalid ones with their times and rings.
 
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
         the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite; where
