@@ -9,11 +9,11 @@ r"""Draw the exact map of every simulated world, as one lap of its route sees it
 import argparse
 from pathlib import Path
 
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
 from lidarslam.simulation.recording.reference_map import reference_map
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from lidarslam.viewer.picture import Camera, draw, height_colours, save_picture
 

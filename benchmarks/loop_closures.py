@@ -9,8 +9,8 @@ them. `rooms` is a world of this benchmark: a corridor round a block, along it r
 
 Prints a Markdown table, a row for each recording. ATE is of all scans, after SE(3) alignment. A closure is false when
 its relative pose is off the truth by more than 0.5 m or 3 degrees; the first number is of those that the detector
-accepted, the second of those that the optimiser believed in the end. A keyframe is a revisit when the truth was within
-half the median range of it before, a loop's least way ago; it is found when a closure was believed within 5 m of way of
+accepted, the second of those that the optimiser kept in the end. A keyframe is a revisit when the truth was within
+half the median range of it before, a loop's least way ago; it is found when a closure was kept within 5 m of way of
 it. Milliseconds are of the processor. At the end, what false ones there are, and why true ones were refused.
 """
 
@@ -30,21 +30,19 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angl
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.motion.mounts import MOUNTS, mount_pose
+from lidarslam.simulation.motion.carriers import CARRIERS, MOUNTS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.sensors.table import SENSORS
+from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from mapping.config import LoopConfig, PoseGraphConfig
 from mapping.deskew import body_velocity
 from mapping.global_map.global_map import voxel_size_for
-from mapping.loops.detection import LoopClosure
-from mapping.loops.loop_config import LoopConfig
-from mapping.pose_graph.graph_config import SlamGraphConfig
+from mapping.loops.closure import LoopClosure
+from mapping.pose_graph.correction import Corrected
 from mapping.pose_graph.graph_scan import GraphScan
-from mapping.pose_graph.slam_graph import Corrected, SlamGraph
+from mapping.pose_graph.slam_graph import SlamGraph
 
 ROOMS = "rooms"
 FALSE_M, FALSE_DEG = 0.5, 3.0
@@ -141,7 +139,7 @@ def drifting(lap: Lap, factor: float, seed: int) -> FloatArray:
     return chain(lap.truth[0], motions @ exp(rates[stretch] * steps[:, None]))
 
 
-def follow(lap: Lap, estimates: FloatArray, config: SlamGraphConfig) -> Followed:
+def follow(lap: Lap, estimates: FloatArray, config: PoseGraphConfig) -> Followed:
     """Give the graph scan after scan."""
     graph = SlamGraph(config)
     milliseconds: list[float] = []
@@ -169,9 +167,9 @@ def errors_of(closures: Sequence[LoopClosure], truth: FloatArray) -> FloatArray:
     return np.array([[np.linalg.norm(T[:3, 3]), np.rad2deg(rotation_angle(T))] for T in off]).reshape(-1, 2)
 
 
-def revisits(position: FloatArray, way_m: FloatArray, range_m: float, config: LoopConfig) -> list[int]:
+def revisits(position: FloatArray, way_m: FloatArray, range_m: float) -> list[int]:
     """Keyframes (K,) that are close to where the sensor was before."""
-    least = max(config.min_way_m, config.min_way_ranges * range_m)
+    least = max(10.0, 3.0 * range_m)
     found = []
     for index in range(len(way_m)):
         near = np.linalg.norm(position[way_m < way_m[index] - least] - position[index], axis=1) < 0.5 * range_m
@@ -191,19 +189,19 @@ def is_false(errors: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((errors[:, 0] > FALSE_M) | (errors[:, 1] > FALSE_DEG))
 
 
-def row(lap: Lap, estimates: FloatArray, followed: Followed, config: LoopConfig) -> list[str]:
+def row(lap: Lap, estimates: FloatArray, followed: Followed) -> list[str]:
     """The cells of one recording."""
     result = followed.result
     truth, way_m = lap.truth[result.keyframe_scans], lap.way_m[result.keyframe_scans]
-    accepted = [closure for closure in result.closures if closure.verdict == "accepted"]
-    believed = [closure for closure, kept in zip(result.closures, result.believed, strict=True) if kept]
-    errors = errors_of(believed, truth)
+    accepted = [closure for closure in result.closures if closure.accepted]
+    kept = [closure for closure, kept in zip(result.closures, result.inliers, strict=True) if kept]
+    errors = errors_of(kept, truth)
     false = is_false(errors)
     right = errors[~false]
-    again = revisits(truth[:, :3, 3], way_m, followed.range_m, config)
-    ways = way_m[[closure.second for closure in believed]]
+    again = revisits(truth[:, :3, 3], way_m, followed.range_m)
+    ways = way_m[[closure.second for closure in kept]]
     covered = [i for i in again if (np.abs(ways - way_m[i]) < _FOUND_WITHIN_M).any()]
-    nees = [_squared(c, truth) for c, wrong in zip(believed, false, strict=True) if not wrong]
+    nees = [_squared(c, truth) for c, wrong in zip(kept, false, strict=True) if not wrong]
     before, after = ate_m(lap, estimates), ate_m(lap, result.T_world_lidar)
 
     def pair(column: int, unit: str) -> str:
@@ -217,8 +215,8 @@ def row(lap: Lap, estimates: FloatArray, followed: Followed, config: LoopConfig)
         f"{after / before:.2f}",
         str(len(way_m)),
         str(len(again)),
-        str(len(believed)),
-        str(sum(closure.found_by == "appearance" for closure in believed)),
+        str(len(kept)),
+        str(sum(closure.by_appearance for closure in kept)),
         f"{is_false(errors_of(accepted, truth)).sum()} / {false.sum()}",
         pair(0, "m"),
         pair(1, "deg"),
@@ -237,14 +235,18 @@ def refusals(lap: Lap, followed: Followed) -> list[str]:
     reasons: Counter[str] = Counter()
     errors = errors_of(result.closures, truth)
     for closure, (off_m, off_deg), wrong in zip(result.closures, errors, is_false(errors), strict=True):
-        if wrong and closure.verdict == "accepted":
+        if wrong and closure.accepted:
             lines.append(
-                f"false: {closure.first} and {closure.second}, {closure.found_by}, off by {off_m:.2f} m"
+                f"false: {closure.first} and {closure.second}, {_found_by(closure)}, off by {off_m:.2f} m"
                 f" {off_deg:.1f} deg, overlap {closure.overlap:.2f}, {closure.consistent} agree"
             )
-        elif not wrong and closure.verdict == "rejected":
+        elif not wrong and not closure.accepted:
             reasons[re.sub(r"[0-9.]+", "N", closure.reason)] += 1
     return lines + [f"right but refused, {count}: {reason}" for reason, count in reasons.most_common()]
+
+
+def _found_by(closure: LoopClosure) -> str:
+    return "by appearance" if closure.by_appearance else "nearby"
 
 
 def _squared(closure: LoopClosure, truth: FloatArray) -> float:
@@ -274,10 +276,11 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=3, help="scans are taken one in so many")
     parser.add_argument("--drift", type=float, default=1.0, help="times 1 %% of the way and 2 degrees in 100 m")
     arguments = parser.parse_args()
-    loops = expecting(arguments.drift)
-    config = SlamGraphConfig(enabled=True, loops=loops)
+    # The defaults, with the drift where there is more.
+    drift_percent = max(1.0, arguments.drift) * LoopConfig().drift_percent
+    config = PoseGraphConfig(enabled=True, loops=LoopConfig(drift_percent=drift_percent))
     header = ["recording", "path, m", "ATE before / after, m", "ratio", "keyframes", "revisits", "closures"]
-    header += ["by appearance", "false, accepted / believed"]
+    header += ["by appearance", "false, accepted / kept"]
     header += ["off by, median / max", "degrees", "squared over covariance", "revisits found, %"]
     header += ["ms a keyframe, median / 95 % / mean"]
     print_row(header)
@@ -286,17 +289,9 @@ def main() -> None:
     for lap in laps(arguments):
         estimates = drifting(lap, arguments.drift, arguments.seed)
         followed = follow(lap, estimates, config)
-        print_row(row(lap, estimates, followed, loops))
+        print_row(row(lap, estimates, followed))
         notes += [f"{lap.name}: {line}" for line in refusals(lap, followed)]
     print("", *notes, sep="\n")
-
-
-def expecting(factor: float) -> LoopConfig:
-    """The defaults, told of more drift where there is more."""
-    default, larger = LoopConfig(), max(1.0, factor)
-    return LoopConfig(
-        drift_percent=larger * default.drift_percent, drift_deg_per_100m=larger * default.drift_deg_per_100m
-    )
 
 
 if __name__ == "__main__":

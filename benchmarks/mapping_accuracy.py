@@ -35,12 +35,10 @@ from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.sensors.table import SENSORS
+from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from mapping.config import MappingConfig
 from odometry.config import KissConfig, OdometryConfig

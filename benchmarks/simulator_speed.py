@@ -10,12 +10,10 @@ import time
 from collections.abc import Iterator, Sequence
 from statistics import median
 
-from lidarslam.simulation.motion.carriers import CARRIERS
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.sensors.table import SENSORS
+from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 
@@ -49,7 +47,7 @@ def _rows(world: World, motion_name: str, sensors: Sequence[str], scans: int, se
             seconds.append(time.perf_counter() - start)
         each = median(seconds)
         yield (
-            f"{name:10}{sensor.rays_per_scan:10,}{round(median(points)):10,}"
+            f"{name:10}{sensor.pattern.columns * sensor.pattern.lasers:10,}{round(median(points)):10,}"
             f"{1e3 * each:12.1f}{sensor.period_s / each:8.1f}"
         )
 

@@ -23,6 +23,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mapping_accuracy import METHODS, make_simulation, print_row
+from simulated_faults import (
+    Cover,
+    Faulty,
+    carried_off,
+    covered,
+    dropped,
+    even_tunnel,
+    index_back,
+    open_plain,
+    passing_by,
+    standing_still,
+    straight_drive,
+)
 
 from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.config.settings import Config
@@ -32,21 +45,10 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.mounts import mount_pose
-from lidarslam.simulation.recording.faults import (
-    Cover,
-    Faulty,
-    carried_off,
-    covered,
-    dropped,
-    index_back,
-    passing_by,
-    standing_still,
-)
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.worlds.featureless import even_tunnel, open_plain, straight_drive
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import GlobalMapConfig
 from mapping.global_map.moved_points import seen_through

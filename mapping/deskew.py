@@ -65,16 +65,11 @@ def deskew(
         velocity_before: (6,) for points before the stamp, rotation first, in the frame of the stamp.
         velocity_after: (6,) for points after it.
     """
-    if not len(points):
-        return points
-    if time_offsets.min() >= 0.0 or np.array_equal(velocity_before, velocity_after):
+    if np.array_equal(velocity_before, velocity_after):
         return move(points, time_offsets, velocity_after)
-    if time_offsets.max() <= 0.0:
-        return move(points, time_offsets, velocity_before)
-    before = time_offsets < 0.0
     moved = np.empty_like(points)
-    moved[before] = move(points[before], time_offsets[before], velocity_before)
-    moved[~before] = move(points[~before], time_offsets[~before], velocity_after)
+    for part, velocity in ((time_offsets < 0.0, velocity_before), (time_offsets >= 0.0, velocity_after)):
+        moved[part] = move(points[part], time_offsets[part], velocity)
     return moved
 
 

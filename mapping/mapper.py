@@ -90,7 +90,7 @@ class Mapper(Stateful):
         T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
         if scan.is_sparse:
             lost = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
-            return MappedScan(lost, T_world_lidar, False, Status.LOST, _sparse_message(scan), way_known=False)
+            return MappedScan(lost, T_world_lidar, False, Status.LOST, _sparse_message(scan), is_connected=False)
         state = MotionState(scan.stamp, T_world_lidar, velocity, last.covariance, scan.seen_until_s)
         self._map = self._new_map(scan, state)
         self._first = scan if scan.sweep.times is not None and self._config.continuous_time else None
@@ -128,7 +128,7 @@ class Mapper(Stateful):
             self._map = self._new_map(scan, MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION))
             reason += "; a new map begins here"
         lost = MotionState(scan.stamp, T_world_lidar, _FADING * velocity, LOST_MOTION)
-        return MappedScan(lost, T_world_lidar, False, Status.LOST, reason, fit, way_known=False)
+        return MappedScan(lost, T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)
 
     def _new_map(self, scan: SampledScan, state: MotionState) -> SurfelMap:
         """A map of one scan."""

@@ -1,6 +1,7 @@
 """Shared fixtures: random numbers, real recordings, and a room whose scans are known exactly."""
 
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.resume.state_file import read_state, write_state
+
+# The benchmarks are scripts that import one another from their own folder.
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 # The first call of a compiled loop takes as long as compiling it.
 settings.register_profile("patient", deadline=None)

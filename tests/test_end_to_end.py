@@ -25,7 +25,6 @@ from lidarslam.run.directory import FILES
 from lidarslam.run.finished_run import load_run
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
-from mapping.pose_graph.g2o import read_g2o
 
 KISS_ICP = [
     "odometry.method=kiss-icp",
@@ -140,8 +139,9 @@ def test_a_pose_graph_is_built_when_it_is_asked_for(
     assert outcome.metrics is not None
     assert outcome.metrics.errors.ate_rmse_m < 0.005
     graph = json.loads((out / "summary.json").read_text())["pose_graph"]
-    assert graph["keyframes"] == len(read_g2o(out / "pose_graph.g2o").keys) >= 3
-    assert graph["edges"] == len(read_g2o(out / "pose_graph.g2o").edges)
+    lines = (out / "pose_graph.g2o").read_text().splitlines()
+    assert graph["keyframes"] == sum(line.startswith("VERTEX_SE3:QUAT") for line in lines) >= 3
+    assert graph["edges"] == sum(line.startswith("EDGE_SE3:QUAT") for line in lines)
     assert outcome.summary.to_json()["loop_closures"] == 0
     cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
     distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))

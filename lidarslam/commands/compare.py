@@ -51,7 +51,7 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
     Each method runs in a process of its own, one after another. A method that crashes or gets lost is a row of the
     table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes the report so far.
     """
-    from lidarslam.compare.command import CompareOptions, run_compare
+    from lidarslam.compare.command import run_compare
 
     if (benchmark is None) == (not sources):
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
@@ -62,6 +62,6 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
     for name in of_sources:
         if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT and len(sources) != 1:
             flag = f"--{name.replace('_', '-')}"
-            raise click.UsageError(f"{flag} belongs to a single SOURCE; a benchmark file has one for each recording")
-    if not run_compare(CompareOptions(sources, benchmark, **options), say, note):
+            raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
+    if not run_compare(say, note, sources=sources, benchmark=benchmark, **options):
         ctx.exit(EXIT_MENDABLE)

@@ -11,7 +11,7 @@ from lidarslam.commands.terminal import say
 _WORLD = Registered("lidarslam.simulation.worlds.registry", "WORLDS")
 _SENSOR = Registered("lidarslam.simulation.sensors.table", "SENSORS")
 _CARRIER = Registered("lidarslam.simulation.motion.carriers", "CARRIERS")
-_MOUNT = Registered("lidarslam.simulation.motion.mounts", "MOUNTS")
+_MOUNT = Registered("lidarslam.simulation.motion.carriers", "MOUNTS")
 _FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 
 

@@ -1,52 +1,28 @@
 """A benchmark file: recordings, methods, tables and published rows, so that a table of a paper is one command."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from evaluation.comparison.quantities import QUANTITIES
+from evaluation.comparison.mean_table import TablePlan
+from evaluation.comparison.quantities import find_quantity
+from evaluation.comparison.table import TableCell, TableRow
+from lidarslam.compare.methods import Method, parse_method
+from lidarslam.compare.plan import RECORDINGS
+from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import YamlError, read_yaml
 from lidarslam.core.errors import ConfigError
+from lidarslam.simulation.recording.folder import README, REFERENCE_MAP
+from lidarslam.simulation.recording.record import record
+from lidarslam.simulation.recording.request import RecordRequest
 
 
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Simulated(_Model):
-    """A recording that is made when it is not there; names as in `lidarslam simulate`."""
-
-    world: str = "office"
-    sensor: str = "vlp-16"
-    motion: str = "handheld"
-    speed_mps: float | None = Field(None, gt=0.0, description="null: as the motion and the world have it")
-    mount: str = "upright"
-    scans: int = Field(300, ge=1)
-    seed: int = Field(0, ge=0)
-    format: str = "mcap"
-
-
-class BenchmarkRecording(_Model):
-    """One recording; paths are relative to the data's folder."""
-
-    name: str
-    source: Path | None = Field(None, description="null only where it is simulated")
-    set: tuple[str, ...] = Field((), description="settings for this recording alone, key.path=value")
-    start: int = Field(0, ge=0)
-    stop: int | None = Field(None, ge=0)
-    step: int = Field(1, ge=1)
-    prior: Path | None = None
-    reference: str | None = Field(None, description="a method's name or a file; null: the benchmark's, or ground truth")
-    reference_map: Path | None = None
-    simulate: Simulated | None = None
-
-    @model_validator(mode="after")
-    def _lies_somewhere_or_is_made(self) -> Self:
-        if (self.source is None) == (self.simulate is None):
-            raise ValueError(f"recording {self.name}: give either source or simulate")
-        return self
 
 
 class BenchmarkMethod(_Model):
@@ -58,7 +34,7 @@ class BenchmarkMethod(_Model):
 
 
 class Published(_Model):
-    """A row of somebody's table; a value for each column, null where none was published."""
+    """A row of a published table; a value for each column, null where none was published."""
 
     method: str
     values: tuple[float | str | None, ...]
@@ -74,12 +50,38 @@ class BenchmarkTable(_Model):
     published: tuple[Published, ...] = ()
     note: str = ""
 
+    @model_validator(mode="after")
+    def _is_consistent(self) -> Self:
+        columns = len(self.groups) * len(self.quantities)
+        for row in self.published:
+            if len(row.values) != columns:
+                raise ValueError(
+                    f"table {self.title!r}, row {row.method!r}: expected {columns} values, one for each group and"
+                    f" quantity, got {len(row.values)}"
+                )
+        try:
+            self.plan()
+        except ConfigError as error:
+            raise ValueError(f"table {self.title!r}: {error}") from error
+        return self
+
+    def plan(self) -> TablePlan:
+        """The table to fill."""
+        sizes = [len(group) for group in self.groups.values() for _ in self.quantities]
+        published = tuple(
+            TableRow(row.method, [TableCell(*cell) for cell in zip(row.values, sizes, strict=True)], row.source)
+            for row in self.published
+        )
+        return TablePlan(
+            self.title, self.groups, [find_quantity(name) for name in self.quantities], published, self.note
+        )
+
 
 class Benchmark(_Model):
-    """The whole file."""
+    """The whole file; paths are relative to the data's folder."""
 
     title: str
-    recordings: tuple[BenchmarkRecording, ...] = Field(min_length=1)
+    recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
     methods: tuple[str | BenchmarkMethod, ...] = Field(min_length=1)
     set: tuple[str, ...] = Field((), description="settings for everything, key.path=value")
     reference: str | None = Field(None, description="a method's name; null: ground truth")
@@ -88,29 +90,17 @@ class Benchmark(_Model):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         names = [recording.name for recording in self.recordings]
-        if len(set(names)) < len(names):
-            raise ValueError("two recordings have the same name")
+        if None in names or len({*names}) < len(names):
+            raise ValueError("a recording has no name, or two have the same name")
+        for recording in self.recordings:
+            if (recording.source is None) == (recording.simulate is None):
+                raise ValueError(f"recording {recording.name}: give either source or simulate")
         for table in self.tables:
-            _check_table(table, names)
+            unknown = {name for group in table.groups.values() for name in group}.difference(names)
+            if unknown:
+                listed = ", ".join(sorted(unknown))
+                raise ValueError(f"table {table.title!r} names recordings that are not listed: {listed}")
         return self
-
-
-def _check_table(table: BenchmarkTable, recordings: list[str]) -> None:
-    unknown = {name for group in table.groups.values() for name in group} - set(recordings)
-    if unknown:
-        raise ValueError(f"table {table.title!r} names recordings that are not listed: {', '.join(sorted(unknown))}")
-    strange = [name for name in table.quantities if name not in QUANTITIES]
-    if strange:
-        raise ValueError(
-            f"table {table.title!r}: no quantity is called {strange[0]!r}; there are: {', '.join(QUANTITIES)}"
-        )
-    columns = len(table.groups) * len(table.quantities)
-    for row in table.published:
-        if len(row.values) != columns:
-            raise ValueError(
-                f"table {table.title!r}, row {row.method!r}: expected {columns} values, one for each group and"
-                f" quantity, got {len(row.values)}"
-            )
 
 
 def load_benchmark(path: Path) -> Benchmark:
@@ -120,17 +110,75 @@ def load_benchmark(path: Path) -> Benchmark:
         ConfigError: it cannot be read, is not YAML, or does not fit.
     """
     try:
-        tree = read_yaml(path)
+        return Benchmark.model_validate(read_yaml(path))
     except YamlError as error:
         raise ConfigError(f"{path}: {error}") from error
-    try:
-        return Benchmark.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {'; '.join(_faults(error))}") from None
+        faults = [
+            ": ".join(filter(None, [".".join(map(str, fault["loc"])), fault["msg"].removeprefix("Value error, ")]))
+            for fault in error.errors()
+        ]
+        raise ConfigError(f"{path}: {'; '.join(faults)}") from None
 
 
-def _faults(error: ValidationError) -> list[str]:
-    return [
-        ": ".join(filter(None, [".".join(map(str, fault["loc"])), fault["msg"].removeprefix("Value error, ")]))
-        for fault in error.errors()
-    ]
+def fill_request(request: CompareRequest, benchmark: Benchmark, data: Path | None) -> CompareRequest:
+    """The comparison of a benchmark; methods that the request names already replace its own.
+
+    Args:
+        request: where it goes, limits, settings.
+        benchmark: the file's content.
+        data: the folder that the benchmark's paths are relative to; None: the current one, and for the recordings
+            that are simulated one in `request.out`.
+
+    Raises:
+        ConfigError: a method does not exist, or not in this version.
+    """
+    return replace(
+        request,
+        recordings=tuple(_located(entry, benchmark, data, request.out) for entry in benchmark.recordings),
+        methods=request.methods or tuple(_method(method) for method in benchmark.methods),
+        settings=(*benchmark.set, *request.settings),
+        skip_missing=True,
+        title=benchmark.title,
+        tables=tuple(table.plan() for table in benchmark.tables),
+    )
+
+
+def make_recordings(
+    request: CompareRequest, counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+) -> None:
+    """Simulate the recordings that are not there yet.
+
+    Raises:
+        LidarSlamError: one cannot be made.
+    """
+    for entry in request.recordings:
+        if entry.simulate is not None and entry.source is not None and not (entry.source / README).is_file():
+            with counting(f"recording {entry.name}") as counter:
+                record(RecordRequest(entry.source, **entry.simulate.model_dump()), counter)
+
+
+def _located(entry: RecordingEntry, benchmark: Benchmark, data: Path | None, out: Path) -> RecordingEntry:
+    """The recording with paths as they are found from here."""
+    root = data or Path()
+    simulated = (data or out / RECORDINGS) / (entry.name or "")
+    reference_map = None if entry.reference_map is None else root / entry.reference_map
+    reference = entry.reference or benchmark.reference
+    if entry.reference is not None and (root / entry.reference).is_file():
+        reference = str(root / entry.reference)
+    return replace(
+        entry,
+        source=simulated if entry.source is None else root / entry.source,
+        prior=None if entry.prior is None else root / entry.prior,
+        reference=reference,
+        reference_map=reference_map or (simulated / REFERENCE_MAP if entry.source is None else None),
+    )
+
+
+def _method(method: str | BenchmarkMethod) -> Method:
+    try:
+        if isinstance(method, str):
+            return parse_method(method)
+        return Method(method.name, (*parse_method(method.method).settings, *method.set))
+    except ConfigError as error:
+        raise ConfigError(f"{error}; the benchmark's methods can be replaced with --methods") from None

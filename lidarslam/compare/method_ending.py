@@ -1,4 +1,4 @@
-"""What the end of a method's process means: its status in the comparison, and why."""
+"""Status of a method in the comparison by the end of its process, and the reason."""
 
 import json
 import signal
@@ -10,38 +10,44 @@ from lidarslam.compare.method_process import LOST
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.run.directory import SUMMARY
 
-# The run came to its end; how much of it was lost is another matter.
+# The run came to its end, lost scans or not.
 WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
 _LONGEST_MESSAGE = 300
 
-Judgement = tuple[MethodStatus, str]
 
-
-def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> Judgement:
+def judge(ending: Ending, folder: Path, log: Path, limits: Limits) -> tuple[MethodStatus, str]:
     """The status and, when it did not end well, the reason.
 
     Args:
         ending: of the process.
         folder: its run directory, which held no run before.
         log: its standard error.
-        limits: that it had.
+        limits: of the process.
     """
     has_result = (folder / SUMMARY).is_file()
-    if ending.cause != "itself":
-        return _cut_short(ending, has_result, limits)
-    if ending.status == LOST and has_result:
-        return "lost", _where_lost(folder)
-    if ending.status == 0 and has_result:
-        return "ok", ""
-    said = _last_words(log)
+    if ending.cause == "memory":
+        return "out of memory", f"took more than {limits.memory_mb:,.0f} MB"
+    if ending.cause == "time":
+        return "timed out", f"took more than {limits.timeout_s:g} s"
+    if ending.cause == "interrupt":
+        return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
+    if has_result and ending.status in (0, LOST):
+        return ("lost", _where_lost(folder)) if ending.status else ("ok", "")
+    return _failed(ending.status, has_result, _last_words(log))
+
+
+def _failed(status: int, has_result: bool, said: str) -> tuple[MethodStatus, str]:
     if any(words in said for words in _MEMORY_ERRORS):
         return "out of memory", said
-    if ending.status < 0:
-        return _killed(-ending.status, said)
-    return ("stopped" if has_result else "failed"), said or f"ended with status {ending.status} and said nothing"
+    if status == -signal.SIGKILL:
+        return "out of memory", "killed by the system (signal 9), as it does when memory runs out"
+    if status < 0:
+        reason = f"{_SIGNALS.get(-status, 'ended by the system')} (signal {-status})"
+        return "failed", f"{reason}: {said}" if said else reason
+    return ("stopped" if has_result else "failed"), said or f"ended with status {status} and said nothing"
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -51,21 +57,6 @@ def read_summary(folder: Path) -> dict[str, Any]:
         OSError, ValueError: it is not there, or damaged.
     """
     return cast(dict[str, Any], json.loads((folder / SUMMARY).read_text(encoding="utf-8")))
-
-
-def _cut_short(ending: Ending, has_result: bool, limits: Limits) -> Judgement:
-    if ending.cause == "memory":
-        return "out of memory", f"took more than {limits.memory_mb:,.0f} MB"
-    if ending.cause == "time":
-        return "timed out", f"took more than {limits.timeout_s:g} s"
-    return ("stopped", "interrupted") if has_result else ("not run", "interrupted before there was a result")
-
-
-def _killed(number: int, said: str) -> Judgement:
-    if number == signal.SIGKILL:
-        return "out of memory", "killed by the system (signal 9), as it does when memory runs out"
-    reason = f"{_SIGNALS.get(number, 'ended by the system')} (signal {number})"
-    return "failed", f"{reason}: {said}" if said else reason
 
 
 def _where_lost(folder: Path) -> str:
@@ -78,7 +69,7 @@ def _where_lost(folder: Path) -> str:
 
 
 def _last_words(log: Path) -> str:
-    """The last line a process wrote to standard error, without the program's name before it."""
+    """The last line on standard error, without the program's name before it."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return last.removeprefix("lidarslam: ")[:_LONGEST_MESSAGE]

@@ -1,61 +1,40 @@
-"""One method of a comparison in a process of its own: a run that says how far it is.
+"""One method of a comparison in a process of its own: a run that reports its progress.
 
-The argument is the request as JSON, see `encode`. After every scan a line goes to standard output: its number from 1,
-and how many there are. Whatever a library prints goes to standard error. The exit status is that of `lidarslam run`.
+The arguments are the folder to stand in and the request as JSON. After every scan a line goes to standard output: its
+number from 1, and how many there are. Libraries' output goes to standard error. The exit status is that of
+`lidarslam run`.
 """
 
-import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from lidarslam.config.settings import Config
+from pydantic import TypeAdapter
+
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 
 STOPPED, LOST = 1, 3
+_REQUEST = TypeAdapter(RunRequest)
 
 
-def encode(request: RunRequest) -> str:
-    """The request as the one argument of this module; of what it shows, nothing."""
-    return json.dumps(
-        {
-            "folder": str(Path.cwd()),
-            "source": str(request.source),
-            "out": str(request.out),
-            "config": request.config.model_dump(mode="json"),
-            "start": request.start,
-            "stop": request.stop,
-            "step": request.step,
-            "prior": None if request.prior is None else str(request.prior),
-        }
-    )
-
-
-def decode(text: str) -> RunRequest:
-    """The request; paths stay relative to the folder it was made in, which becomes the current one."""
-    values: dict[str, Any] = json.loads(text)
-    os.chdir(values.pop("folder"))
-    prior = values.pop("prior")
-    return RunRequest(
-        source=Path(values.pop("source")),
-        out=Path(values.pop("out")),
-        config=Config.model_validate(values.pop("config")),
-        prior=None if prior is None else Path(prior),
-        overwrite=True,
-        resumable=False,  # a comparison runs it again, and saving would count as its time
-        **values,
-    )
+def encode(request: RunRequest) -> tuple[str, str]:
+    """The arguments; the run overwrites and is not resumable, because saving its state would count as its time."""
+    request = replace(request, overwrite=True, resumable=False)
+    return str(Path.cwd()), _REQUEST.dump_json(request).decode()
 
 
 def main() -> int:
     """Run; the exit status."""
+    folder, request = sys.argv[1:]
+    os.chdir(folder)
     with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as progress:
         os.dup2(2, 1)
         try:
-            outcome = execute(decode(sys.argv[1]), lambda number, total, _: print(number, total, file=progress))
+            run = _REQUEST.validate_json(request)
+            outcome = execute(run, lambda number, total, _: print(number, total, file=progress))
         except LidarSlamError as error:
             print(f"lidarslam: {error}", file=sys.stderr)
             return STOPPED

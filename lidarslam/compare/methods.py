@@ -1,15 +1,13 @@
-"""Methods as the command line of a comparison names them: BASE[@VOXEL][+map][+graph]."""
+"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map][+graph]."""
 
-import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import get_args
 
 from lidarslam.core.errors import ConfigError
 from odometry.config import OdometryName
 
-# A name that says what it is to a user -> the odometry's name in the configuration.
+# Name for the user -> name of the odometry in the configuration.
 _BASES = {"learned": "learned", "kiss-icp": "kiss-icp", "constant-velocity": "constant-velocity", "prior": "external"}
 _NAME = re.compile(r"(?P<base>[a-z][a-z-]*)(@(?P<voxel>[^+@]+))?(?P<map>\+map)?(?P<graph>\+graph)?")
 _GRAMMAR = f"{', '.join(_BASES)}; each with +map, +graph or +map+graph; and kiss-icp@0.5 for a voxel size of 0.5 m"
@@ -21,7 +19,7 @@ class Method:
 
     Attributes:
         name: as the user named it, such as `kiss-icp@0.5` or `learned+map`.
-        settings: what it sets in the configuration, `key.path=value`.
+        settings: of the configuration, `key.path=value`.
     """
 
     name: str
@@ -47,26 +45,21 @@ def parse_method(name: str) -> Method:
         raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
     if odometry == "constant-velocity" and not match["map"]:
         raise ConfigError(f"{name}: only predicts; compare constant-velocity+map, which corrects it against the map")
-    return Method(name, tuple(_settings(name, odometry, match)))
+    voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)
+    mapping, pose_graph = (str(match[part] is not None).lower() for part in ("map", "graph"))
+    switches = (f"mapping.enabled={mapping}", f"pose_graph.enabled={pose_graph}")
+    return Method(name, (f"odometry.method={odometry}", *voxel, *switches))
 
 
-def _settings(name: str, odometry: str, match: re.Match[str]) -> Iterator[str]:
-    yield f"odometry.method={odometry}"
-    if match["voxel"] is not None:
-        yield f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, odometry, match['voxel'])!r}"
-    yield f"mapping.enabled={str(match['map'] is not None).lower()}"
-    yield f"pose_graph.enabled={str(match['graph'] is not None).lower()}"
-
-
-def _voxel_size_m(name: str, odometry: str, text: str) -> float:
-    if odometry != "kiss-icp":
+def _voxel_size_m(name: str, match: re.Match[str]) -> float:
+    if match["base"] != "kiss-icp":
         raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
     try:
-        size_m = float(text)
+        size_m = float(match["voxel"])
     except ValueError:
-        size_m = math.nan
-    if not 0.0 < size_m < math.inf:
-        raise ConfigError(f"{name}: expected a voxel size in metres, as in kiss-icp@0.5, got {text!r}")
+        size_m = 0.0
+    if not 0.0 < size_m < float("inf"):
+        raise ConfigError(f"{name}: expected a voxel size in metres, as in kiss-icp@0.5, got {match['voxel']!r}")
     return size_m
 
 

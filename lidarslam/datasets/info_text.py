@@ -1,4 +1,4 @@
-"""What `lidarslam info` prints."""
+"""Output of `lidarslam info`."""
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
@@ -14,7 +14,7 @@ _EPOCH_FROM_S, _EPOCH_UNTIL_S = 5e8, 5e9
 
 
 def describe_source(source: Path, config: ReaderConfig) -> str:
-    """What a recording holds; of a bag whose topic is still to be chosen, the topics alone.
+    """The contents of a recording; of a bag whose topic is still to be chosen, the topics alone.
 
     Raises:
         InputError: the source cannot be read.
@@ -22,23 +22,23 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
     try:
         return format_info(source, open_recording(source, config).describe())
     except SeveralTopicsError as error:
-        names = ", ".join(topic.name for topic in error.clouds)
         rows = [
             ("source", str(source)),
-            ("point clouds", names),
+            ("point clouds", ", ".join(topic.name for topic in error.clouds)),
             ("note", f"Choose one of them with --topic, such as --topic {error.clouds[0].name}"),
         ]
-        return "\n".join([*_aligned(rows), *_topic_lines(error.topics, chosen=None)])
+        return _text(rows, error.topics, chosen=None)
 
 
 def format_info(source: Path, info: RecordingInfo) -> str:
     """A recording's description as aligned lines of text."""
-    return "\n".join([*_aligned(list(_rows(source, info))), *_topic_lines(info.topics, info.topic)])
+    return _text(list(_rows(source, info)), info.topics, info.topic)
 
 
-def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+def _text(rows: Sequence[tuple[str, str]], topics: Sequence[Topic], chosen: str | None) -> str:
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:<{width}}{one_line(text)}" for name, text in rows]
+    lines = [f"{name:<{width}}{one_line(text)}" for name, text in rows]
+    return "\n".join([*lines, *_topic_lines(topics, chosen)])
 
 
 def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
@@ -79,9 +79,8 @@ def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:
     if not topics:
         return
     yield from ("", "topics")
-    shown = [(topic, one_line(topic.name), one_line(topic.message_type)) for topic in topics]
-    width = max(len(name) for _, name, _ in shown)
-    types = max(len(message_type) for _, _, message_type in shown)
-    for topic, name, message_type in shown:
+    names = max(len(one_line(topic.name)) for topic in topics)
+    types = max(len(one_line(topic.message_type)) for topic in topics)
+    for topic in topics:
         mark = "*" if topic.name == chosen else " "
-        yield f"  {mark} {name:<{width}}  {message_type:<{types}}  {topic.messages:>8,}"
+        yield f"  {mark} {one_line(topic.name):<{names}}  {one_line(topic.message_type):<{types}}  {topic.messages:>8,}"

@@ -1,4 +1,4 @@
-"""The door between a recording and whoever works on its scans: each scan is looked at here, once."""
+"""Scans of a recording on their way to a run: ordered by stamp, thinned where too large, checked once."""
 
 from collections.abc import Iterator
 
@@ -20,13 +20,11 @@ _SAMPLE = 4096
 
 _THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most so many, one in a cell of 2 cm"
 _MILLIMETRES = "scans look like millimetres, where metres are expected: convert the points"
-_ONE_PLACE = "scans have all their points at one place and say nothing"
+_ONE_PLACE = "scans have all their points at one place and carry no geometry"
 
 
 def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Scan]:
-    """The chosen scans of a recording, in the order of time, of a size that can be worked on.
-
-    What is left out and what looks wrong is counted in `faults`.
+    """The chosen scans of a recording, in the order of time, of bounded size; faults are counted.
 
     Raises:
         InputError: the recording is damaged where no scan can be left out, or its clock was set back.
@@ -36,7 +34,7 @@ def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Sca
 
 
 def look_at(scan: Scan, faults: Faults) -> Scan:
-    """The scan, thinned if it is too large; what looks wrong with it is counted."""
+    """The scan, thinned if it is too large; faults are counted."""
     if len(scan) > _MOST_POINTS:
         faults.note(_THINNED, f"{len(scan):,} points at {scan.stamp:.9f}")
         scan = scan.select(one_per_cell(scan.points, _CELL_M))

@@ -1,4 +1,4 @@
-"""How good a trajectory and its map are: from a run directory or a trajectory file to metrics.json."""
+"""Evaluation of a run directory or a trajectory file: metrics.json."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from evaluation.trajectory.metrics import TrajectoryMetrics, disagreement, evalu
 from lidarslam.core.errors import InputError
 from lidarslam.evaluate.error_cloud import check_error_files, write_errors
 from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
-from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map, read_map
+from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map
 from lidarslam.evaluate.reference_map import ReferenceMap, find_reference_map, load_reference_map
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
@@ -20,7 +20,7 @@ from lidarslam.run.directory import RunDirectory
 
 @dataclass(frozen=True)
 class EvaluateRequest:
-    """What is evaluated, against what, and where the figures go.
+    """Estimate, references and outputs.
 
     Attributes:
         run: a run directory, or a trajectory in TUM or KITTI text.
@@ -28,12 +28,12 @@ class EvaluateRequest:
         reference_map: a cloud; None: the exact map of a simulated source, else none.
         map_file: the map of a bare trajectory, or another one than the run's.
         alignment: of the trajectory, for the ATE.
-        tolerance_s, max_gap_s: how poses are matched in time.
-        map_options: how maps are compared.
+        tolerance_s, max_gap_s: of the association in time.
+        map_options: of the comparison of maps.
         errors: files for the map coloured by its errors.
         errors_clip_m: distance of the brightest colour.
         out: file for the figures; None: metrics.json of the run, and nothing of a bare trajectory.
-        needs_reference: whether it is an error that there is nothing to compare with.
+        needs_reference: whether it is an error that there is no reference.
     """
 
     run: Path
@@ -52,15 +52,15 @@ class EvaluateRequest:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What came of it.
+    """Errors of an estimate.
 
     Attributes:
         estimate: what was evaluated.
-        reference: what its trajectory was held against, in words; None when there was nothing.
+        reference: description of the reference trajectory; None without one.
         metrics: errors of the trajectory.
         map: errors of the map; None without a map or a reference for it.
-        entropy: crispness of the map; None without a map.
-        notes: what the reader should know.
+        entropy: of the map; None without a map.
+        notes: remarks for the reader.
         written: the files.
     """
 
@@ -86,37 +86,42 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     """Compare, and write the figures.
 
     Raises:
-        InputError: something to read is missing or damaged, or there is nothing to compare with.
-        OutputError: something cannot be written.
+        InputError: a file is missing or damaged, or there is no reference.
+        OutputError: a file cannot be written.
     """
     check_error_files(request.errors)
     estimate = read_estimate(request.run, request.map_file)
     notes: list[str] = []
-    reference = _reference(request, estimate, notes)
-    metrics = None
+    reference, metrics = _reference(request, estimate, notes), None
     if reference is not None:
-        pair_of_both = pair(estimate, reference)
-        metrics = evaluate_trajectory(*pair_of_both, request.tolerance_s, request.max_gap_s, request.alignment)
-        unrelated = disagreement(metrics)
-        notes += [] if unrelated is None else [unrelated]
-    compared = _evaluate_map(request, estimate, metrics, reference, notes)
+        trajectories = pair(estimate, reference)
+        metrics = evaluate_trajectory(*trajectories, request.tolerance_s, request.max_gap_s, request.alignment)
+        notes += [warning] if (warning := disagreement(metrics)) is not None else []
+    # Poses of KITTI's camera do not give the LiDAR's world.
+    in_camera = estimate.run is not None and reference is not None and reference.stamps is None
+    compared = _evaluate_map(request, estimate, None if in_camera else metrics, notes)
     if request.errors and compared is None:
         raise InputError("--errors colours a map by its distance to a reference; name one with --reference-map MAP")
-    evaluation = Evaluation(
-        estimate=estimate,
-        reference=None if reference is None else reference.what,
-        metrics=metrics,
-        map=compared,
-        entropy=_entropy(estimate, compared),
-        notes=[*notes, *(compared.warnings() if compared is not None else ())],
-        written=_outputs(request, estimate),
-    )
-    _write(request, evaluation)
+    entropy = None
+    if compared is not None:
+        entropy = compared.entropy
+        notes += compared.warnings()
+    elif estimate.map_file is not None:
+        entropy = map_entropy(estimate.map_points())
+    out = request.out or (None if estimate.run is None else estimate.run / files.METRICS)
+    written = [*([] if out is None else [out]), *request.errors]
+    what = None if reference is None else reference.what
+    evaluation = Evaluation(estimate, what, metrics, compared, entropy, notes, written)
+    if out is not None:
+        RunDirectory(out.parent).write_json(out.name, evaluation.to_json())
+    if compared is not None:
+        for path in request.errors:
+            write_errors(path, compared.comparison, compared.positions, request.errors_clip_m)
     return evaluation
 
 
 def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -> Poses | None:
-    """What the trajectory is held against; with a map to compare, doing without is only noted."""
+    """The reference trajectory; where a map is compared, its absence is only noted."""
     if request.reference is not None:
         return read_reference(request.reference, estimate.config.reader)
     if not request.needs_reference:
@@ -134,35 +139,25 @@ def _own_truth(estimate: Estimate) -> Poses:
     source = estimate.source
     if source is None:
         raise InputError(
-            f"{estimate.poses.what}: nothing says what is true here; name a trajectory with --reference or a map with"
-            " --reference-map"
+            f"{estimate.poses.what}: has no reference; name a trajectory with --reference or a map with --reference-map"
         )
     if not source.exists():
         raise InputError(
-            f"{source}: the recording that the run was made of is not there any more; name it, or its true"
-            " trajectory, with --reference"
+            f"{source}: the run's recording is not there any more; name it, or its true trajectory, with --reference"
         )
     return recording_truth(source, estimate.config.reader)
 
 
 def _evaluate_map(
-    request: EvaluateRequest,
-    estimate: Estimate,
-    metrics: TrajectoryMetrics | None,
-    reference: Poses | None,
-    notes: list[str],
+    request: EvaluateRequest, estimate: Estimate, metrics: TrajectoryMetrics | None, notes: list[str]
 ) -> MapEvaluation | None:
-    reference_map = _reference_map(request, estimate)
-    if reference_map is None:
+    reference = _reference_map(request, estimate)
+    if reference is None:
         return None
     if estimate.map_file is None and request.reference_map is None:
-        if estimate.run is not None:
-            notes.append("the run has no map to compare with that of the simulation")
+        notes += ["the run has no map to compare with that of the simulation"] if estimate.run is not None else []
         return None
-    # Poses of KITTI's camera say nothing about where the LiDAR's world lies.
-    in_camera = estimate.run is not None and reference is not None and reference.stamps is None
-    own_metrics = None if in_camera else metrics
-    return evaluate_map(estimate, read_map(estimate), own_metrics, reference_map, request.map_options)
+    return evaluate_map(estimate, metrics, reference, request.map_options)
 
 
 def _reference_map(request: EvaluateRequest, estimate: Estimate) -> ReferenceMap | None:
@@ -172,22 +167,3 @@ def _reference_map(request: EvaluateRequest, estimate: Estimate) -> ReferenceMap
         return None
     sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
     return next((found for found in map(find_reference_map, sources) if found is not None), None)
-
-
-def _entropy(estimate: Estimate, compared: MapEvaluation | None) -> MapEntropy | None:
-    if compared is not None:
-        return compared.entropy
-    return None if estimate.map_file is None else map_entropy(read_map(estimate))
-
-
-def _outputs(request: EvaluateRequest, estimate: Estimate) -> list[Path]:
-    figures = request.out or (None if estimate.run is None else estimate.run / files.METRICS)
-    return [*([] if figures is None else [figures]), *request.errors]
-
-
-def _write(request: EvaluateRequest, evaluation: Evaluation) -> None:
-    for path in evaluation.written:
-        if path not in request.errors:
-            RunDirectory(path.parent).write_json(path.name, evaluation.to_json())
-        elif evaluation.map is not None:
-            write_errors(path, evaluation.map.comparison, evaluation.map.positions, request.errors_clip_m)

@@ -1,8 +1,7 @@
-"""What is evaluated and what it is held against, read from runs, recordings and trajectory files."""
+"""Estimates and references, read from runs, recordings and trajectory files."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,23 +13,24 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
+from lidarslam.evaluate.reference_cloud import read_cloud
 from lidarslam.resume.unfinished import require_whole
 from lidarslam.run import directory as files
 from lidarslam.run.finished_run import read_trajectory
 
-# KITTI's LiDAR turned ten times a second; only speeds depend on it.
+# KITTI's LiDAR turns ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1
 _KITTI_COLUMNS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """A trajectory as it was found.
+    """A trajectory with or without stamps.
 
     Attributes:
-        what: it is, in words.
-        stamps: (N,), None in KITTI's text format, which has none.
-        T_world_lidar: (N, 4, 4); of KITTI's camera where that is what a file holds.
+        what: its description.
+        stamps: (N,), None in KITTI's text format.
+        T_world_lidar: (N, 4, 4); of KITTI's camera where the file is in that frame.
         T_cam_lidar: of a KITTI recording, whose pose files are in the camera's frame.
     """
 
@@ -39,13 +39,8 @@ class Poses:
     T_world_lidar: FloatArray
     T_cam_lidar: FloatArray | None = None
 
-    @classmethod
-    def of(cls, what: str, trajectory: Trajectory, T_cam_lidar: FloatArray | None = None) -> "Poses":
-        """The poses of a trajectory."""
-        return cls(what, trajectory.stamps, trajectory.T_world_lidar, T_cam_lidar)
-
     def in_camera(self) -> "Poses":
-        """The same in the frame of KITTI's camera, as the pose files have them, if there is a camera."""
+        """The same in the frame of KITTI's camera, if there is one."""
         if self.T_cam_lidar is None:
             return self
         return Poses(self.what, self.stamps, self.T_cam_lidar @ self.T_world_lidar @ inverse(self.T_cam_lidar))
@@ -53,13 +48,13 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What is evaluated.
+    """A trajectory and its map.
 
     Attributes:
         poses: the trajectory.
         run: the run directory, None of a bare trajectory.
         map_file: its map, None when there is none.
-        source: the recording that the run was made of, None of a bare trajectory.
+        source: the recording of the run, None of a bare trajectory.
         config: of the run; the defaults of a bare trajectory.
     """
 
@@ -68,6 +63,17 @@ class Estimate:
     map_file: Path | None
     source: Path | None
     config: Config
+
+    def map_points(self) -> FloatArray:
+        """The map's points (N, 3).
+
+        Raises:
+            InputError: there is no map, or it cannot be read.
+        """
+        if self.map_file is None:
+            advice = "name it with --map FILE" if self.run is None else "tracking was lost on every scan"
+            raise InputError(f"{self.poses.what}: has no map to compare; {advice}")
+        return read_cloud(self.map_file)
 
 
 def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
@@ -80,12 +86,17 @@ def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
         raise InputError(f"{path}: no such run directory or trajectory file")
     if not path.is_dir():
         return Estimate(read_poses(path), None, map_file, None, Config())
-    poses = Poses.of(str(path), read_trajectory(path))
+    trajectory, config_file = read_trajectory(path), path / files.CONFIG
+    poses = Poses(str(path), trajectory.stamps, trajectory.T_world_lidar)
     own_map = path / files.MAP_PLY
     chosen_map = map_file or (own_map if own_map.is_file() else None)
-    if not (path / files.CONFIG).is_file():
+    if not config_file.is_file():
         return Estimate(poses, path, chosen_map, None, Config())
-    return Estimate(poses, path, chosen_map, _source(path / files.CONFIG), load_config(path / files.CONFIG))
+    try:
+        source = Path(read_yaml(config_file)[files.RUN_SECTION]["source"])
+    except (YamlError, TypeError, KeyError):
+        source = None
+    return Estimate(poses, path, chosen_map, source, load_config(config_file))
 
 
 def read_reference(path: Path, config: ReaderConfig) -> Poses:
@@ -98,7 +109,8 @@ def read_reference(path: Path, config: ReaderConfig) -> Poses:
         raise InputError(f"{path}: no such trajectory, run directory or recording")
     require_whole(path)
     if (path / files.TRAJECTORY_TUM).is_file():
-        return Poses.of(f"the run {path}", read_trajectory(path))
+        trajectory = read_trajectory(path)
+        return Poses(f"the run {path}", trajectory.stamps, trajectory.T_world_lidar)
     if path.is_dir() or any(reader.recognises(path) for reader in READERS.values()):
         return recording_truth(path, config)
     return read_poses(path)
@@ -116,7 +128,7 @@ def recording_truth(source: Path, config: ReaderConfig) -> Poses:
         raise InputError(
             f"{source}: came with no ground truth; name a trajectory with --reference or a map with --reference-map"
         )
-    return Poses.of(f"the ground truth of {source}", truth, recording.T_cam_lidar)
+    return Poses(f"the ground truth of {source}", truth.stamps, truth.T_world_lidar, recording.T_cam_lidar)
 
 
 def read_poses(path: Path) -> Poses:
@@ -125,16 +137,23 @@ def read_poses(path: Path) -> Poses:
     Raises:
         InputError: it is damaged.
     """
-    if _columns(path) == _KITTI_COLUMNS:
+    try:
+        with path.open(encoding="utf-8-sig") as lines:
+            rows = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
+            columns = next((len(words) for words in rows if words), 0)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: neither a TUM nor a KITTI trajectory; it is not text") from error
+    if columns == _KITTI_COLUMNS:
         return Poses(str(path), None, read_kitti_poses(path))
-    return Poses.of(str(path), read_tum(path))
+    trajectory = read_tum(path)
+    return Poses(str(path), trajectory.stamps, trajectory.T_world_lidar)
 
 
 def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
     """Both as trajectories with stamps, poses of one and the same sensor.
 
-    KITTI's text has no stamps, so that its poses are matched by their number, and is in the camera's frame: a
-    recording's truth follows it there, and a run is represented by its own trajectory in that format.
+    KITTI's text has no stamps, so that its poses are matched by their number, and is in the camera's frame: the truth
+    of a recording is brought there, and a run is represented by its own trajectory in that format.
 
     Raises:
         InputError: one has no stamps, and the other not as many poses.
@@ -144,34 +163,14 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
         poses = Poses(poses.what, poses.stamps, read_kitti_poses(estimate.run / files.TRAJECTORY_KITTI))
     if poses.stamps is None:
         reference = reference.in_camera()
-    stamps = poses.stamps, reference.stamps
-    if stamps[0] is not None and stamps[1] is not None:
-        return Trajectory(stamps[0], poses.T_world_lidar), Trajectory(stamps[1], reference.T_world_lidar)
-    if len(poses.T_world_lidar) != len(reference.T_world_lidar):
+    if poses.stamps is not None and reference.stamps is not None:
+        return Trajectory(poses.stamps, poses.T_world_lidar), Trajectory(reference.stamps, reference.T_world_lidar)
+    count = len(poses.T_world_lidar)
+    if count != len(reference.T_world_lidar):
         raise InputError(
-            f"{poses.what} has {len(poses.T_world_lidar):,} poses, {reference.what} has"
-            f" {len(reference.T_world_lidar):,}, and KITTI's text format has no stamps to match them by;"
-            " give both as TUM files, or the same poses in both"
+            f"{poses.what} has {count:,} poses, {reference.what} has {len(reference.T_world_lidar):,}, and KITTI's text"
+            " format has no stamps to match them by; give both as TUM files, or the same poses in both"
         )
-    counted: FloatArray = _KITTI_PERIOD_S * np.arange(len(poses.T_world_lidar), dtype=np.float64)
-    common = next((s for s in stamps if s is not None), counted)
-    return Trajectory(common, poses.T_world_lidar), Trajectory(common, reference.T_world_lidar)
-
-
-def _columns(path: Path) -> int:
-    """How many numbers the first line with any has."""
-    try:
-        with path.open(encoding="utf-8-sig") as lines:
-            rows = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
-            return next((len(words) for words in rows if words), 0)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: neither a TUM nor a KITTI trajectory; it is not text") from error
-
-
-def _source(config_file: Path) -> Path | None:
-    """The recording that config.yaml names."""
-    try:
-        tree: Any = read_yaml(config_file)
-        return Path(tree[files.RUN_SECTION]["source"])
-    except (YamlError, TypeError, KeyError):
-        return None
+    stamps = poses.stamps if poses.stamps is not None else reference.stamps
+    stamps = _KITTI_PERIOD_S * np.arange(count, dtype=np.float64) if stamps is None else stamps
+    return Trajectory(stamps, poses.T_world_lidar), Trajectory(stamps, reference.T_world_lidar)

@@ -1,4 +1,4 @@
-"""A map held against a reference map: aligned, compared, its crispness measured."""
+"""Comparison of a map with a reference map: alignment, errors, entropy."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,30 +17,27 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse, is_rigid, orthonormalize, transform_points
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import parse_numbers
-from lidarslam.evaluate.inputs import Estimate, read_estimate
-from lidarslam.evaluate.reference_cloud import read_cloud
+from lidarslam.evaluate.inputs import Estimate
 from lidarslam.evaluate.reference_map import ReferenceMap
-
-AUTO, TRAJECTORY, NONE = "auto", "trajectory", "none"
 
 _DRAWN_POINTS = 200_000
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How maps are compared.
+    """Options of the comparison of maps.
 
     Attributes:
-        alignment: where `T_reference_map` comes from. "trajectory": the alignment of the trajectory with one in the
-            reference map's world; "none": the map is in the reference's frame already; "global": a search; or the
-            name of a text file with the 4x4 matrix. "auto": the trajectory where it is known to be in the reference
-            map's world, else whichever of trajectory, none and global fits first.
+        alignment: initial `T_reference_map`. "trajectory": the alignment of the trajectory with one in the reference
+            map's world; "none": the identity; "global": global registration; or the name of a text file with the 4x4
+            matrix. "auto": the trajectory where it is known to be in the reference map's world, else the first of
+            trajectory, none and global that fits.
         refine: whether ICP follows; None: unless the alignment is "none".
-        spacing_m: both clouds are thinned to one point in cells of this size.
-        max_range_m: how far the sensor sees; None: as far as the run's map reaches.
+        spacing_m: edge of the cells that both clouds are thinned to one point in.
+        max_range_m: range of the sensor; None: that of the run's map.
     """
 
-    alignment: str = AUTO
+    alignment: str = "auto"
     refine: bool | None = None
     spacing_m: float = DEFAULT_SPACING_M
     max_range_m: float | None = None
@@ -52,15 +49,15 @@ class MapOptions:
 
 @dataclass(frozen=True, eq=False)
 class MapEvaluation:
-    """What came of it.
+    """Errors of a map.
 
     Attributes:
-        reference: what the map was held against, in words.
-        alignment: how it was brought there.
+        reference: description of the reference map.
+        alignment: of the map with it.
         comparison: the errors, in numbers and point by point.
-        entropy: crispness of the map by itself; None when it is too sparse.
-        positions: (K, 3) where the sensor was, in the reference's frame.
-        max_range_m: how far it sees.
+        entropy: of the map by itself; None when it is too sparse.
+        positions: (K, 3) of the sensor, in the reference's frame.
+        max_range_m: range of the sensor.
     """
 
     reference: str
@@ -84,7 +81,7 @@ class MapEvaluation:
         return MapErrors(errors.points[::step], errors.distances_m[::step])
 
     def warnings(self) -> Iterator[str]:
-        """What the reader of the figures must know."""
+        """Reasons not to trust the figures."""
         alignment, gap_m = self.alignment, self.comparison.map_gap_m
         if not alignment.is_trustworthy:
             yield (
@@ -93,68 +90,34 @@ class MapEvaluation:
             )
         if gap_m is not None and gap_m > F_SCORE_THRESHOLDS_M[0]:
             yield (
-                f"the map's points are {gap_m:.2f} m apart, so that completeness and the F-score at"
-                f" {F_SCORE_THRESHOLDS_M[0]:g} m say more about its voxels than about its errors;"
-                " run again with --set global_map.voxel_size_m=0.05"
+                f"the map's points are {gap_m:.2f} m apart, which limits completeness and the F-score at"
+                f" {F_SCORE_THRESHOLDS_M[0]:g} m; run again with --set global_map.voxel_size_m=0.05"
             )
 
 
-def evaluate_map_of_run(
-    run: Path, metrics: TrajectoryMetrics | None, reference: ReferenceMap, options: MapOptions | None = None
+def evaluate_map(
+    estimate: Estimate, metrics: TrajectoryMetrics | None, reference: ReferenceMap, options: MapOptions | None = None
 ) -> MapEvaluation:
-    """Hold a run's map against a reference map.
+    """Compare the map of an estimate with a reference map.
 
     Args:
-        run: the run directory.
-        metrics: of its trajectory (`trajectory.tum`), None when that has no reference.
+        estimate: with a map in the world of its poses.
+        metrics: of its trajectory, None when that has no reference.
         reference: from `load_reference_map` or `find_reference_map`.
         options: the defaults when None.
 
     Raises:
-        InputError: the run has no map, or it cannot be aligned.
-    """
-    estimate = read_estimate(run)
-    return evaluate_map(estimate, read_map(estimate), metrics, reference, options)
-
-
-def read_map(estimate: Estimate) -> FloatArray:
-    """The map's points (N, 3).
-
-    Raises:
-        InputError: there is none, or it cannot be read.
-    """
-    if estimate.map_file is None:
-        advice = "name it with --map FILE" if estimate.run is None else "no scan of it could be believed"
-        raise InputError(f"{estimate.poses.what}: has no map to compare; {advice}")
-    return read_cloud(estimate.map_file)
-
-
-def evaluate_map(
-    estimate: Estimate,
-    map_points: FloatArray,
-    metrics: TrajectoryMetrics | None,
-    reference: ReferenceMap,
-    options: MapOptions | None = None,
-) -> MapEvaluation:
-    """Hold a map (N, 3), in the world of the estimate's poses, against a reference map; else as `evaluate_map_of_run`.
-
-    Raises:
-        InputError: it cannot be aligned.
+        InputError: there is no map, or it cannot be aligned.
     """
     options = options or MapOptions()
+    points = estimate.map_points()
     T_reference_world, positions = _along_trajectory(estimate, metrics, reference)
-    alignment = _align(map_points, reference, T_reference_world, options)
+    alignment = _align(points, reference, T_reference_world, options)
     max_range_m = options.max_range_m or estimate.config.global_map.max_range_m
     positions = transform_points(alignment.T_reference_map, positions)
-    aligned = transform_points(alignment.T_reference_map, map_points)
-    return MapEvaluation(
-        reference=reference.what,
-        alignment=alignment,
-        comparison=compare_maps(aligned, reference.points, positions, max_range_m, options.spacing_m),
-        entropy=map_entropy(map_points),
-        positions=positions,
-        max_range_m=max_range_m,
-    )
+    aligned = transform_points(alignment.T_reference_map, points)
+    comparison = compare_maps(aligned, reference.points, positions, max_range_m, options.spacing_m)
+    return MapEvaluation(reference.what, alignment, comparison, map_entropy(points), positions, max_range_m)
 
 
 def _along_trajectory(
@@ -162,44 +125,45 @@ def _along_trajectory(
 ) -> tuple[FloatArray | None, FloatArray]:
     """`T_reference_world` (4, 4) by the trajectories, and the sensor's positions (K, 3) in the map's world.
 
-    The positions are the true ones where there are any: a lost trajectory would look at places it never was.
+    The positions are the true ones where there are any, as those of a lost trajectory are wrong.
     """
     poses, method = estimate.poses, "se3" if metrics is None else metrics.alignment
+    without_truth = None, poses.T_world_lidar[:, :3, 3]
     if reference.truth is not None and poses.stamps is not None:
         try:
             association = associate(Trajectory(poses.stamps, poses.T_world_lidar), reference.truth)
         except InputError:
-            return None, poses.T_world_lidar[:, :3, 3]
+            return without_truth
         T_reference_world = align(association.estimate, association.reference, method)
         true_positions = association.reference.positions
     elif metrics is not None:
         T_reference_world, true_positions = metrics.T_reference_estimate, metrics.association.reference.positions
     else:
-        return None, poses.T_world_lidar[:, :3, 3]
+        return without_truth
     return T_reference_world, transform_points(inverse(T_reference_world), true_positions)
 
 
 def _align(
-    map_points: FloatArray, reference: ReferenceMap, T_reference_world: FloatArray | None, options: MapOptions
+    points: FloatArray, reference: ReferenceMap, T_reference_world: FloatArray | None, options: MapOptions
 ) -> MapAlignment:
-    by_trajectory = {} if T_reference_world is None else {TRAJECTORY: T_reference_world}
-    refine = options.alignment != NONE if options.refine is None else options.refine
-    as_given = {NONE: np.eye(4)}
-    if options.alignment == AUTO:
-        shares_world = reference.truth is not None and bool(by_trajectory)
-        guesses = by_trajectory if shares_world else by_trajectory | as_given
-        return align_map(map_points, reference.points, guesses, search=not shares_world, refine=refine)
-    if options.alignment == GLOBAL:
-        return align_map(map_points, reference.points, {}, search=True)
-    if options.alignment == TRAJECTORY:
-        if not by_trajectory:
-            raise InputError("--map-alignment trajectory needs a true trajectory in the reference map's world")
-        return align_map(map_points, reference.points, by_trajectory, refine=refine)
-    if options.alignment == NONE:
-        return align_map(map_points, reference.points, as_given, refine=refine)
-    return align_map(
-        map_points, reference.points, {"file": read_transform(Path(options.alignment))}, search=False, refine=refine
-    )
+    by_trajectory = {} if T_reference_world is None else {"trajectory": T_reference_world}
+    as_given, search = {"none": np.eye(4)}, options.alignment == GLOBAL
+    match options.alignment:
+        case "auto":
+            search = reference.truth is None or not by_trajectory
+            guesses = by_trajectory | as_given if search else by_trajectory
+        case "global":
+            guesses = {}
+        case "trajectory":
+            if not by_trajectory:
+                raise InputError("--map-alignment trajectory needs a true trajectory in the reference map's world")
+            guesses = by_trajectory
+        case "none":
+            guesses = as_given
+        case file:
+            guesses = {"file": read_transform(Path(file))}
+    refine = options.alignment != "none" if options.refine is None else options.refine
+    return align_map(points, reference.points, guesses, search, refine)
 
 
 def read_transform(path: Path) -> FloatArray:

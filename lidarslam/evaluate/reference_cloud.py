@@ -1,5 +1,4 @@
-"""Point clouds on disk, as scanners, surveyors and mapping programs leave them; the only file that imports laspy and
-pye57."""
+"""Point clouds on disk, as scanners, surveyors and mapping programs write them; the only file with laspy and pye57."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +29,14 @@ def read_cloud(path: Path) -> FloatArray:
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise InputError(f"{path}: not a point cloud that can be read; it must end in {', '.join(_READERS)}")
-    points = read(path)
+    try:
+        points = read(path)
+    except InputError:
+        raise
+    except Exception as error:  # whatever a damaged file makes of laspy, its decompressors and libE57Format
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        kind = path.suffix[1:].upper()
+        raise InputError(f"{path}: not a readable {kind} file ({reason}); copy it again or remove it") from error
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise InputError(f"{path}: holds no point; choose another file")
@@ -40,27 +46,14 @@ def read_cloud(path: Path) -> FloatArray:
     return points
 
 
-def _read_table(path: Path) -> FloatArray:
-    table = read_ply(path) if path.suffix.lower() == ".ply" else read_pcd(path)
-    try:
-        return coordinates(table)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
 def _read_las(path: Path) -> FloatArray:
-    try:
-        import laspy
-    except ImportError as error:
-        raise InputError(f"{path}: LAS and LAZ files need laspy; type: pip install 'laspy[lazrs]'") from error
-    try:
-        with laspy.open(path) as file:
-            cloud = file.read()
-            if len(cloud) != file.header.point_count:
-                raise ValueError(f"{len(cloud):,} of {file.header.point_count:,} points")
-            return np.asarray(cloud.xyz, dtype=np.float64)
-    except Exception as error:  # whatever a damaged file makes of laspy and of its decompressors
-        raise _damaged(path, error) from error
+    import laspy
+
+    with laspy.open(path) as file:
+        cloud = file.read()
+        if len(cloud) != file.header.point_count:
+            raise ValueError(f"{len(cloud):,} of {file.header.point_count:,} points")
+        return np.asarray(cloud.xyz, dtype=np.float64)
 
 
 def _read_e57(path: Path) -> FloatArray:
@@ -68,27 +61,18 @@ def _read_e57(path: Path) -> FloatArray:
         import pye57
     except ImportError as error:
         raise InputError(f"{path}: E57 files need pye57; type: pip install pye57") from error
+    file = pye57.E57(str(path))
     try:
-        file = pye57.E57(str(path))
-        try:
-            scans = [file.read_scan(number, ignore_missing_fields=True) for number in range(file.scan_count)]
-        finally:
-            file.close()
-        columns = [np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1) for scan in scans]
-        return np.concatenate([np.empty((0, 3)), *columns])
-    except Exception as error:  # pye57 passes on libE57Format's own exceptions
-        raise _damaged(path, error) from error
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    kind = path.suffix[1:].upper()
-    reason = " ".join(str(error).split())[:160] or type(error).__name__
-    return InputError(f"{path}: not a readable {kind} file ({reason}); copy it again or remove it")
+        scans = [file.read_scan(number, ignore_missing_fields=True) for number in range(file.scan_count)]
+    finally:
+        file.close()
+    columns = [np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1) for scan in scans]
+    return np.concatenate([np.empty((0, 3)), *columns])
 
 
 _READERS: dict[str, Callable[[Path], FloatArray]] = {
-    ".ply": _read_table,
-    ".pcd": _read_table,
+    ".ply": lambda path: coordinates(read_ply(path)),
+    ".pcd": lambda path: coordinates(read_pcd(path)),
     ".las": _read_las,
     ".laz": _read_las,
     ".e57": _read_e57,

@@ -1,4 +1,4 @@
-"""Maps that are true: a file, or what lies beside a simulated recording."""
+"""Reference maps: a file, or the exact map beside a simulated recording."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,9 @@ class ReferenceMap:
     """A map to compare with.
 
     Attributes:
-        path: where it was read.
+        path: of its file.
         points: (N, 3) in its own frame.
-        truth: the true trajectory in that same frame; None when no trajectory is known to be in it.
+        truth: the true trajectory in that frame; None when none is known.
     """
 
     path: Path
@@ -26,7 +26,7 @@ class ReferenceMap:
 
     @property
     def what(self) -> str:
-        """It is, in words."""
+        """Its description."""
         return f"{self.path}{'' if self.truth is None else ', the exact map of the simulation'}"
 
 

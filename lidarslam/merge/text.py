@@ -1,6 +1,5 @@
-"""What `lidarslam merge` prints at the end."""
+"""The report that `lidarslam merge` prints at the end."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.merge.merge import MergeOutcome
@@ -10,21 +9,13 @@ from lidarslam.run.summary_text import format_map
 
 
 def format_merge(out: Path, outcome: MergeOutcome) -> str:
-    """A merge in a few lines: each recording, what joins them, the common map, what went wrong, where it all lies."""
-    return "\n".join(_lines(out, outcome))
-
-
-def _lines(out: Path, outcome: MergeOutcome) -> Iterator[str]:
+    """A merge in a few lines: each recording, the loops between them, the common map, warnings, and the directory."""
     summary = outcome.summary
-    for recording, run in zip(summary.recordings, outcome.runs, strict=True):
-        yield _recording(recording, run)
-    yield _joined(summary)
-    yield format_map(summary.map)
-    for warning in summary.warnings:
-        yield f"warning: {warning}"
+    lines = [_recording(recording, run) for recording, run in zip(summary.recordings, outcome.runs, strict=True)]
+    lines += [_joined(summary), format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
     if summary.lost_scans:
-        yield f"tracking was lost on {summary.lost_scans:,} scans; the summaries of the recordings say where"
-    yield f"written to {out}"
+        lines.append(f"tracking was lost on {summary.lost_scans:,} scans; the summaries of the recordings say where")
+    return "\n".join([*lines, f"written to {out}"])
 
 
 def _recording(recording: MergedRecording, run: RunOutcome | None) -> str:
@@ -43,7 +34,7 @@ def _joined(summary: MergeSummary) -> str:
     joined = sum(recording.joined for recording in summary.recordings)
     loops = () if summary.graph is None else summary.graph.loops
     closed = [loop for loop in loops if loop.accepted]
-    between = sum(loop.first_recording != loop.second_recording for loop in closed)
+    between = sum(len(set(loop.recordings or ())) > 1 for loop in closed)
     return (
         f"{joined} of {len(summary.recordings)} recordings in one map;"
         f" loops closed: {between} between recordings, {len(closed) - between} within"

@@ -83,7 +83,7 @@ class ScanToMap(Stateful):
         motion = estimated.motion
         prior = Prior(motion.T_prev_curr if measured else None, odometry.mean(estimated.scan), motion.covariance)
         mapped = self._mapper.process(estimated.scan, prior)
-        expected = inverse(self._T_world_last) @ mapped.T_world_expected
+        expected = inverse(self._T_world_last) @ mapped.T_world_predicted
         self._T_odom_lidar = self._T_odom_lidar @ (motion.T_prev_curr if measured else expected)
         self._T_world_last = mapped.state.T_world_lidar
         return Localised(
@@ -99,7 +99,7 @@ class ScanToMap(Stateful):
             inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,
             degenerate=mapped.degenerate,
             stage_ms={"refine": 1e3 * (time.perf_counter() - started)},
-            is_connected=mapped.way_known,
+            is_connected=mapped.is_connected,
         )
 
 

@@ -22,53 +22,38 @@ if TYPE_CHECKING:  # GTSAM takes a while to load
 
 @dataclass(frozen=True)
 class LoopReport:
-    """A loop closure in the summary, accepted or rejected.
+    """A loop closure in the summary.
 
     Attributes:
-        first_scan, second_scan: which scans of their recordings, the second the later one.
-        accepted, reason: whether it is in the graph; why not.
-        found_by: "nearby" the estimate, or "appearance".
-        first_recording, second_recording: which recordings, from 1; None where there is one only.
+        closure: between keyframes.
+        accepted: whether it is in the graph: an outlier of the optimisation is not.
+        scans: which of their recordings, the second the later one.
+        recordings: which, from 1; None where there is one only.
     """
 
-    first_scan: int
-    second_scan: int
+    closure: LoopClosure
     accepted: bool
-    reason: str
-    found_by: str
-    overlap: float
-    residual_m: float
-    inlier_ratio: float
-    consistent: int
-    distance_m: float
-    turn_deg: float
-    first_recording: int | None = None
-    second_recording: int | None = None
-
-    @classmethod
-    def of(
-        cls, closure: LoopClosure, inlier: bool, scans: tuple[int, int], recordings: tuple[int | None, int | None]
-    ) -> "LoopReport":
-        """Of a closure between two scans; an outlier of the optimisation is rejected too."""
-        return cls(
-            *scans,
-            accepted=inlier,
-            reason=closure.reason if inlier or closure.reason else "does not fit the other edges of the graph",
-            found_by="appearance" if closure.by_appearance else "nearby",
-            overlap=closure.overlap,
-            residual_m=closure.residual_m,
-            inlier_ratio=closure.inlier_ratio,
-            consistent=closure.consistent,
-            distance_m=float(np.linalg.norm(closure.T_first_second[:3, 3])),
-            turn_deg=float(np.rad2deg(rotation_angle(closure.T_first_second))),
-            first_recording=recordings[0],
-            second_recording=recordings[1],
-        )
+    scans: tuple[int, int]
+    recordings: tuple[int, int] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """An entry of summary.json."""
-        known = {name: value for name, value in vars(self).items() if value is not None}
-        return {name: round(value, 4) if isinstance(value, float) else value for name, value in known.items()}
+        closure, of = self.closure, self.recordings
+        outlier = closure.accepted and not self.accepted
+        return {
+            "first_scan": self.scans[0],
+            "second_scan": self.scans[1],
+            "accepted": self.accepted,
+            "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
+            "found_by": "appearance" if closure.by_appearance else "nearby",
+            "overlap": round(closure.overlap, 4),
+            "residual_m": round(closure.residual_m, 4),
+            "inlier_ratio": round(closure.inlier_ratio, 4),
+            "consistent": closure.consistent,
+            "distance_m": round(float(np.linalg.norm(closure.T_first_second[:3, 3])), 4),
+            "turn_deg": round(float(np.rad2deg(rotation_angle(closure.T_first_second))), 4),
+            **({} if of is None else {"first_recording": of[0], "second_recording": of[1]}),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +76,6 @@ class GraphOutcome:
     loops: tuple[LoopReport, ...]
     largest_correction_m: float
     keyframe_ms: tuple[float, ...]
-
-    @property
-    def accepted(self) -> tuple[LoopReport, ...]:
-        """The loops that were closed."""
-        return tuple(loop for loop in self.loops if loop.accepted)
 
 
 def begin_graph(config: Config, directory: Path | None = None, file: Path | None = None) -> "SlamGraph | None":
@@ -130,7 +110,7 @@ def close_loops(
     closed = None if finished is None else finished.outcome([0])
     if closed is not None:
         log.correct(closed.T_world_lidar)
-        pairs = [(loop.first_scan, loop.second_scan) for loop in closed.accepted if loop.second_scan < len(log)]
+        pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
     return closed
 
@@ -161,16 +141,16 @@ class FinishedGraph:
         return [int(recording) for recording in mapped[self._result.frames[mapped] == frames[counts.argmax()]]]
 
     def common(self) -> GraphOutcome | None:
-        """The connected recordings; with the rejected closures to the others, which say why these are apart."""
-        ours = self.joined
-        outcome = self.outcome(ours)
+        """The connected recordings, and why others are apart: the rejected loops between recordings."""
+        outcome = self.outcome(self.joined)
+        if outcome is None:
+            return None
         apart = [
             loop
             for loop in self._loops(range(len(self._scans)), numbered=True)
-            if {loop.first_recording, loop.second_recording} <= {recording + 1 for recording in ours}
-            or (loop.first_recording != loop.second_recording and not loop.accepted)
+            if not (loop.accepted or self._are_in(self.joined, loop.closure)) and len(set(loop.recordings or ())) > 1
         ]
-        return None if outcome is None else replace(outcome, loops=tuple(apart))
+        return replace(outcome, loops=(*outcome.loops, *apart))
 
     def outcome(self, recordings: Sequence[int]) -> GraphOutcome | None:
         """Some recordings, and the loops between them; None when none has a keyframe."""
@@ -186,7 +166,7 @@ class FinishedGraph:
             edges=tuple(
                 replace(edge, first=row[edge.first], second=row[edge.second])
                 for edge in result.edges
-                if edge.first in row and edge.second in row
+                if self._are_in(recordings, edge)
             ),
             loops=self._loops(recordings, numbered=len(recordings) > 1),
             largest_correction_m=max(self._correction_m(recording) for recording in recordings),
@@ -208,16 +188,20 @@ class FinishedGraph:
         T_common_own = self._result.T_world_lidar[first] @ inverse(self._graph.scan_poses[first])
         return float(np.linalg.norm(after[:, :3, 3] - (T_common_own @ before)[:, :3, 3], axis=1).max())
 
+    def _are_in(self, recordings: Sequence[int], edge: RelativePose) -> bool:
+        of = self._result.keyframe_recordings
+        return bool(of[edge.first] in recordings and of[edge.second] in recordings)
+
     def _loops(self, recordings: Sequence[int], numbered: bool) -> tuple[LoopReport, ...]:
         of = self._result.keyframe_recordings
         scans = self._result.keyframe_scans - self._result.first_scans[of]
         return tuple(
-            LoopReport.of(
+            LoopReport(
                 closure,
                 inlier,
                 (int(scans[closure.first]), int(scans[closure.second])),
-                (int(of[closure.first]) + 1, int(of[closure.second]) + 1) if numbered else (None, None),
+                (int(of[closure.first]) + 1, int(of[closure.second]) + 1) if numbered else None,
             )
             for closure, inlier in zip(self._result.closures, self._result.inliers, strict=True)
-            if of[closure.first] in recordings and of[closure.second] in recordings
+            if self._are_in(recordings, closure)
         )

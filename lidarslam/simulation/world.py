@@ -1,34 +1,23 @@
-"""What a world is made of: boxes, cylinders and height fields, things that move, and a route through it.
-
-Few primitives serve two casters: Open3D casts rays against their triangles, the batched one against their formulas.
-"""
+"""Worlds: boxes, cylinders and height fields, moving boxes, and a route through them."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, make_transform
 
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Solid boxes.
+    """Solid boxes in the world."""
 
-    Attributes:
-        centres: (N, 3) in the world.
-        half_sizes: (N, 3) along the box's own axes, positive.
-        R_world_box: (N, 3, 3).
-    """
-
-    centres: FloatArray
-    half_sizes: FloatArray
-    R_world_box: FloatArray
+    centres: FloatArray  # (N, 3)
+    half_sizes: FloatArray  # (N, 3) along the box's own axes, positive
+    R_world_box: FloatArray  # (N, 3, 3)
 
     def __post_init__(self) -> None:
         n = len(self.centres)
-        _check("Boxes.centres", self.centres, (n, 3))
-        _check("Boxes.half_sizes", self.half_sizes, (n, 3))
-        _check("Boxes.R_world_box", self.R_world_box, (n, 3, 3))
+        _check(self, centres=(n, 3), half_sizes=(n, 3), R_world_box=(n, 3, 3))
         if (self.half_sizes <= 0.0).any():
             raise ValueError("Boxes.half_sizes must be positive")
 
@@ -43,22 +32,15 @@ class Boxes:
 
 @dataclass(frozen=True, eq=False)
 class Cylinders:
-    """Solid cylinders with flat ends, in any direction: poles, trunks, pipes.
+    """Solid cylinders with flat ends, in any direction: poles, trunks, pipes."""
 
-    Attributes:
-        starts, ends: (N, 3) centres of the two ends, in the world.
-        radii: (N,) positive.
-    """
-
-    starts: FloatArray
-    ends: FloatArray
-    radii: FloatArray
+    starts: FloatArray  # (N, 3) centres of the two ends, in the world
+    ends: FloatArray  # (N, 3)
+    radii: FloatArray  # (N,) positive
 
     def __post_init__(self) -> None:
         n = len(self.starts)
-        _check("Cylinders.starts", self.starts, (n, 3))
-        _check("Cylinders.ends", self.ends, (n, 3))
-        _check("Cylinders.radii", self.radii, (n,))
+        _check(self, starts=(n, 3), ends=(n, 3), radii=(n,))
         if (self.radii <= 0.0).any() or (np.linalg.norm(self.ends - self.starts, axis=1) <= 0.0).any():
             raise ValueError("Cylinders must have positive radii and lengths")
 
@@ -75,19 +57,16 @@ class Cylinders:
 class HeightField:
     """A surface z(x, y) over a regular grid: ground, or with another one above it the rock around a tunnel.
 
-    Attributes:
-        origin_xy: (2,) world position of `heights[0, 0]`.
-        cell_m: distance between neighbouring grid points.
-        heights: (X, Y) z at `origin + cell * (i, j)`; each cell is two triangles, split along the diagonal from
-            (i, j) to (i + 1, j + 1).
+    `heights` (X, Y) are z at `origin_xy + cell_m * (i, j)`; each cell is two triangles, split along the diagonal from
+    (i, j) to (i + 1, j + 1).
     """
 
-    origin_xy: FloatArray
+    origin_xy: FloatArray  # (2,)
     cell_m: float
     heights: FloatArray
 
     def __post_init__(self) -> None:
-        _check("HeightField.origin_xy", self.origin_xy, (2,))
+        _check(self, origin_xy=(2,))
         if self.heights.ndim != 2 or min(self.heights.shape) < 2 or not np.isfinite(self.heights).all():
             raise ValueError(f"HeightField.heights must be a finite grid of at least (2, 2), got {self.heights.shape}")
         if not self.cell_m > 0.0:
@@ -109,15 +88,10 @@ class HeightField:
 
 @dataclass(frozen=True, eq=False)
 class Grass:
-    """Blades on the ground, too thin and too many for primitives: what rays meet among them is drawn for each scan.
+    """Blades on the ground, too thin and too many for primitives: returns among them are drawn for each scan."""
 
-    Attributes:
-        heights: of the blades above the ground, 0 where none grow.
-        free_path_m: mean path of a ray among the blades until one reflects it; the shorter, the denser.
-    """
-
-    heights: HeightField
-    free_path_m: float
+    heights: HeightField  # of the blades above the ground, 0 where none grow
+    free_path_m: float  # mean path of a ray among the blades until one reflects it
 
     def __post_init__(self) -> None:
         if self.heights.heights.min() < 0.0 or not self.free_path_m > 0.0:
@@ -126,31 +100,21 @@ class Grass:
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """Something that drives around: boxes that follow a polyline at constant speed, again and again.
+    """Moving boxes that follow a closed polyline at constant speed, again and again."""
 
-    Attributes:
-        boxes: in the mover's own frame, x forwards, the origin on the ground.
-        waypoints: (M, 3) closed polyline in the world, or one point for something that stands.
-        speed_mps: along the polyline.
-        start_m: where on the polyline it is at time 0.
-    """
-
-    boxes: Boxes
-    waypoints: FloatArray
+    boxes: Boxes  # in the mover's own frame, x forwards, the origin on the ground
+    waypoints: FloatArray  # (M, 3) of the polyline, or one point for a mover that stands
     speed_mps: float
-    start_m: float
+    start_m: float  # along the polyline at time 0
 
     def __post_init__(self) -> None:
-        _check("Mover.waypoints", self.waypoints, (len(self.waypoints), 3))
+        _check(self, waypoints=(len(self.waypoints), 3))
         if not len(self.waypoints):
             raise ValueError("Mover.waypoints must hold a point")
 
     def pose_at(self, times: FloatArray) -> FloatArray:
         """T_world_mover (N, 4, 4) at times (N,) in seconds, x along the polyline."""
-        from lidarslam.core.geometry import make_transform
-
-        corners = np.concatenate([self.waypoints, self.waypoints[:1]])
-        steps = np.diff(corners, axis=0)
+        steps = np.roll(self.waypoints, -1, axis=0) - self.waypoints
         lengths = np.linalg.norm(steps, axis=1)
         if lengths.sum() <= 0.0:
             return make_transform(np.broadcast_to(np.eye(3), (len(times), 3, 3)), self.waypoints[:1])
@@ -158,56 +122,36 @@ class Mover:
         along = np.mod(self.start_m + self.speed_mps * times, ends[-1])
         leg = np.minimum(np.searchsorted(ends, along, side="right"), len(lengths) - 1)
         fraction = (along - (ends[leg] - lengths[leg])) / lengths[leg]
-        position = corners[leg] + fraction[:, None] * steps[leg]
         yaw = np.arctan2(steps[leg, 1], steps[leg, 0])
         R = np.zeros((len(times), 3, 3))
-        R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = (
-            np.cos(yaw),
-            -np.sin(yaw),
-            np.sin(yaw),
-            np.cos(yaw),
-            1,
-        )
-        return make_transform(R, position)
+        R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
+        R[:, 1, 0] = np.sin(yaw)
+        R[:, 0, 1], R[:, 2, 2] = -R[:, 1, 0], 1.0
+        return make_transform(R, self.waypoints[leg] + fraction[:, None] * steps[leg])
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Where a carrier can go.
+    """A carrier's way; after the last waypoint it goes on at the first, and so revisits every place."""
 
-    Attributes:
-        waypoints: (M, 3) corners of a polyline on the ground; the last is joined to the first, so that going on long
-            enough revisits every place.
-        corner_radius_m: how far a corner may be cut, what a car needs and a walker does not.
-        free_side_m: free space to either side of the polyline.
-        free_height_m: free space above the ground.
-        speed_limit_mps: how fast anybody would go here.
-    """
-
-    waypoints: FloatArray
-    corner_radius_m: float
-    free_side_m: float
-    free_height_m: float
+    waypoints: FloatArray  # (M, 3) corners of a closed polyline on the ground
+    corner_radius_m: float  # how far a corner may be cut, which a car needs and a walker does not
+    free_side_m: float  # free space to either side of the polyline
+    free_height_m: float  # free space above the ground
     speed_limit_mps: float
 
     def __post_init__(self) -> None:
-        _check("Route.waypoints", self.waypoints, (len(self.waypoints), 3))
+        _check(self, waypoints=(len(self.waypoints), 3))
         if len(self.waypoints) < 3:
             raise ValueError(f"Route.waypoints must hold three corners or more, got {len(self.waypoints)}")
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A place to record in.
+    """A place to record in; the same name and seed make the same world.
 
-    Attributes:
-        name, seed: which world this is; the same two make the same world.
-        boxes, cylinders, height_fields: what stands still.
-        movers: what does not.
-        route: the way through it.
-        map_spacing_m: distance between the points of its reference map: 5 cm indoors, 10 cm outdoors, where surfaces
-            are rougher and a map has millions of points.
-        grass: on its ground, if any; not in the reference map, and unknown to the batched caster.
+    The reference map's points are `map_spacing_m` apart: 5 cm indoors, 10 cm outdoors, where surfaces are rougher and
+    a map has millions of points. Grass is not in it.
     """
 
     name: str
@@ -225,6 +169,7 @@ class World:
         return self.height_fields[0].height_at(xy) if self.height_fields else np.zeros(len(xy))
 
 
-def _check(name: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"{name} must be {shape}, got {array.shape}")
+def _check(owner: object, **shapes: tuple[int, ...]) -> None:
+    for name, shape in shapes.items():
+        if getattr(owner, name).shape != shape:
+            raise ValueError(f"{type(owner).__name__}.{name} must be {shape}, got {getattr(owner, name).shape}")

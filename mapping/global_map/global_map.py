@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.core.state import Saved, State, Stateful
+from lidarslam.core.state import State, Stateful
 from mapping.global_map import kernels
 from mapping.surfels.voxel_hash import key_cells, point_keys
 
@@ -101,13 +101,6 @@ class GlobalMap(Stateful):
         with self._lock:
             self._pending = [_Voxels.join(self._pending)]
             return super().state()
-
-    @classmethod
-    def restored(cls, saved: Saved) -> "GlobalMap":
-        """The map with a state."""
-        made = cls.__new__(cls)
-        made.restore(saved)
-        return made
 
     def add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
         """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp."""

@@ -5,7 +5,7 @@ that drift cannot explain is rejected within a segment; where tracking was lost,
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Stateful
 from mapping.config import LoopConfig
 from mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
-from mapping.loops.closure import LoopClosure
+from mapping.loops.closure import CHI_SQUARED_99, LoopClosure
 from mapping.loops.verification import MIN_INLIERS, Verification, verify
 
 # Way after a closure before the next is looked for: another would repeat it.
@@ -32,23 +32,6 @@ _RIVALS = 5
 # A closure is compared with at most so many of those before it.
 _MEMORY = 40
 _ALONE = "no other closure agrees"
-
-
-@dataclass(frozen=True, eq=False)
-class Submap:
-    """The submap of a keyframe.
-
-    Attributes:
-        index: of the keyframe, from 0 without gaps, over all segments.
-        segment: stretch of continuous tracking; keyframes of one follow one another.
-        way_m: path length from the recording's start.
-        points: (N, 3) in the keyframe's LiDAR frame, compensated and thinned.
-    """
-
-    index: int
-    segment: int
-    way_m: float
-    points: FloatArray
 
 
 class LoopDetector(Stateful):
@@ -71,23 +54,19 @@ class LoopDetector(Stateful):
         """The size of detail that suits a keyframe's submap."""
         return self._database.submaps[index].cell_m
 
-    def add(self, submap: Submap, poses: FloatArray) -> list[LoopClosure]:
+    def add(self, points: FloatArray, way_m: float, segment: int, poses: FloatArray) -> list[LoopClosure]:
         """Take the next keyframe, and return the closures that are accepted or rejected by now.
 
         Args:
-            submap: of the keyframe.
+            points: (N, 3) its submap, in its LiDAR frame, compensated and thinned.
+            way_m: path length from the recording's start.
+            segment: stretch of continuous tracking; keyframes of one follow one another.
             poses: (K, 4, 4) `T_world_lidar` of all keyframes, this one last, as they are estimated now.
-
-        Raises:
-            ValueError: keyframes do not come one by one, or the poses are not theirs.
         """
-        database = self._database
-        if submap.index != len(database) or poses.shape != (submap.index + 1, 4, 4):
-            raise ValueError(f"expected keyframe {len(database)} with as many poses, got {submap.index}")
-        database.add(submap.points, submap.way_m, submap.segment, poses)
-        decided = self._drop_old(submap)
-        if len(database.submaps[-1]) >= MIN_INLIERS and not self._is_soon(submap):
-            decided += self._look(submap.index)
+        self._database.add(points, way_m, segment, poses)
+        decided = self._drop_old(way_m, segment)
+        if len(self._database.submaps[-1]) >= MIN_INLIERS and not self._is_soon(way_m, segment):
+            decided += self._look(len(self._database) - 1)
         return decided
 
     def finish(self) -> list[LoopClosure]:
@@ -95,12 +74,12 @@ class LoopDetector(Stateful):
         left, self._pending = self._pending, []
         return [replace(closure, reason=_ALONE) for closure in left]
 
-    def _is_soon(self, submap: Submap) -> bool:
+    def _is_soon(self, way_m: float, segment: int) -> bool:
         """Whether the last closure is so recent that another would repeat it."""
         if self._pending or not self._accepted:
             return False
         last, track = self._accepted[-1].second, self._database.track
-        return bool(track.segment[last] == submap.segment and submap.way_m - track.way_m[last] < _SPACING_M)
+        return bool(track.segment[last] == segment and way_m - track.way_m[last] < _SPACING_M)
 
     def _look(self, index: int) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""
@@ -159,16 +138,16 @@ class LoopDetector(Stateful):
         against: list[LoopClosure] = []
         for other in [*self._accepted[-_MEMORY:], *self._pending[-_MEMORY:]]:
             cycle = None if other is closure else track.close_cycle(closure, other)
-            if cycle is not None and cycle.sigma_m <= most_m:
-                (agreeing if cycle.closes else against).append(other)
+            if cycle is not None and cycle[1] <= most_m:
+                (agreeing if cycle[0] < CHI_SQUARED_99 else against).append(other)
         return agreeing, against
 
-    def _drop_old(self, submap: Submap) -> list[LoopClosure]:
+    def _drop_old(self, way_m: float, segment: int) -> list[LoopClosure]:
         """Closures that no other agreed with for too long, as rejected."""
         track = self._database.track
         old = [
             c for c in self._pending
-            if track.segment[c.second] != submap.segment or submap.way_m - track.way_m[c.second] > _PENDING_M
+            if track.segment[c.second] != segment or way_m - track.way_m[c.second] > _PENDING_M
         ]  # fmt: skip
         self._pending = [closure for closure in self._pending if closure not in old]
         return [replace(closure, reason=_ALONE) for closure in old]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
-from mapping.loops.closure import CHI_SQUARED_99, RelativePose
+from mapping.loops.closure import RelativePose
 
 # However short the way, poses next to each other are no better than this; radians and metres.
 _LEAST_ROTATION = np.deg2rad(0.1)
@@ -93,8 +93,11 @@ class Track:
         parts = (slice(0, 3), slice(3, 6))
         return max(float(np.sqrt(xi[p] @ np.linalg.solve(covariance[p, p], xi[p]))) for p in parts)
 
-    def close_cycle(self, a: RelativePose, b: RelativePose) -> "Cycle | None":
-        """The cycle of two links and the ways between them; None when they do not join the same two segments."""
+    def close_cycle(self, a: RelativePose, b: RelativePose) -> tuple[float, float] | None:
+        """Chi-squared of the cycle of two links and the ways between them, and its largest standard deviation, metres.
+
+        None when the links do not join the same two segments.
+        """
         segment = self.segment
         if segment[a.first] != segment[b.first] or segment[a.second] != segment[b.second]:
             return None
@@ -108,13 +111,5 @@ class Track:
             + of_way @ self.drift_covariance(a.first, b.first) @ of_way.T
             + self.drift_covariance(a.second, b.second)
         )
-        squared = float(xi @ np.linalg.solve(covariance, xi))
-        return Cycle(squared < CHI_SQUARED_99, float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])))
-
-
-@dataclass(frozen=True)
-class Cycle:
-    """A cycle of two loop closures: whether it closes, and its largest standard deviation, metres."""
-
-    closes: bool
-    sigma_m: float
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+        return float(xi @ np.linalg.solve(covariance, xi)), sigma_m

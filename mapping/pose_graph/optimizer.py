@@ -56,12 +56,7 @@ def relax(poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[Rela
 
 
 def optimise(poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[RelativePose]) -> Optimised:
-    """All poses (N, 4, 4) together, and which loop closures are inliers; the other edges are never rejected.
-
-    Raises:
-        ValueError: an edge is not between two of the poses, or holds a number that is not finite.
-    """
-    _check(len(poses), [*edges, *loops])
+    """All poses (N, 4, 4) together, and which loop closures are inliers; the other edges are never rejected."""
     inliers = np.ones(len(loops), dtype=np.bool_)
     if loops:
         poses = relax(poses, edges, loops)
@@ -111,14 +106,6 @@ def bounded(covariance: FloatArray) -> FloatArray:
     if values[0] < 1.0 or values[-1] > _LARGEST_RATIO**2:
         scaled = (vectors * np.clip(values, 1.0, _LARGEST_RATIO**2)) @ vectors.T
     return np.asarray(0.5 * (scaled + scaled.T) * np.outer(_LEAST, _LEAST), dtype=np.float64)
-
-
-def _check(count: int, edges: Sequence[RelativePose]) -> None:
-    for edge in edges:
-        if edge.first == edge.second or not (0 <= edge.first < count and 0 <= edge.second < count):
-            raise ValueError(f"an edge joins two of {count} poses, got {edge.first} and {edge.second}")
-        if not (np.isfinite(edge.T_first_second).all() and np.isfinite(edge.covariance).all()):
-            raise ValueError(f"the edge from {edge.first} to {edge.second} must be finite")
 
 
 def _solve(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float) -> gtsam.Values:

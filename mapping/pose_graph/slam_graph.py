@@ -22,7 +22,7 @@ from lidarslam.core.state import Stateful
 from mapping.config import PoseGraphConfig
 from mapping.global_map.global_map import GlobalMap, means_points
 from mapping.loops.closure import LoopClosure, RelativePose
-from mapping.loops.detection import LoopDetector, Submap
+from mapping.loops.detection import LoopDetector
 from mapping.loops.refinement import DenseSubmap, refine
 from mapping.loops.revisits import as_registered
 from mapping.pose_graph.correction import Corrected, corrected, recordings_of
@@ -52,7 +52,6 @@ class SlamGraph(Stateful):
     _selector: KeyframeSelector
     _store: SubmapStore
     _detector: LoopDetector
-    _is_submap_open: bool  # whether the last keyframe's submap still grows
     _submap: GlobalMap | None  # of the last keyframe, in its frame
     _first_scans: list[int]
     _keyframes: list[Keyframe]
@@ -76,13 +75,13 @@ class SlamGraph(Stateful):
         self._selector = KeyframeSelector(config.keyframes)
         self._detector = LoopDetector(config.loops)
         self._store = SubmapStore(directory, file)
-        self._is_submap_open, self._submap = False, None
+        self._submap = None
         self.scan_poses, self.keyframe_ms, self._first_scans = [], [], [0]
         self._keyframes, self._poses, self._edges, self._closures, self._unrefined = [], [], [], [], []
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
     def _after_restore(self) -> None:
-        if not len(self._keyframes) == len(self._poses) == len(self._store) + self._is_submap_open:
+        if len(self._keyframes) != len(self._poses) or len(self._keyframes) - len(self._store) not in (0, 1):
             raise ValueError(f"{len(self._keyframes)} keyframes have {len(self._store)} submaps")
         self._detector.rebuild(means_points(means) for means in self._store)
 
@@ -153,6 +152,11 @@ class SlamGraph(Stateful):
         """Give up the submaps on disk."""
         self._store.close()
 
+    @property
+    def _is_submap_open(self) -> bool:
+        """Whether the last keyframe's submap still grows."""
+        return len(self._store) < len(self._keyframes)
+
     def _accepted(self) -> list[LoopClosure]:
         return [closure for closure in self._closures if closure.accepted]
 
@@ -168,20 +172,16 @@ class SlamGraph(Stateful):
             self._poses.append(self._poses[-1] @ T_first_second)
             self._segment += motion.lost  # the drift model does not hold across
         self._keyframes.append(Keyframe(len(self.scan_poses) - 1, self._segment, self._path_m, scan.covariance))
-        self._is_submap_open = True
 
     def _close_submap(self) -> None:
         """Keep the last keyframe's submap, and look for loop closures with it."""
         if not self._is_submap_open:
             return
-        self._is_submap_open = False
         index, keyframe = len(self._keyframes) - 1, self._keyframes[-1]
         submap, self._submap = self._submap or GlobalMap(1.0), None
         means = submap.means()
         self._store.append(means)
-        found = self._detector.add(
-            Submap(index, keyframe.segment, keyframe.path_m, means_points(means)), np.array(self._poses)
-        )
+        found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
         self._refine_closures(until=index - _REACH)

@@ -87,32 +87,38 @@ def vote(
         votes: (B, S) written, of each block; the shift of zero is in the middle.
     """
     votes[:, :] = 0.0
-    size = votes.shape[1]
-    middle = size // 2
-    own = np.empty(size, dtype=np.float32)
+    middle = votes.shape[1] // 2
+    own = np.empty(votes.shape[1], dtype=np.float32)
     for m in range(len(points)):
         own[:] = 0.0
         for k in range(len(held_points)):
-            cosine, along, gap = 0.0, 0.0, 0.0
-            for i in range(3):
-                cosine += held_normals[k, i] * normals[m, i]
-                along += held_normals[k, i] * direction[i]
-                gap += held_normals[k, i] * (held_points[k, i] - points[m, i])
-            if cosine < _SAME_NORMAL:
+            if _dot(held_normals[k], normals[m]) < _SAME_NORMAL:
                 continue
+            along, gap, squared = _dot(held_normals[k], direction), 0.0, 0.0
+            for i in range(3):
+                gap += held_normals[k, i] * (held_points[k, i] - points[m, i])
             shift = gap / along
             if not abs(shift) < middle * bin_m:
                 continue
-            squared = 0.0
             for i in range(3):
                 squared += (points[m, i] + shift * direction[i] - held_points[k, i]) ** 2
-            if squared > held_radii[k] * held_radii[k]:
-                continue
-            half = gate_m / abs(along)
-            first = max(int(np.ceil((shift - half) / bin_m)) + middle, 0)
-            last = min(int(np.floor((shift + half) / bin_m)) + middle, size - 1)
-            for s in range(first, last + 1):
-                weight = np.float32(1.0 - abs((s - middle) * bin_m - shift) / half)
-                own[s] = max(own[s], weight)
-        for s in range(size):
+            if squared <= held_radii[k] * held_radii[k]:
+                _vote_once(shift, gate_m / abs(along), bin_m, own)
+        for s in range(len(own)):
             votes[blocks[m], s] += own[s]
+
+
+@compiled
+def _vote_once(shift: float, half: float, bin_m: float, votes: NDArray[np.float32]) -> None:
+    """Raise the votes (S,) around a shift to a triangle of half-width `half`."""
+    middle = len(votes) // 2
+    first = max(int(np.ceil((shift - half) / bin_m)) + middle, 0)
+    last = min(int(np.floor((shift + half) / bin_m)) + middle, len(votes) - 1)
+    for s in range(first, last + 1):
+        weight = np.float32(1.0 - abs((s - middle) * bin_m - shift) / half)
+        votes[s] = max(votes[s], weight)
+
+
+@compiled
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

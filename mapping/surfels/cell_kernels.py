@@ -123,17 +123,6 @@ def insert(
 
 
 @compiled
-def place(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows) -> None:
-    """Put unique new keys (N,) with their rows (N,) into a hash with enough free slots."""
-    for n in range(len(keys)):
-        slot = _home(keys[n], bits)
-        while table_keys[slot] != EMPTY:
-            slot = (slot + 1) & ((1 << bits) - 1)
-        table_keys[slot] = keys[n]
-        table_rows[slot] = rows[n]
-
-
-@compiled
 def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
     """Write the keys (N,) of the cells that points (N, 3) lie in."""
     scale = 1.0 / cell_m

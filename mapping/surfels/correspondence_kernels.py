@@ -101,17 +101,22 @@ def match_compact(
         rx, ry, rz = ax - along * x, ay - along * y, az - along * z
         length = max(math.sqrt(rx * rx + ry * ry + rz * rz), 1e-9)
         for axis in range(3):
-            if axis == 0:
-                u, v, w = p[3], p[4], p[5]
-            elif axis == 1:
-                u, v, w = p[7] * p[5] - p[8] * p[4], p[8] * p[3] - p[6] * p[5], p[6] * p[4] - p[7] * p[3]
-            else:
-                u, v, w = p[6], p[7], p[8]
+            u, v, w = _axis(p, axis)
             across_rings = abs(u * rx + v * ry + w * rz) / length
             if p[9 + axis] < largest_m and across_rings < _MOST_ACROSS:
                 _write(found, count, n, p[0:3], u, v, w, p[9 + axis], 0.0)
                 count += 1
     return count
+
+
+@compiled
+def _axis(p: FloatArray, axis: int) -> tuple[float, float, float]:
+    """A principal axis of a surfel (15,), by ascending extent."""
+    if axis == 0:
+        return p[3], p[4], p[5]
+    if axis == 1:
+        return p[7] * p[5] - p[8] * p[4], p[8] * p[3] - p[6] * p[5], p[6] * p[4] - p[7] * p[3]
+    return p[6], p[7], p[8]
 
 
 @compiled

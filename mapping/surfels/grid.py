@@ -150,8 +150,9 @@ class SurfelGrid(Stateful):
         reach[counts < _SAMPLES] = 0.0
         arms = np.swapaxes(axes, 1, 2) * reach[:, :, None]
         offsets = np.concatenate([arms, -arms], axis=1)
-        spread = _spread(counts, sums[:, _ELEVATION])[:, None] * np.repeat([1.0, -1.0], 3)
-        elevations = sums[:, _ELEVATION.start, None] / counts[:, None] + spread
+        elevation, squared = sums[:, _ELEVATION].T / counts
+        spread = np.sqrt(np.maximum(squared - elevation * elevation, 0.0))
+        elevations = elevation[:, None] + spread[:, None] * np.repeat([1.0, -1.0], 3)
         points = (key_cells(self._keys[:count]) + 0.5 + mean)[:, None] + offsets
         several = np.ones((count, _SAMPLES), dtype=np.bool_)
         several[counts < _SAMPLES, 1:] = False
@@ -219,12 +220,6 @@ class SurfelGrid(Stateful):
         self._sums = _resized(self._sums, capacity)
         self._surfels = _resized(self._surfels, capacity)
         self._surfel_counts = _resized(self._surfel_counts, capacity)
-
-
-def _spread(counts: FloatArray, moments: FloatArray) -> FloatArray:
-    """Standard deviation (N,) from counts (N,) and first and second moments (N, 2)."""
-    mean = moments[:, 0] / counts
-    return np.sqrt(np.maximum(moments[:, 1] / counts - mean * mean, 0.0))
 
 
 def _resized(values: NDArray[Any], capacity: int) -> NDArray[Any]:

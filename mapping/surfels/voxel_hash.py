@@ -42,11 +42,13 @@ def key_steps(offsets: NDArray[np.int64]) -> Keys:
 class VoxelHash:
     """Open addressing with linear probing; rows are numbered in the order of their first insertion."""
 
+    _bits: int
+    _count: int
+    _keys: Keys
+    _rows: Rows
+
     def __init__(self) -> None:
-        self._bits = _FIRST_BITS
-        self._keys = np.full(1 << self._bits, kernels.EMPTY, dtype=np.int64)
-        self._rows = np.zeros(1 << self._bits, dtype=np.int32)
-        self._count = 0
+        self._clear(_FIRST_BITS)
 
     def __len__(self) -> int:
         return self._count
@@ -71,22 +73,21 @@ class VoxelHash:
             done, self._count = kernels.insert(keys, done, self._count, most, *self.slots, rows)
             if done == len(keys):
                 return rows
-            self._grow()
+            used = np.flatnonzero(self._keys != kernels.EMPTY)
+            by_row = np.empty(len(used), dtype=np.int64)
+            by_row[self._rows[used]] = self._keys[used]
+            self._clear(self._bits + 1)
+            self.insert(by_row)
 
     def rebuild(self, keys: Keys) -> None:
         """Replace the contents by unique keys (N,) in rows 0 to N-1."""
-        self._count = len(keys)
-        self._bits = _FIRST_BITS
-        while len(keys) > _LARGEST_LOAD * (1 << self._bits):
-            self._bits += 1
-        self._fill(np.ascontiguousarray(keys), np.arange(len(keys), dtype=np.int32))
+        bits = _FIRST_BITS
+        while len(keys) > _LARGEST_LOAD * (1 << bits):
+            bits += 1
+        self._clear(bits)
+        self.insert(keys)
 
-    def _grow(self) -> None:
-        used = np.flatnonzero(self._keys != kernels.EMPTY)
-        self._bits += 1
-        self._fill(self._keys[used], self._rows[used])
-
-    def _fill(self, keys: Keys, rows: Rows) -> None:
-        self._keys = np.full(1 << self._bits, kernels.EMPTY, dtype=np.int64)
-        self._rows = np.zeros(1 << self._bits, dtype=np.int32)
-        kernels.place(keys, rows, *self.slots)
+    def _clear(self, bits: int) -> None:
+        self._bits, self._count = bits, 0
+        self._keys = np.full(1 << bits, kernels.EMPTY, dtype=np.int64)
+        self._rows = np.zeros(1 << bits, dtype=np.int32)

@@ -153,8 +153,7 @@ class ScanMatcher:
         of a street fits there too. The rotations are taken from the given poses (4, 4).
         """
         last, interval_s = self.last, self.scan.stamp - self.last.stamp
-        points = self.scan.keypoints.compensated(last.velocity)
-        if not len(points) or interval_s <= 0.0:
+        if interval_s <= 0.0:
             return []
         radius_m, up = min(_FASTEST_M_S * interval_s, self.scan.range_m), self._map.vertical()
         starts = []
@@ -162,7 +161,7 @@ class ScanMatcher:
             T = last.T_world_lidar.copy()
             T[:3, :3] = rotation[:3, :3]
             starts.append(positions_around(T, up, radius_m, _DISPLACED_CELLS * self._map.cell_m))
-        attempts = []
+        points, attempts = self.scan.keypoints.compensated(last.velocity), []
         for start in best_supported(points, np.concatenate(starts), self._map):
             velocity = body_velocity(inverse(last.T_world_lidar) @ start, interval_s)
             moving = replace(last, velocity=velocity, covariance=UNKNOWN_VELOCITY)
@@ -172,30 +171,23 @@ class ScanMatcher:
 
     def search_yaw(self, prediction: Prediction) -> Attempt | None:
         """Relocalise by yaw search at the predicted and the last position; None where no result is reliable."""
-        points = self.scan.keypoints.compensated(prediction.velocity)
-        if not len(points):
-            return None
         up = self._map.vertical()
         poses = (prediction.T_world_lidar, self.last.T_world_lidar)
         starts = np.concatenate([turned_poses(T_world_lidar, up, _YAW_STEP_DEG) for T_world_lidar in poses])
-        return best_of(attempt for attempt in self._from(starts, points, prediction) if attempt.is_reliable)
+        return best_of(attempt for attempt in self._from(starts, prediction) if attempt.is_reliable)
 
     def search_map(self, prediction: Prediction) -> Attempt | None:
         """Relocalise anywhere in the map at any yaw; None where no result is reliable, or two places fit alike."""
-        points = self.scan.keypoints.compensated(prediction.velocity)
-        if not len(points):
-            return None
         view = BirdsEyeMap.of(self._map.means(), self._map.vertical(), _VIEW_CELLS * self._map.cell_m)
-        all_points = self.scan.sweep.compensated(prediction.velocity)
-        starts = view.find(all_points, self.last.T_world_lidar, _VIEW_RANGES * self.scan.range_m, _PLACES)
-        if not len(starts):
-            return None
-        attempts = self._from(starts, points, prediction)
+        points = self.scan.sweep.compensated(prediction.velocity)
+        starts = view.find(points, self.last.T_world_lidar, _VIEW_RANGES * self.scan.range_m, _PLACES)
+        attempts = self._from(starts, prediction)
         best = best_of(attempts)
         return best if best is not None and best.is_reliable and not best.has_rivals(attempts) else None
 
-    def _from(self, starts: FloatArray, points: FloatArray, prediction: Prediction) -> list[Attempt]:
-        """Attempts with status ok from the best of the poses (K, 4, 4), by compensated points (N, 3)."""
+    def _from(self, starts: FloatArray, prediction: Prediction) -> list[Attempt]:
+        """Attempts with status ok from the best of the poses (K, 4, 4)."""
+        points = self.scan.keypoints.compensated(prediction.velocity)
         covariance = np.zeros((12, 12))
         covariance[:6, :6], covariance[6:, 6:] = _ANYWHERE, prediction.covariance[6:, 6:]
         attempts = [

@@ -43,18 +43,18 @@ class MappedScan:
 
     Attributes:
         state: pose at the stamp and velocity during the sweep, with their covariance.
-        T_world_expected: (4, 4) predicted pose.
+        T_world_predicted: (4, 4) predicted pose.
         registered: whether the pose is that of a registration; else it is the predicted one.
         status, message: tracking status, and its reason.
         fit: to the map; None where the scan was not compared with it.
         degenerate: names of the directions along which the prediction was kept.
         iterations: of the registration.
         added: whether the scan is good enough for the map, and was inserted.
-        way_known: whether the sensor was tracked from the scan before; else it was relocalised, or only predicted.
+        is_connected: whether the sensor was tracked from the scan before; else it was relocalised, or only predicted.
     """
 
     state: MotionState
-    T_world_expected: FloatArray
+    T_world_predicted: FloatArray
     registered: bool
     status: Status
     message: str = ""
@@ -62,7 +62,7 @@ class MappedScan:
     degenerate: tuple[str, ...] = ()
     iterations: int = 0
     added: bool = False
-    way_known: bool = True
+    is_connected: bool = True
 
 
 class Tracker(Stateful):
@@ -132,7 +132,7 @@ class Tracker(Stateful):
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
             state=state,
-            T_world_expected=attempt.prediction.T_world_lidar,
+            T_world_predicted=attempt.prediction.T_world_lidar,
             registered=True,
             status=status,
             message=message,
@@ -140,7 +140,7 @@ class Tracker(Stateful):
             degenerate=registration.degeneracy.names,
             iterations=registration.iterations,
             added=attempt.status is Status.OK and not jumped and not self._state.is_unconfirmed,
-            way_known=not attempt.relocalised,
+            is_connected=not attempt.relocalised,
         )
 
     def lose(self, surfel_map: SurfelMap, has_points: bool) -> bool:

@@ -280,7 +280,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path, rng):
     with pytest.raises(InputError, match=r"0000000002\.txt:1: expected 30 numbers"):
         _ = open_recording(drive).ground_truth
     (drive / "oxts" / "data" / "0000000002.txt").write_text("490.0 8.4" + " 0.0" * 28 + "\n")
-    with pytest.raises(InputError, match=r"0000000002\.txt: begins with 490, which is no latitude"):
+    with pytest.raises(InputError, match=r"0000000002\.txt: .* begins with a latitude"):
         _ = open_recording(drive).ground_truth
     (drive / "velodyne_points" / "timestamps.txt").write_text("2011-09-26 13:04:32.1\nyesterday\n")
     with pytest.raises(InputError, match="'yesterday' at line 2"):

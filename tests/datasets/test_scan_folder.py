@@ -387,7 +387,7 @@ def test_bin_with_other_numbers_of_columns(tmp_path, rng):
         open_recording(tmp_path / "six")
     five[0, 4] = 0.5
     five[:31].tofile(tmp_path / "five" / "0.bin")
-    with pytest.raises(InputError, match="is no ring"):
+    with pytest.raises(InputError, match="20 bytes with a ring"):
         open_recording(tmp_path / "five")
 
 

@@ -7,8 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from lidarslam.cli import main
-from lidarslam.compare.benchmark import Benchmark, load_benchmark
-from lidarslam.compare.benchmark_request import fill_request
+from lidarslam.compare.benchmark import Benchmark, fill_request, load_benchmark
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.request import CompareRequest
 from lidarslam.core.errors import ConfigError

@@ -14,7 +14,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import format_kitti, write_tum
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.evaluate.evaluate import EvaluateRequest, evaluate
-from lidarslam.evaluate.map_evaluation import MapOptions, evaluate_map_of_run, read_transform
+from lidarslam.evaluate.inputs import read_estimate
+from lidarslam.evaluate.map_evaluation import MapOptions, evaluate_map, read_transform
 from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
 from lidarslam.evaluate.text import format_evaluation
 from mapping.global_map.global_map import PointCloud
@@ -110,8 +111,8 @@ def test_every_alignment_is_told(run: Path, tmp_path: Path, alignment: str) -> N
 def test_the_figures_for_a_comparison(run: Path, recording: Path) -> None:
     reference = find_reference_map(recording)
     assert reference is not None
-    evaluation = evaluate_map_of_run(run, None, reference)
-    assert evaluation.trajectory.alignment.method == "trajectory"
+    evaluation = evaluate_map(read_estimate(run), None, reference)
+    assert evaluation.alignment.method == "trajectory"
     assert len(evaluation.errors.points) == len(evaluation.errors.distances_m) > 1_000
     assert evaluation.errors.distances_m.max() < 0.2
     assert find_reference_map(run) is None

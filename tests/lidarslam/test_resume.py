@@ -156,7 +156,7 @@ METHODS = {
     "odometry alone": ["--odometry", "learned", "--no-mapping", "--stop", "10"],
     "pose graph": [
         "--odometry", "constant-velocity", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",
-        "--set", "pose_graph.loops.min_way_m=0.5", "--set", "pose_graph.loops.min_way_ranges=0",
+        "--set", "pose_graph.loops.min_way_m=0.5",
     ],
     "kiss-icp": ["--odometry", "kiss-icp", "--no-mapping", "--set", "odometry.kiss_icp.threads=1", "--stop", "12"],
 }  # fmt: skip

@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from lidarslam.pipeline.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.run.summary_text import format_outcome
+from mapping.loops.closure import LoopClosure
 
 
 def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
@@ -43,7 +46,8 @@ def test_what_moved_is_counted() -> None:
 
 
 def test_loops_are_counted_and_their_effect_is_said() -> None:
-    loops = [LoopReport(0, 9, accepted, "", "nearby", 0.9, 0.01, 0.8, 2, 1.0, 5.0) for accepted in (True, False, True)]
+    closure = LoopClosure(0, 5, np.eye(4), np.eye(6), 0.9, 0.01, 0.8, False, 2, "")
+    loops = [LoopReport(closure, accepted, (0, 9)) for accepted in (True, False, True)]
     for chosen, words in (
         (loops, "7 keyframes, 2 loops closed, poses corrected by up to 1.23 m (1 candidate rejected;"),
         (loops[:1], "7 keyframes, 1 loop closed, poses corrected by up to 1.23 m\n"),

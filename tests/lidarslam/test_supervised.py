@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarslam.compare.supervised import Ending, Limits, session_rss_mb, supervise
+from lidarslam.compare.supervised import Ending, Limits, supervise, tree_rss_mb
 
 Run = Callable[..., Ending]
 
@@ -97,8 +97,8 @@ except KeyboardInterrupt:
     assert mark.exists()
 
 
-def test_a_session_without_processes_has_no_memory() -> None:
-    assert session_rss_mb(2**30) is None
+def test_a_process_that_is_gone_has_no_memory() -> None:
+    assert tree_rss_mb(2**30) == 0.0
 
 
 def _runs(pid: int) -> bool:

@@ -9,30 +9,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
-from lidarslam.core.scan import Scan
-from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.motion.mounts import mount_pose
-from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.faults import (
+from simulated_faults import (
     Cover,
     Faulty,
     carried_off,
     covered,
     dropped,
+    even_tunnel,
     index_back,
     passing_by,
     standing_still,
+    straight_drive,
 )
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.simulation.motion.carriers import mount_pose
+from lidarslam.simulation.motion.given_motion import motion_along
+from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
 from lidarslam.simulation.sensors.scan_patterns import Spinning
 from lidarslam.simulation.sensors.sensor import Sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import World
-from lidarslam.simulation.worlds.featureless import even_tunnel, straight_drive
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig
 from mapping.deskew import Sweep
@@ -161,7 +162,7 @@ def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: S
     results = process(mapper, replace(recorded, scans=recorded.scans[: AT + 18]))
     assert results[0].status is not Status.OK
     assert any("relocalised in the map" in result.message for result in results[:3])
-    assert not any(result.way_known for result in results if "relocalised in the map" in result.message)
+    assert not any(result.is_connected for result in results if "relocalised in the map" in result.message)
     assert not results[0].added
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded, 3)

@@ -208,7 +208,7 @@ def test_a_scan_of_nothing_is_lost_stays_where_it_was_expected_and_changes_nothi
     assert lost.message == "no points within range"
     assert not lost.registered
     assert size(settled) == held
-    np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_expected)
+    np.testing.assert_array_equal(lost.state.T_world_lidar, lost.T_world_predicted)
     truth = inverse(rest_truth.T_world_lidar[0]) @ rest_truth.T_world_lidar
     assert np.linalg.norm(lost.state.T_world_lidar[:3, 3] - truth[15, :3, 3]) < 0.02, "it goes on as it did"
 

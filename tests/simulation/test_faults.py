@@ -4,16 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated_faults import (
+    carried_off,
+    covered,
+    dropped,
+    even_tunnel,
+    index_back,
+    open_plain,
+    passing_by,
+    standing_still,
+    straight_drive,
+)
 
 from lidarslam.core.geometry import inverse, rotation_angle
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion, Sway
-from lidarslam.simulation.motion.mounts import mount_pose
-from lidarslam.simulation.recording.faults import carried_off, covered, dropped, index_back, passing_by, standing_still
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
 from lidarslam.simulation.sensors.scan_patterns import Spinning
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import World
-from lidarslam.simulation.worlds.featureless import even_tunnel, open_plain, straight_drive
 
 
 @pytest.fixture

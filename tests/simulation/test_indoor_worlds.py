@@ -11,7 +11,8 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.casting.mesh import world_mesh
 from lidarslam.simulation.world import Boxes, World
 from lidarslam.simulation.worlds.building import UP
-from lidarslam.simulation.worlds.clearance import Clearance, sample_route
+from lidarslam.simulation.worlds.clearance import Clearance
+from lidarslam.simulation.worlds.paths import subdivide_loop
 from lidarslam.simulation.worlds.registry import build_world
 
 NAMES = ("office", "tunnel", "hall")
@@ -52,7 +53,7 @@ def arrays_of(world: World) -> list[FloatArray]:
 
 def level_frames(world: World, spacing_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points (N, 3) along the route, with level unit vectors (N, 3) ahead and to the left."""
-    points = sample_route(world.route, spacing_m)
+    points = subdivide_loop(world.route.waypoints, spacing_m)
     ahead = (np.roll(points, -1, axis=0) - points) * [1.0, 1.0, 0.0]
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return points, ahead, np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))], axis=1)
@@ -169,7 +170,7 @@ def test_fork_lifts_stay_off_the_route(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_tunnels_ground_is_what_is_driven_on(seed: int) -> None:
     world = cached_world("tunnel", seed)
-    points = sample_route(world.route, 0.5)
+    points = subdivide_loop(world.route.waypoints, 0.5)
     np.testing.assert_allclose(world.ground_at(points[:, :2]), points[:, 2], atol=0.1)
     ground, roof = world.height_fields
     border = np.ones(ground.heights.shape, dtype=bool)

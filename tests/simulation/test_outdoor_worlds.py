@@ -12,8 +12,7 @@ from lidarslam.simulation.casting.caster import Caster
 from lidarslam.simulation.casting.mesh import CYLINDER_SIDES, box_mesh, cylinder_mesh, merge
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.world import World
-from lidarslam.simulation.worlds.clearance import sample_route
-from lidarslam.simulation.worlds.paths import loop_length
+from lidarslam.simulation.worlds.paths import loop_length, subdivide_loop
 from lidarslam.simulation.worlds.registry import build_world
 
 NAMES = ("street", "park", "forest", "fields", "terrace")
@@ -74,7 +73,7 @@ def test_the_route_is_a_loop_on_the_ground(world):
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     assert steps.min() > 0.1
     assert steps.max() < 6.0  # the last is joined to the first like any other
-    along = sample_route(world.route)
+    along = subdivide_loop(world.route.waypoints, 0.1)
     assert np.abs(along[:, 2] - world.ground_at(along[:, :2])).max() < 0.25
 
 
@@ -87,7 +86,7 @@ def test_the_route_lies_well_within_the_ground(world):
 
 def samples_of(world: World, near_m: float) -> FloatArray:
     """Points (N, 3) in the boxes and on the sides of the cylinders that may come that near to the route."""
-    path = cKDTree(sample_route(world.route)[:, :2])
+    path = cKDTree(subdivide_loop(world.route.waypoints, 0.1)[:, :2])
     boxes, cylinders = world.boxes, world.cylinders
     near = path.query(boxes.centres[:, :2])[0] < near_m + np.linalg.norm(boxes.half_sizes, axis=1)
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 7)] * 3), axis=-1).reshape(-1, 3)
@@ -102,7 +101,7 @@ def samples_of(world: World, near_m: float) -> FloatArray:
 
 def test_nothing_solid_reaches_into_the_free_space(world):
     farther_m = 8.0 if world.name == "fields" else 0.0  # nothing else is near the route there
-    points, path = samples_of(world, world.route.free_side_m + farther_m), sample_route(world.route)
+    points, path = samples_of(world, world.route.free_side_m + farther_m), subdivide_loop(world.route.waypoints, 0.1)
     distance, nearest = cKDTree(path[:, :2]).query(points[:, :2], distance_upper_bound=world.route.free_side_m)
     beneath = np.isfinite(distance)  # within the free side: it must be above the free height, or in the ground
     above = points[beneath, 2] - path[nearest[beneath], 2]
@@ -119,7 +118,9 @@ def test_nobody_on_the_route_sees_anything_within_the_free_side(world):
     angle = np.linspace(0.0, 2.0 * np.pi, 49)[:-1]
     directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(48)], axis=1)
     heights = np.linspace(0.3, world.route.free_height_m - 0.05, 8)
-    eyes = sample_route(world.route)[::5, None, None, :] + heights[:, None, None] * np.array([0.0, 0.0, 1.0])
+    eyes = subdivide_loop(world.route.waypoints, 0.1)[::5, None, None, :] + heights[:, None, None] * np.array(
+        [0.0, 0.0, 1.0]
+    )
     rays = np.concatenate(np.broadcast_arrays(eyes, directions), axis=-1).astype(np.float32)
     seen = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
     assert seen.min() >= world.route.free_side_m
@@ -153,7 +154,7 @@ def test_houses_reach_below_the_ground_and_wheels_just_to_it(worlds):
 
 
 def test_movers_stay_on_the_ground_and_off_the_route(world):
-    path = cKDTree(sample_route(world.route)[:, :2])
+    path = cKDTree(subdivide_loop(world.route.waypoints, 0.1)[:, :2])
     assert bool(world.movers) == (world.name not in ("forest", "fields"))
     for mover in world.movers:
         length = np.linalg.norm(np.roll(mover.waypoints, -1, axis=0) - mover.waypoints, axis=1).sum()
@@ -246,7 +247,7 @@ def test_grass_grows_beside_the_roads_and_not_on_them(seed, worlds):
         world = worlds[name, seed]
         assert world.grass is not None
         heights = world.grass.heights
-        route = sample_route(world.route, 0.5)[:, :2]
+        route = subdivide_loop(world.route.waypoints, 0.5)[:, :2]
         ring = kept_free_m * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
         assert heights.height_at((route[:, None] + ring).reshape(-1, 2)).max() == 0.0
         assert 0.8 * tallest_m > heights.heights[heights.heights > 0.0].mean() > 0.04

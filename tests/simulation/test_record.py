@@ -17,7 +17,7 @@ from lidarslam.simulation.recording import record as record_module
 from lidarslam.simulation.recording.motion import read_trajectory
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import Boxes, HeightField, Route, World
 from lidarslam.simulation.writers.registry import FORMATS
 

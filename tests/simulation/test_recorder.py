@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import inverse, transform_points
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.noise import bloom, measure, range_sigma, reflectivity, return_probability, scan_rng
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.noise import bloom, measure, range_sigma, reflectivity, return_probability
 from lidarslam.simulation.sensors.sensor import RangeModel
+from lidarslam.simulation.sensors.table import find_sensor
 
 EXACT = RangeModel(0.3, 100.0, 0.0, 0.0, 0.0, 1e-9, dropout=0.0)
 NOISY = RangeModel(0.3, 100.0, 0.01, 0.0003, 0.003, 0.002)
@@ -158,14 +158,16 @@ def test_returns_fade_with_range_and_slant():
 
 def test_dropouts_happen_at_their_rate():
     n = 100_000
-    measured = measure(NOISY, np.full(n, 10.0), np.ones(n), np.full(n, 0.8), scan_rng(1, 2))
+    measured = measure(NOISY, np.full(n, 10.0), np.ones(n), np.full(n, 0.8), np.random.default_rng([1, 2]))
     assert abs(np.isinf(measured).mean() - 0.005) < 0.001
     inside = measured[np.isfinite(measured)]
     np.testing.assert_allclose(inside / 0.002, np.round(inside / 0.002), atol=1e-6)
 
 
 def test_limits_of_range_hold():
-    measured = measure(NOISY, np.array([0.1, 10.0, 150.0, np.inf]), np.ones(4), np.full(4, 0.8), scan_rng(0, 4))
+    measured = measure(
+        NOISY, np.array([0.1, 10.0, 150.0, np.inf]), np.ones(4), np.full(4, 0.8), np.random.default_rng([0, 4])
+    )
     assert np.isfinite(measured).tolist() == [False, True, False, False]
 
 
@@ -177,7 +179,7 @@ def test_edges_bloom():
     ranges[1000:1500] = np.inf
     model = replace(NOISY, beam_divergence=0.003)
     flat = ranges.ravel()
-    trials = [bloom(model, flat, lasers, 2.0 * np.pi / columns, scan_rng(k, 0)) for k in range(200)]
+    trials = [bloom(model, flat, lasers, 2.0 * np.pi / columns, np.random.default_rng([k, 0])) for k in range(200)]
     changed = np.mean([edge.reshape(columns, lasers) for _, edge in trials], axis=(0, 2))
     assert set(np.flatnonzero(changed)) == {499, 508, 1000, 1499}
     np.testing.assert_allclose(changed[[499, 508, 1000]], 0.003 / (4.0 * np.pi / columns), atol=0.03)
@@ -188,7 +190,7 @@ def test_edges_bloom():
 
 def test_small_steps_give_mixed_ranges():
     ranges = np.array([[5.0], [6.0]] * 5000)
-    bloomed, edge = bloom(NOISY, ranges.ravel(), 1, 0.003, scan_rng(0, 0))
+    bloomed, edge = bloom(NOISY, ranges.ravel(), 1, 0.003, np.random.default_rng([0, 0]))
     mixed = bloomed[edge]
     assert 5.0 <= mixed.min() < 5.1
     assert 5.9 < mixed.max() <= 6.0

@@ -9,11 +9,11 @@ from scipy.spatial import KDTree
 from lidarslam.simulation.casting.caster import Caster
 from lidarslam.simulation.casting.mesh import Mesh, box_mesh
 from lidarslam.simulation.casting.mesh_pieces import pieces_near
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
 from lidarslam.simulation.recording.reference_map import SeenSurfaces, reference_map, sample_seen
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import Boxes
 
 # A square of 10 m split into two triangles, facing up.
@@ -117,4 +117,4 @@ def test_cutting_keeps_area_orientation_and_all_that_is_near():
     assert (high - low).max() <= 1.6
     assert area.sum() < 30.0
     assert high[:, 0].max() > 2.6
-    assert len(pieces_near(SQUARE, np.array([[0, 0, 50]]), 0.2)) == 0
+    assert len(pieces_near(SQUARE, np.array([[0, 0, 50]]), 0.2).corners) == 0

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.errors import InputError
-from lidarslam.simulation.motion.mounts import MOUNTS, mount_pose
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.sensors.table import SENSORS
+from lidarslam.simulation.motion.carriers import MOUNTS, mount_pose
+from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 
 # name: rays a sweep, lasers, lowest and highest elevation in degrees
 FACTS = {
@@ -34,8 +33,8 @@ def test_every_sensor_has_its_facts():
 def test_rays_are_as_published(name):
     sensor = find_sensor(name)
     rays_per_scan, lasers, lowest, highest = FACTS[name]
-    directions, fractions, rings = sensor.rays(3)
-    assert directions.shape == (rays_per_scan, 3) == (sensor.rays_per_scan, 3)
+    directions, fractions, rings = sensor.pattern.rays(3)
+    assert directions.shape == (rays_per_scan, 3) == (sensor.pattern.columns * sensor.pattern.lasers, 3)
     assert sensor.pattern.lasers == lasers
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
     assert (np.diff(fractions) >= 0.0).all()
@@ -49,7 +48,7 @@ def test_rays_are_as_published(name):
 
 @pytest.mark.parametrize("name", [name for name in FACTS if name != "livox"])
 def test_a_ring_keeps_its_elevation_and_turns_clockwise(name):
-    directions, _, rings = find_sensor(name).rays(0)
+    directions, _, rings = find_sensor(name).pattern.rays(0)
     for ring in (0, rings.max()):
         own = directions[rings == ring]
         assert np.ptp(elevations_deg(own)) < 1e-9
@@ -60,7 +59,7 @@ def test_a_ring_keeps_its_elevation_and_turns_clockwise(name):
 
 def test_vlp_16_fires_by_its_manual():
     """Lasers 0, 1, 2 look at -15, 1 and -13 degrees, 2.304 us apart, and the head turns on between them."""
-    directions, fractions, rings = find_sensor("vlp-16").rays(0)
+    directions, fractions, rings = find_sensor("vlp-16").pattern.rays(0)
     np.testing.assert_allclose(elevations_deg(directions[:4]), [-15.0, 1.0, -13.0, 3.0], atol=1e-9)
     np.testing.assert_array_equal(rings[:4], [0, 8, 1, 9])
     np.testing.assert_allclose(np.diff(fractions[:16]) * 1800 * 55.296, 2.304, atol=1e-9)
@@ -80,14 +79,14 @@ def test_calibrated_rings_are_uneven_and_stay_in_order():
 
 
 def test_ouster_fires_whole_columns():
-    _, fractions, rings = find_sensor("os1-128").rays(0)
+    _, fractions, rings = find_sensor("os1-128").pattern.rays(0)
     assert len(np.unique(fractions)) == 1024
     np.testing.assert_array_equal(rings[:128], np.arange(128))
 
 
 def test_livox_goes_on_and_does_not_repeat():
     sensor = find_sensor("livox")
-    sweeps = [sensor.rays(index).directions for index in range(60)]
+    sweeps = [sensor.pattern.rays(index).directions for index in range(60)]
     # From the last shot of a sweep to the first of the next it is one step of the pattern.
     step = np.linalg.norm(sweeps[0][4] - sweeps[0][0])
     assert np.linalg.norm(sweeps[1][0] - sweeps[0][-4]) < 1.5 * step

@@ -14,9 +14,8 @@ from lidarslam.simulation.motion.motions import rotations
 from lidarslam.simulation.motion.path_clearance import check_clearance, is_inside
 from lidarslam.simulation.recording.motion import given_path, read_trajectory
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
-from lidarslam.simulation.worlds.street.along import build_along
-from lidarslam.simulation.worlds.street.rows import FREE_SIDE_M
+from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.worlds.street.along import FREE_SIDE_M, build_along
 
 
 def figure_of_eight(size_m=70.0, rounds=1):

@@ -14,12 +14,11 @@ from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.recording.recorder import SimulatedScan
-from lidarslam.simulation.writers.bag_messages import MessageSerializer
-from lidarslam.simulation.writers.clock import CLOCK_START_NS, clock_ns
 from lidarslam.simulation.writers.driver_clouds import DRIVERS, find_driver
-from lidarslam.simulation.writers.interface import Rig
+from lidarslam.simulation.writers.interface import CLOCK_START_NS, Rig, clock_ns
 from lidarslam.simulation.writers.kitti import T_CAM_LIDAR, compensate
-from lidarslam.simulation.writers.registry import FORMATS, find_format, load_writer
+from lidarslam.simulation.writers.registry import FORMATS, find_format
+from lidarslam.simulation.writers.rosbag import MessageSerializer
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 SWEEP_S = 0.1
@@ -51,7 +50,7 @@ def make_rig(drive, driver="velodyne"):
 
 def write(name, folder, sweeps, rig):
     """The recording that the program's reader finds in a folder with the scans."""
-    load_writer(name)(folder, iter(sweeps), rig)
+    find_format(name).writer()(folder, iter(sweeps), rig)
     return open_recording(find_format(name).source_in(folder))
 
 
@@ -117,7 +116,7 @@ def test_messages_are_laid_out_as_the_driver_lays_them_out(name, driver, tmp_pat
 
 def messages(name, driver, folder, sweeps, drive):
     """Record stamp and message, decoded by rosbags with the definitions in the bag, with the sweep it was made of."""
-    load_writer(name)(folder, iter(sweeps), make_rig(drive, driver))
+    find_format(name).writer()(folder, iter(sweeps), make_rig(drive, driver))
     source = find_format(name).source_in(folder)
     store = MessageSerializer(ros2=name != "rosbag1").store
     with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(source) as reader:
@@ -246,7 +245,7 @@ def test_same_scans_same_bytes(name, tmp_path, sweeps, rig):
     contents = []
     for folder in (tmp_path / "a" / "room", tmp_path / "b" / "room"):
         folder.parent.mkdir()
-        load_writer(name)(folder, iter(sweeps[:2]), rig)
+        find_format(name).writer()(folder, iter(sweeps[:2]), rig)
         files = sorted(path for path in folder.rglob("*") if path.is_file())
         contents.append({path.relative_to(folder): path.read_bytes() for path in files})
     assert contents[0].keys() == contents[1].keys()
@@ -269,13 +268,13 @@ def test_one_scan_is_held_at_a_time(name, tmp_path, sweeps, rig):
             del made, scan
             most = max(most, len(alive))
 
-    load_writer(name)(tmp_path / "room", stream(), rig)
+    find_format(name).writer()(tmp_path / "room", stream(), rig)
     assert most == 1  # the writer's own, when the next one is asked for
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
-    load_writer(name)(tmp_path / "room", iter(sweeps[:2]), rig)
+    find_format(name).writer()(tmp_path / "room", iter(sweeps[:2]), rig)
     patterns = find_format(name).files
     for entry in (tmp_path / "room").iterdir():
         assert any(entry.match(pattern) for pattern in patterns)
@@ -284,6 +283,6 @@ def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
 
 def test_unknown_names_are_told_the_choice():
     with pytest.raises(InputError, match=r"'pcap'.*kitti, ply, rosbag1, rosbag2, mcap"):
-        load_writer("pcap")
+        find_format("pcap")
     with pytest.raises(InputError, match=r"'sick'.*velodyne, ouster, hesai, livox"):
         find_driver("sick")

@@ -1,4 +1,4 @@
-"""Which function reads a scan file into a table of points."""
+"""Readers of scan files into tables of points, by their suffix."""
 
 from collections.abc import Callable, Sequence
 from io import BytesIO
@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
-from lidarslam.datasets.folders.point_table import as_table
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, read_bin, read_bytes
 
 TableReader = Callable[[Path], NDArray[np.void]]
 
-# What the float32 numbers of a .bin point are, by how many there are.
-_BIN_FIELDS = {3: ("x", "y", "z"), 4: KITTI_FIELDS, 5: (*KITTI_FIELDS, "ring")}
+# Fields of the float32 numbers of a .bin point, by how many there are; in the order of preference.
+_BIN_FIELDS = {5: (*KITTI_FIELDS, "ring"), 4: KITTI_FIELDS, 3: ("x", "y", "z")}
 _MOST_RINGS = 256
 _WIDEST_ARRAY = 16
 
@@ -26,45 +25,32 @@ def table_reader(files: Sequence[Path]) -> TableReader:
     """The reader for scan files, all with one suffix.
 
     Raises:
-        InputError: it cannot be told how many numbers a point of a `.bin` file has.
+        InputError: the number of values a point of a `.bin` file is ambiguous.
     """
     suffix = files[0].suffix.lower()
     if suffix == ".bin":
         fields = _BIN_FIELDS[_bin_columns(files)]
-        return lambda path: as_table(read_bin(path, len(fields)), fields)
+        return lambda path: _as_table(read_bin(path, len(fields)), fields)
     return {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy}[suffix]
 
 
 def _bin_columns(files: Sequence[Path]) -> int:
-    """How many numbers a point has, so that the sizes of most files fit.
+    """How many numbers a point has: so that the sizes of most files fit, since the file itself does not say.
 
-    The file says nothing about it. Four fit almost always where they are right; five, as nuScenes has them, show
-    by a fifth number that is a small integer in every point.
+    Four fit almost always where they are right; five, as nuScenes has them, only count where the fifth number is a
+    small integer in every point.
     """
-    sizes = np.array([_size(path) for path in files])
-    fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in (4, 5, 3)}
-    most = max(fits.values())
-    likely = [columns for columns, count in fits.items() if count == most]
-    if most == 0:
+    sizes = np.array([path.stat().st_size if path.exists() else 0 for path in files])
+    fits = {columns: int(np.count_nonzero(sizes % (4 * columns) == 0)) for columns in _BIN_FIELDS}
+    if fits[5] and not _fifth_is_ring(files[int(np.argmax(sizes * (sizes % 20 == 0)))]):
+        fits[5] = 0
+    columns = max(fits, key=lambda columns: fits[columns])
+    if not fits[columns]:
         raise InputError(
-            f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 or 20 bytes,"
-            f" got {sizes[0]} bytes, which fit none; the file is damaged or of another format"
+            f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each, or of 12 bytes, or of 20 bytes"
+            f" with a ring, got {sizes[0]} bytes, which fit none; copy it again, or convert the scans to .npy or .ply"
         )
-    if 5 in likely and not _fifth_is_ring(files[int(np.argmax(sizes * (sizes % 20 == 0)))]):
-        likely.remove(5)
-    if not likely:
-        raise InputError(
-            f"{files[0]}: expected float32 points of x, y, z, intensity, 16 bytes each; 20 bytes each fit, but the"
-            " fifth number is no ring, so its meaning is unknown; convert the scans to .npy or .ply"
-        )
-    return 5 if 5 in likely else likely[0]
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:  # gone meanwhile, which is told when it is its turn
-        return 0
+    return columns
 
 
 def _fifth_is_ring(path: Path) -> bool:
@@ -96,4 +82,10 @@ def read_npy(path: Path) -> NDArray[np.void]:
             f" got {array.shape} of {array.dtype}"
         )
     names = tuple("xyz") + tuple(f"column_{column}" for column in range(3, array.shape[-1]))
-    return as_table(array.reshape(-1, array.shape[-1]), names)
+    return _as_table(array.reshape(-1, array.shape[-1]), names)
+
+
+def _as_table(numbers: NDArray[np.generic], names: tuple[str, ...]) -> NDArray[np.void]:
+    """An array (N, columns) of one type as a structured array (N,) with these names."""
+    dtype = np.dtype([(name, numbers.dtype) for name in names])
+    return np.ascontiguousarray(numbers).view(dtype).reshape(-1)

@@ -1,4 +1,4 @@
-"""What lies in a folder of scans: which files are scans, when they were taken, where the truth is."""
+"""Layout of a folder of scans: the scan files, their stamps, the ground truth."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ class FolderLayout:
         stamps: (N,) seconds, strictly increasing.
         from_clock: whether the stamps were found; else they are made from the rate.
         truth: a TUM file, or None.
-        notes: what the user should know.
-        warnings: what was mended.
+        notes: facts for the user.
+        warnings: faults and repairs.
     """
 
     files: tuple[Path, ...]
@@ -35,41 +35,40 @@ class FolderLayout:
     from_clock: bool
     truth: Path | None
     notes: tuple[str, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
 
 
 def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
-    """Look at a folder's names and its stamp file; no scan is opened.
+    """The layout by names and the stamp file; no scan is opened.
 
     Raises:
         InputError: there is no scan, or the stamp file does not go with the scans.
     """
     files, notes, warnings = _find_scans(folder)
-    truth = find_truth_file((folder, folder.resolve().parent))
-    stamp_file = _find_stamp_file(folder)
+    places = (folder, folder.resolve().parent)
+    stamp_file = next((place / name for place in places for name in _STAMP_FILES if (place / name).is_file()), None)
+    stamps, from_clock = np.arange(len(files)) / rate_hz, True
+    named = stamps_from_names([path.stem for path in files])
     if stamp_file is not None:
         stamps, replaced = _read_stamp_file(stamp_file, files)
         if replaced:
             warnings.append(
                 f"{replaced} stamps of {stamp_file.name} repeat, run backwards or far ahead and were interpolated."
             )
-        return FolderLayout(tuple(files), stamps, True, truth, tuple(notes), tuple(warnings))
-    named = stamps_from_names([path.stem for path in files])
-    if named is not None:
-        # The order of names is not that of time: 5.36 comes before 5.4.
-        order = np.argsort(named, kind="stable")
-        if (np.diff(named[order]) > 0.0).all():
-            notes.append("The stamps are the file names.")
-            in_time = tuple(files[i] for i in order)
-            return FolderLayout(in_time, named[order], True, truth, tuple(notes), tuple(warnings))
-        warnings.append("The file names look like stamps, but some are equal.")
-    notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
-    assumed = np.arange(len(files)) / rate_hz
-    return FolderLayout(tuple(files), assumed, False, truth, tuple(notes), tuple(warnings))
+    elif named is not None and len(set(named)) == len(named):
+        notes.append("The stamps are the file names.")
+        order = np.argsort(named)  # not that of the names: 5.36 comes before 5.4
+        files, stamps = [files[i] for i in order], named[order]
+    else:
+        from_clock = False
+        if named is not None:
+            warnings.append("The file names look like stamps, but some are equal.")
+        notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
+    return FolderLayout(tuple(files), stamps, from_clock, find_truth_file(places), tuple(notes), tuple(warnings))
 
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
-    """The scan files in natural order, the most common suffix and numbered names where there are such; and words."""
+    """The scan files in natural order, the most common suffix and numbered names first; notes and warnings."""
     named = [p for p in folder.iterdir() if p.suffix.lower() in SCAN_SUFFIXES and not p.name.startswith(".")]
     candidates = [path for path in named if path.is_file()]
     if not candidates:
@@ -80,17 +79,13 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     numbered = [path for path in same if any(c.isdecimal() for c in path.stem)]
     files = sorted(numbered or same, key=lambda path: natural_key(path.stem))
     skipped = sorted(path.name for path in set(candidates) - set(files))
-    notes = []
-    if skipped:
-        shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
-        notes.append(f"{len(skipped)} other files were not taken for scans: {shown}.")
+    shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
     gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
-    return files, notes, [f"{len(gone)} scans are no files that can be opened, such as {gone[0]}."] if gone else []
-
-
-def _find_stamp_file(folder: Path) -> Path | None:
-    places = (folder, folder.resolve().parent)
-    return next((place / name for place in places for name in _STAMP_FILES if (place / name).is_file()), None)
+    return (
+        files,
+        [f"{len(skipped)} other files were not taken for scans: {shown}."] if skipped else [],
+        [f"{len(gone)} scans are no files that can be opened, such as {gone[0]}."] if gone else [],
+    )
 
 
 def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int]:

@@ -1,15 +1,9 @@
-"""Points with all their fields as structured arrays, whatever file they come from."""
+"""Fields of points in a structured array, whatever file it comes from."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-
-
-def as_table(numbers: NDArray[np.generic], names: tuple[str, ...]) -> NDArray[np.void]:
-    """An array (N, columns) of one type as a structured array (N,) with these names."""
-    dtype = np.dtype([(name, numbers.dtype) for name in names])
-    return np.ascontiguousarray(numbers).view(dtype).reshape(-1)
 
 
 def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from lidarslam.core.errors import InputError
 
 # No sweep is larger; reading on would fill the memory.
 _LARGEST_BYTES = 1 << 31
-# More scans than this nobody records; what is beyond is a name that is no number of a scan, such as a time.
+# A larger number is no scan's, such as a time.
 _MOST_SCANS = 10**9
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
@@ -49,15 +49,15 @@ def numbered_scans(folder: Path, suffix: str = ".bin") -> tuple[list[Path], NDAr
     if not files:
         raise InputError(f"{folder}: holds no {suffix} scan")
     for path in files:
-        if not (path.stem.isascii() and path.stem.isdecimal()):
-            raise InputError(f"{path}: expected a name that is the scan's number, such as 000004{suffix}; rename it")
-        if int(path.stem) >= _MOST_SCANS:
-            raise InputError(f"{path}: the number of a scan is at most {_MOST_SCANS - 1:,}; rename it or move it away")
+        if not (path.stem.isascii() and path.stem.isdecimal() and int(path.stem) < _MOST_SCANS):
+            raise InputError(
+                f"{path}: expected a name that is the scan's number, such as 000004{suffix}, at most"
+                f" {_MOST_SCANS - 1:,}; rename it or move it away"
+            )
     numbers = np.array([int(path.stem) for path in files], dtype=np.intp)
-    twice = np.flatnonzero(np.diff(numbers) == 0)
-    if len(twice):
-        first, second = files[twice[0]].name, files[twice[0] + 1].name
-        raise InputError(f"{folder}: {first} and {second} have the same number; remove one")
+    if (np.diff(numbers) == 0).any():
+        twice = int(np.argmin(np.diff(numbers)))
+        raise InputError(f"{folder}: {files[twice].name} and {files[twice + 1].name} have the same number; remove one")
     return files, numbers
 
 

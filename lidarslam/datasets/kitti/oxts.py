@@ -1,7 +1,7 @@
 """The GPS/IMU unit of a KITTI raw drive: one text file of 30 numbers for each camera image."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ _COLUMNS = 30
 _POSITION_ACCURACY_COLUMN = 23
 
 
-@dataclass(frozen=True, eq=False)
-class OxtsPoses:
+class OxtsPoses(NamedTuple):
     """The unit's poses.
 
     Attributes:
@@ -42,10 +41,9 @@ def read_oxts(folder: Path) -> OxtsPoses:
     files, numbers = numbered_scans(folder, ".txt")
     tables = [parse_numbers(path, _COLUMNS) for path in files]
     for path, table in zip(files, tables, strict=True):
-        if len(table) != 1 or not np.isfinite(table[0, :6]).all():
-            raise InputError(f"{path}: expected one line of {_COLUMNS} numbers, got {len(table)}; copy the file again")
-        if not abs(table[0, 0]) < _POLE_DEG:
-            raise InputError(f"{path}: begins with {table[0, 0]:g}, which is no latitude; copy the file again")
+        if len(table) != 1 or not np.isfinite(table[0, :6]).all() or not abs(table[0, 0]) < _POLE_DEG:
+            expected = f"one line of {_COLUMNS} numbers that begins with a latitude"
+            raise InputError(f"{path}: expected {expected}, got {len(table)} lines; copy the file again")
     rows = np.concatenate(tables)
     return OxtsPoses(numbers, oxts_poses(rows), rows[:, _POSITION_ACCURACY_COLUMN])
 

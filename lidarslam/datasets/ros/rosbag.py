@@ -32,6 +32,7 @@ _FRAMES_LOOKED_AT = 10
 
 _DAMAGED = "damaged places in the bag were passed over"
 _MISSING = "scans are missing that the index lists"
+_NO_HEADER_STAMPS = "The message headers have no stamps, so the times of recording are used."
 _NEVER_SET = "scans were left out: their stamps were never set"
 
 
@@ -62,7 +63,7 @@ class BagRecording:
 
     @property
     def name(self) -> str:
-        """The name of the folder, or of the file without its suffix."""
+        """The folder's name, or the file's without its suffix."""
         return self._source.resolve().name if self._source.is_dir() else self._source.stem
 
     @cached_property
@@ -75,11 +76,9 @@ class BagRecording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """That its index is gone, or its headers have no stamps."""
-        damage = () if self._bag.damage is None else (self._bag.damage,)
-        if self._stamps.from_header:
-            return damage
-        return (*damage, "The message headers have no stamps, so the times of recording are used.")
+        """A lost index, and headers without stamps."""
+        unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
+        return tuple(warning for warning in (self._bag.damage, unset) if warning is not None)
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -147,7 +146,7 @@ class BagRecording:
         frames = Counter(m.frame_id for m in islice(self._sound(), _FRAMES_LOOKED_AT))
         wanted = self._config.frame_id
         if wanted is None:
-            return frames.most_common(1)[0][0] if frames else ""
+            return max(frames, key=lambda frame: frames[frame], default="")
         if wanted not in frames:
             found = ", ".join(repr(frame) for frame in frames)
             raise InputError(

@@ -1,4 +1,4 @@
-"""Primitives as triangles, for casting rays and for the reference map; closed and outward where there is an inside."""
+"""Primitives as triangles, for casting rays and for the reference map; solids are closed and face outwards."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,50 +15,33 @@ CYLINDER_SIDES = 24
 
 # Corner k of a box lies at its half sizes times these signs; a face is two triangles, counter-clockwise from outside.
 _BOX_CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
-_BOX_TRIANGLES = np.array(
-    [
-        [[0, 2, 3], [0, 3, 1]],  # -z
-        [[4, 5, 7], [4, 7, 6]],  # +z
-        [[0, 1, 5], [0, 5, 4]],  # -y
-        [[2, 6, 7], [2, 7, 3]],  # +y
-        [[0, 4, 6], [0, 6, 2]],  # -x
-        [[1, 3, 7], [1, 7, 5]],  # +x
-    ],
-    dtype=np.int32,
-).reshape(12, 3)
+_BOX_FACES = [
+    [[0, 2, 3], [0, 3, 1]],  # -z
+    [[4, 5, 7], [4, 7, 6]],  # +z
+    [[0, 1, 5], [0, 5, 4]],  # -y
+    [[2, 6, 7], [2, 7, 3]],  # +y
+    [[0, 4, 6], [0, 6, 2]],  # -x
+    [[1, 3, 7], [1, 7, 5]],  # +x
+]
+_BOX_TRIANGLES = np.array(_BOX_FACES, dtype=np.int32).reshape(12, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in the world.
+    """Triangles in the world, counter-clockwise as seen from outside."""
 
-    Attributes:
-        vertices: (V, 3).
-        triangles: (T, 3) indices into `vertices`, counter-clockwise as seen from outside.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
+    vertices: FloatArray  # (V, 3)
+    triangles: IntArray  # (T, 3) indices into `vertices`
 
     def __post_init__(self) -> None:
-        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
-            raise ValueError(f"Mesh.vertices must be (V, 3), got {self.vertices.shape}")
-        if self.triangles.ndim != 2 or self.triangles.shape[1] != 3:
-            raise ValueError(f"Mesh.triangles must be (T, 3), got {self.triangles.shape}")
+        if self.vertices.shape[1:] != (3,) or self.triangles.shape[1:] != (3,):
+            raise ValueError(f"Mesh must be (V, 3) and (T, 3), got {self.vertices.shape} and {self.triangles.shape}")
         if self.triangles.size and not 0 <= self.triangles.min() <= self.triangles.max() < len(self.vertices):
             raise ValueError(f"Mesh.triangles must index {len(self.vertices)} vertices, got {self.triangles.max()}")
-
-    @property
-    def normals(self) -> FloatArray:
-        """(T, 3) outward, as long as twice the triangle's area."""
-        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
-        return np.cross(b - a, c - a)
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles of several meshes in one, in their order."""
-    if not meshes:
-        return Mesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32))
     first_vertices = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     triangles = [mesh.triangles + first for mesh, first in zip(meshes, first_vertices, strict=True)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles).astype(np.int32))
@@ -74,7 +57,7 @@ def box_mesh(boxes: Boxes) -> Mesh:
 def cylinder_mesh(cylinders: Cylinders) -> Mesh:
     """A capped prism of `CYLINDER_SIDES` sides for each cylinder, in their order, of the same volume as the cylinder.
 
-    The corners stand 0.6 % of the radius proud and the sides lie 0.3 % inside, so that neither form is larger.
+    The corners stand 0.6 % of the radius proud and the sides lie 0.3 % inside.
     """
     n = CYLINDER_SIDES
     axis = cylinders.ends - cylinders.starts
@@ -89,7 +72,14 @@ def cylinder_mesh(cylinders: Cylinders) -> Mesh:
     around = np.cos(angle)[:, None] * u[:, None, :] + np.sin(angle)[:, None] * v[:, None, :]
     rim = radius[:, None, None] * around
     starts, ends = cylinders.starts[:, None, :], cylinders.ends[:, None, :]
-    return _repeated(np.concatenate([starts, ends, starts + rim, ends + rim], axis=1), _prism_triangles(n))
+    # Vertices 0 and 1 are the ends' centres, then come n around the start and n around the end.
+    k = np.arange(n, dtype=np.int32)
+    low, low_next = 2 + k, 2 + (k + 1) % n
+    high, high_next = low + n, low_next + n
+    start, end = np.zeros_like(k), np.ones_like(k)
+    faces = [[start, low_next, low], [end, high, high_next], [low, low_next, high_next], [low, high_next, high]]
+    triangles = np.concatenate([np.stack(face, axis=1) for face in faces]).astype(np.int32)
+    return _repeated(np.concatenate([starts, ends, starts + rim, ends + rim], axis=1), triangles)
 
 
 def height_field_mesh(field: HeightField) -> Mesh:
@@ -105,7 +95,7 @@ def height_field_mesh(field: HeightField) -> Mesh:
 
 
 def world_mesh(world: World) -> Mesh:
-    """Everything that stands still: boxes, cylinders, height fields, in this order."""
+    """All that stands still: boxes, cylinders, height fields, in this order."""
     grounds = [height_field_mesh(field) for field in world.height_fields]
     return merge([box_mesh(world.boxes), cylinder_mesh(world.cylinders), *grounds])
 
@@ -113,16 +103,6 @@ def world_mesh(world: World) -> Mesh:
 def first_ground_triangle(world: World) -> int:
     """Number in `world_mesh` of the first triangle of the height fields, which are its last."""
     return len(_BOX_TRIANGLES) * len(world.boxes) + 4 * CYLINDER_SIDES * len(world.cylinders)
-
-
-def _prism_triangles(n: int) -> IntArray:
-    """(4 n, 3) triangles of a prism: vertices 0 and 1 the ends' centres, then n around the start, n around the end."""
-    k = np.arange(n, dtype=np.int32)
-    low, low_next = 2 + k, 2 + (k + 1) % n
-    high, high_next = low + n, low_next + n
-    start, end = np.zeros_like(k), np.ones_like(k)
-    faces = [[start, low_next, low], [end, high, high_next], [low, low_next, high_next], [low, high_next, high]]
-    return np.concatenate([np.stack(face, axis=1) for face in faces]).astype(np.int32)
 
 
 def _repeated(vertices: FloatArray, triangles: IntArray) -> Mesh:

@@ -1,67 +1,44 @@
-"""What carries the LiDAR: how fast it goes, how it takes corners, how it sways."""
+"""Carriers of the LiDAR: speeds, corners, sway, and how the LiDAR is mounted."""
 
 from dataclasses import dataclass
 
-from lidarslam.core.errors import InputError
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.simulation.choices import choose
 
 
 @dataclass(frozen=True)
 class Swing:
-    """One sine of a carrier's sway.
+    """One sine of a carrier's sway."""
 
-    Attributes:
-        axis: "x", "y", "z" (metres; forwards, left, up), "roll", "pitch" or "yaw" (degrees).
-        amplitude: in that unit.
-        frequency_hz: before the seed varies it by a tenth.
-        stepwise: whether it follows the carrier's gait, so that all such swings keep one common frequency.
-    """
-
-    axis: str
+    axis: str  # "x", "y", "z" (metres; forwards, left, up), "roll", "pitch" or "yaw" (degrees)
     amplitude: float
-    frequency_hz: float
-    stepwise: bool = False
+    frequency_hz: float  # before the seed varies it by a tenth
+    stepwise: bool = False  # all such swings follow the carrier's gait, at one common frequency
 
 
 @dataclass(frozen=True)
 class Carrier:
-    """A kind of motion.
-
-    Attributes:
-        name: as on the command line.
-        speed_mps: where nothing slows it down.
-        acceleration, side_acceleration: limits along and across, m/s^2.
-        turn_rate_deg, turn_acceleration_deg: about z, degrees a second (squared).
-        stop_angle_deg: at sharper corners it stops and turns on the spot.
-        swings_deg: turns there and back before it takes a corner's new direction.
-        half_width_m: of its body, for staying within the route's free side.
-        footprint_m: radius over which it averages the ground.
-        leans_with_ground: whether it takes the ground's pitch and roll.
-        banks: whether it leans into its accelerations, as what flies must.
-        keeps_going: whether it is at speed when a lap begins, and laps follow one another without a halt; else they
-            begin and end at rest.
-        flight_height_m: above the ground, where the route is high enough; 0 for what does not fly.
-        sensor_height_m: of the LiDAR above the body's origin, which is on the ground or is the flying body.
-        smoothing_s: half the time over which accelerations set in.
-        sway: its sines while it moves.
-    """
+    """A kind of motion, by its name on the command line."""
 
     name: str
-    speed_mps: float
-    acceleration: float
+    speed_mps: float  # where nothing slows it down
+    acceleration: float  # limits along and across, m/s^2
     side_acceleration: float
-    turn_rate_deg: float
+    turn_rate_deg: float  # about z, degrees a second (squared)
     turn_acceleration_deg: float
-    stop_angle_deg: float
-    half_width_m: float
-    footprint_m: float
-    sensor_height_m: float
-    smoothing_s: float
-    swings_deg: tuple[float, ...] = ()
-    leans_with_ground: bool = True
-    banks: bool = False
-    keeps_going: bool = False
-    flight_height_m: float = 0.0
-    sway: tuple[Swing, ...] = ()
+    stop_angle_deg: float  # at sharper corners it stops and turns on the spot
+    half_width_m: float  # of its body, for staying within the route's free side
+    footprint_m: float  # radius over which it averages the ground
+    sensor_height_m: float  # of the LiDAR above the body's origin, which is on the ground or is the flying body
+    smoothing_s: float  # half the time over which accelerations set in
+    swings_deg: tuple[float, ...] = ()  # turns there and back before it takes a corner's new direction
+    leans_with_ground: bool = True  # takes the ground's pitch and roll
+    banks: bool = False  # leans into its accelerations, as what flies must
+    keeps_going: bool = False  # is at speed when a lap begins and ends; else laps begin and end at rest
+    flight_height_m: float = 0.0  # above the ground, where the route is high enough; 0 for what does not fly
+    sway: tuple[Swing, ...] = ()  # while it moves
 
 
 _SUSPENSION = (Swing("pitch", 0.25, 1.3), Swing("roll", 0.25, 1.1), Swing("z", 0.01, 1.3))
@@ -106,13 +83,22 @@ _TABLE = (
 )  # fmt: skip
 CARRIERS: dict[str, Carrier] = {carrier.name: carrier for carrier in _TABLE}
 
+# Rotations of the LiDAR on the body: rotation vectors, degrees. Tilted: looking down to the front and a little aside.
+MOUNTS: dict[str, tuple[float, float, float]] = {
+    "upright": (0.0, 0.0, 0.0),
+    "upside-down": (180.0, 0.0, 0.0),
+    "tilted": (6.0, 25.0, 0.0),
+}
+
 
 def find_carrier(name: str) -> Carrier:
-    """The carrier of that name.
+    """The carrier of that name."""
+    return choose("motion", name, CARRIERS)
 
-    Raises:
-        InputError: there is no such carrier.
-    """
-    if name not in CARRIERS:
-        raise InputError(f"no motion is called {name!r}; there are: {', '.join(CARRIERS)}")
-    return CARRIERS[name]
+
+def mount_pose(name: str, height_m: float) -> FloatArray:
+    """T_body_lidar (4, 4) of a LiDAR mounted so, that far above the body's origin."""
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_rotvec(np.deg2rad(choose("mount", name, MOUNTS))).as_matrix()
+    return make_transform(R, [0.0, 0.0, height_m])

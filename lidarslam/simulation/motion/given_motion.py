@@ -1,7 +1,7 @@
 """Following a trajectory that is given, such as KITTI's ground truth."""
 
 import numpy as np
-from scipy.interpolate import CubicSpline, make_smoothing_spline
+from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
@@ -14,21 +14,19 @@ from lidarslam.simulation.world import World
 
 _STEEPEST_DEG = 80.0
 _FEWEST_TO_SMOOTH = 5
-_PATH_STEP_S = 0.05
 
 
 def motion_along(
-    trajectory: Trajectory, world: World, on_ground: bool = True, carrier: str = "car", smoothing_s: float = 0.0
+    trajectory: Trajectory, world: World | None, on_ground: bool = True, carrier: str = "car", smoothing_s: float = 0.0
 ) -> Motion:
-    """Follow a trajectory in its own time, on smooth splines.
+    """Follow a trajectory in its own time, on smooth splines; after the last pose the body stays where it is.
 
-    The trajectory's world frame is the world's; nothing keeps the path clear of what stands there: the world has to
-    be made around it (`worlds.street_along`), or the path be checked (`path_clearance`). Time 0 is the first pose;
-    after the last one the body stays where it is.
+    The trajectory's world frame is the world's; the world has to be made around it (`worlds.street.along`), or the
+    path be checked (`path_clearance`).
 
     Args:
-        trajectory: poses of a frame with x forwards and z up (a KITTI pose file has to be converted before).
-        world: gives the ground.
+        trajectory: poses of a frame with x forwards and z up.
+        world: gives the ground, if the motion is on it.
         on_ground: take position and heading from the trajectory, height, roll and pitch from the ground under the
             carrier; else take the poses as they are, for what flies or is carried.
         carrier: whose footprint and sensor height are meant when on the ground.
@@ -41,49 +39,30 @@ def motion_along(
     """
     if len(trajectory) < 2:
         raise InputError(f"a motion needs two poses or more, the trajectory has {len(trajectory)}")
-    yaw, pitch, roll = Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_euler("ZYX").T
-    if np.abs(pitch).max() > np.deg2rad(_STEEPEST_DEG):
+    angles = Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_euler("ZYX")
+    if np.abs(angles[:, 1]).max() > np.deg2rad(_STEEPEST_DEG):
         raise InputError(f"a motion cannot look up or down by more than {_STEEPEST_DEG:g} degrees; the trajectory does")
     steps = np.abs(trajectory.relative_motions()[:, :3, 3]).sum(axis=0)
     if on_ground and steps[2] > steps[0]:
         raise InputError("the trajectory moves along its z axis, not along x; is it in the frame of a camera?")
     times = trajectory.stamps - trajectory.stamps[0]
-    x, y, z, roll, pitch, yaw = (
-        _smoothed(times, values, smoothing_s)
-        for values in (*trajectory.positions.T, np.unwrap(roll), np.unwrap(pitch), np.unwrap(yaw))
-    )
+    xyz = _smoothed(times, trajectory.positions, smoothing_s)
+    yaw, pitch, roll = _smoothed(times, np.unwrap(angles, axis=0), smoothing_s).T
     height = 0.0
-    if on_ground:
+    if on_ground and world is not None:
         body = find_carrier(carrier)
         height = body.sensor_height_m
-        z, roll, pitch = _put_on_ground(world, np.stack([x, y], axis=-1), yaw, body.footprint_m)
-    base = np.stack([x, y, z, roll, pitch, yaw, np.zeros(len(x))], axis=-1)
+        ground = ground_under(world, xyz[:, :2], body.footprint_m)
+        pitch, roll = ground.pitch_and_roll(yaw)
+        xyz = np.column_stack([xyz[:, :2], ground.height])
+    base = np.column_stack([xyz, roll, pitch, yaw, np.zeros(len(xyz))])
     return Motion("given", times, base, Sway(), height, repeats=False)
 
 
-def path_along(trajectory: Trajectory, smoothing_s: float = 0.0) -> FloatArray:
-    """Positions (N, 3) that `motion_along` passes, also between the poses, before they are put on the ground."""
-    times = trajectory.stamps - trajectory.stamps[0]
-    positions = np.stack([_smoothed(times, values, smoothing_s) for values in trajectory.positions.T], axis=-1)
-    moments = np.linspace(0.0, times[-1], max(2, int(np.ceil(times[-1] / _PATH_STEP_S)) + 1))
-    return np.asarray(CubicSpline(times, positions, bc_type="natural")(moments))
-
-
 def _smoothed(times: FloatArray, values: FloatArray, smoothing_s: float) -> FloatArray:
-    """Values (N,) of the curve that balances distance and curvature so that it follows what lasts longer."""
+    """Values (N, D) of the smoothing spline that follows what lasts longer."""
     if smoothing_s <= 0.0 or len(times) < _FEWEST_TO_SMOOTH:
         return values
     # Of the smoothing spline's balance, lam * integral(f''^2), the response to a frequency w is 1 / (1 + lam dt w^4).
     balance = smoothing_s**4 / float(np.median(np.diff(times)))
-    return np.asarray(make_smoothing_spline(times, values, lam=balance)(times))
-
-
-def _put_on_ground(
-    world: World, xy: FloatArray, yaw: FloatArray, footprint_m: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Height, roll and pitch (N,) of a body on the ground."""
-    ground = ground_under(world, xy, footprint_m)
-    c, s = np.cos(yaw), np.sin(yaw)
-    pitch = -np.arctan(c * ground.slope[:, 0] + s * ground.slope[:, 1])
-    roll = np.arctan(c * ground.slope[:, 1] - s * ground.slope[:, 0])
-    return ground.height, roll, pitch
+    return np.column_stack([make_smoothing_spline(times, column, lam=balance)(times) for column in values.T])

@@ -1,6 +1,6 @@
-"""How a body rests on uneven ground."""
+"""Bodies on uneven ground."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,25 +11,28 @@ _SAMPLES = 24
 _BLOCK = 4096
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """The ground under a footprint.
+class Ground(NamedTuple):
+    """Planes that fit the ground under footprints."""
 
-    Attributes:
-        height: (N,) z of the plane that fits the ground under the footprint, at its middle.
-        slope: (N, 2) rise of that plane for each metre in x and y.
-    """
+    height: FloatArray  # (N,) z at the footprint's middle
+    slope: FloatArray  # (N, 2) rise for each metre in x and y
 
-    height: FloatArray
-    slope: FloatArray
+    def pitch_and_roll(self, yaw: FloatArray, rise: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Pitch and roll (N,) of a body of that yaw (N,) on the planes, which rise by `rise` more for each metre."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        pitch = -np.arctan(c * self.slope[:, 0] + s * self.slope[:, 1] + rise)
+        return pitch, np.arctan(c * self.slope[:, 1] - s * self.slope[:, 0])
 
 
 def ground_under(world: World, xy: FloatArray, radius_m: float) -> Ground:
-    """Fit planes to the ground within a radius of (N, 2) positions; they depend on the position alone.
+    """Fit planes to the ground within a radius of (N, 2) positions, by weighted least squares.
 
-    Samples lie evenly in the disc, with weights that vanish at its rim: triangle edges pass gently under the body.
+    Samples are spread over the disc like the seeds of a sunflower, with weights that vanish at its rim: triangle edges
+    pass gently under the body.
     """
-    disc = _even_disc(_SAMPLES)
+    k = np.arange(_SAMPLES) + 0.5
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    disc = np.sqrt(k / _SAMPLES)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     weights = (1.0 - (disc**2).sum(axis=1)) ** 2
     weights /= weights.sum()
     offsets = radius_m * disc
@@ -37,15 +40,6 @@ def ground_under(world: World, xy: FloatArray, radius_m: float) -> Ground:
     fit = np.linalg.solve(offsets.T @ (weights[:, None] * offsets), (weights[:, None] * offsets).T)
     heights = np.empty((len(xy), _SAMPLES))
     for start in range(0, len(xy), _BLOCK):
-        block = xy[start : start + _BLOCK]
-        heights[start : start + _BLOCK] = world.ground_at((block[:, None] + offsets).reshape(-1, 2)).reshape(
-            -1, _SAMPLES
-        )
+        samples = xy[start : start + _BLOCK, None] + offsets
+        heights[start : start + _BLOCK] = world.ground_at(samples.reshape(-1, 2)).reshape(-1, _SAMPLES)
     return Ground(heights @ weights, heights @ fit.T)
-
-
-def _even_disc(count: int) -> FloatArray:
-    """Points (count, 2) spread evenly over the unit disc: the seeds of a sunflower."""
-    k = np.arange(count) + 0.5
-    angle = np.pi * (1.0 + 5.0**0.5) * k
-    return np.asarray(np.sqrt(k / count)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))

@@ -1,4 +1,4 @@
-"""How a body moves through a world: poses at any time, without end."""
+"""Motions of a body through a world: poses at any time, without end."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,30 +10,22 @@ from lidarslam.core.geometry import FloatArray, make_transform
 
 # Columns of `Motion.base`.
 CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "activity")
-_AXES = CHANNELS[:6]
 
 
 @dataclass(frozen=True, eq=False)
 class Sway:
-    """Sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest.
+    """K sines on top of a motion, in the body's frame; they grow with the motion's activity and vanish at rest."""
 
-    Attributes:
-        axes: (K,) indices into x, y, z, roll, pitch, yaw.
-        amplitudes: (K,) metres or radians.
-        frequencies_hz, phases: (K,).
-    """
-
-    axes: tuple[int, ...] = ()
-    amplitudes: tuple[float, ...] = ()
+    axes: tuple[int, ...] = ()  # indices into x, y, z, roll, pitch, yaw
+    amplitudes: tuple[float, ...] = ()  # metres or radians
     frequencies_hz: tuple[float, ...] = ()
     phases: tuple[float, ...] = ()
 
     def at(self, times: FloatArray) -> FloatArray:
         """Deflections (N, 6) at times (N,), full size."""
-        deflections = np.zeros((len(times), len(_AXES)))
-        for axis, amplitude, frequency, phase in zip(
-            self.axes, self.amplitudes, self.frequencies_hz, self.phases, strict=True
-        ):
+        deflections = np.zeros((len(times), 6))
+        sines = zip(self.axes, self.amplitudes, self.frequencies_hz, self.phases, strict=True)
+        for axis, amplitude, frequency, phase in sines:
             deflections[:, axis] += amplitude * np.sin(2.0 * np.pi * frequency * times + phase)
         return deflections
 
@@ -42,25 +34,17 @@ class Sway:
 class Motion:
     """The motion of a body, x forwards and z up, whose origin is on the ground under it (or which flies).
 
-    Attributes:
-        name: of the carrier, or of the trajectory that is followed.
-        times: (K,) from 0 to `duration_s`.
-        base: (K, 7) world position, roll, pitch, yaw and activity (0 to 1) at the times; cubic splines go through
-            them. R_world_body = Rz(yaw) Ry(pitch) Rx(roll).
-        sway: what comes on top, seeded.
-        sensor_height_m: how far above the body's origin a LiDAR sits.
-        repeats: whether another lap follows a lap; else the body stays where it is in the end.
-        rests: whether a lap begins and ends at rest; else its last pose is its first, whole turns of yaw aside, and the
-            next lap follows without a halt.
+    Cubic splines go through `base`: world position, roll, pitch, yaw and activity (0 to 1), with
+    R_world_body = Rz(yaw) Ry(pitch) Rx(roll).
     """
 
-    name: str
-    times: FloatArray
-    base: FloatArray
+    name: str  # of the carrier, or "given"
+    times: FloatArray  # (K,) from 0 to `duration_s`
+    base: FloatArray  # (K, 7)
     sway: Sway
-    sensor_height_m: float
-    repeats: bool = True
-    rests: bool = True
+    sensor_height_m: float  # of a LiDAR above the body's origin
+    repeats: bool = True  # another lap follows a lap; else the body stays where it is in the end
+    rests: bool = True  # a lap begins and ends at rest; else its last pose is its first, whole turns of yaw aside
 
     def __post_init__(self) -> None:
         if self.base.shape != (len(self.times), len(CHANNELS)) or self.times[0] != 0.0:
@@ -91,10 +75,7 @@ class Motion:
 
 
 def _closed_spline(times: FloatArray, values: FloatArray) -> CubicSpline[np.float64]:
-    """Through values (K, D) at times (K,), with equal derivatives at either end, whatever the values differ by there.
-
-    A periodic spline of what is left without a linear trend, and the trend on top.
-    """
+    """Through values (K, D) at times (K,), with equal derivatives at either end: a periodic spline and a trend."""
     slope = (values[-1] - values[0]) / times[-1]
     level = values - np.multiply.outer(times, slope)
     level[-1] = level[0]
@@ -107,8 +88,9 @@ def _closed_spline(times: FloatArray, values: FloatArray) -> CubicSpline[np.floa
 def rotations(roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:
     """Rz(yaw) Ry(pitch) Rx(roll), (N, 3, 3), of angles (N,) in radians."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (np.cos, np.sin))
-    R = np.empty((len(roll), 3, 3))
-    R[:, 0, 0], R[:, 0, 1], R[:, 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
-    R[:, 1, 0], R[:, 1, 1], R[:, 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
-    R[:, 2, 0], R[:, 2, 1], R[:, 2, 2] = -sp, cp * sr, cp * cr
-    return R
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0).copy()

@@ -1,4 +1,4 @@
-"""Whether a given trajectory keeps clear of what stands in a world that was not made around it."""
+"""Clearance of a given trajectory in a world that was not made around it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,13 @@ _LOWEST_M = 0.3  # kerbs and bumps under a carrier are not in its way
 
 
 def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None:
-    """See that a carrier's body meets nothing that stands still, from the first scan to the end of the last.
+    """Refuse a trajectory on which the carrier's body meets a static surface, from the first scan to the last.
 
     The body is a ball of the carrier's half width round the sensor; on the ground, one above the wheels as well.
 
     Args:
         simulation: whose motion follows the trajectory.
-        carrier: what moves along it.
+        carrier: moves along it.
         name: of the trajectory, for the message.
 
     Raises:
@@ -29,17 +29,23 @@ def check_clearance(simulation: Simulation, carrier: Carrier, name: str) -> None
     world = simulation.world
     times = np.arange(0.0, simulation.scan_count / simulation.sensor.rate_hz + _TIME_STEP_S, _TIME_STEP_S)
     positions = simulation.motion.pose_at(times)[:, :3, 3]
-    heights = [0.0]
-    if carrier.leans_with_ground:
-        heights = [carrier.half_width_m + _LOWEST_M, carrier.sensor_height_m]
+    on_ground = [carrier.half_width_m + _LOWEST_M, carrier.sensor_height_m]
     is_blocked = np.zeros(len(times), dtype=bool)
-    for height in heights:
+    for height in on_ground if carrier.leans_with_ground else [0.0]:
         body = positions + np.array([0.0, 0.0, height])
         is_blocked |= simulation.distance_to_surfaces(body) < carrier.half_width_m
         # A surface cannot be crossed without coming near it, so that only the start can be deep inside something.
         is_blocked[0] |= is_inside(world, body[0])
-    _refuse_first(is_blocked, "through something solid", simulation, positions, times, name)
-    _refuse_first(_is_off_ground(world, positions), "off the ground", simulation, positions, times, name)
+    for refused, whither in (
+        (is_blocked, "through something solid"),
+        (_is_off_ground(world, positions), "off the ground"),
+    ):
+        if refused.any():
+            x, y, z = positions[refused.argmax()]
+            raise InputError(
+                f"{name}: leads {whither} in {world.name}, seed {world.seed}, at x {x:.1f}, y {y:.1f}, z {z:.1f} m,"
+                f" {times[refused.argmax()]:.1f} s after its start; only --world street is built around a trajectory"
+            )
 
 
 def is_inside(world: World, point: FloatArray) -> bool:
@@ -62,21 +68,3 @@ def _is_off_ground(world: World, positions: FloatArray) -> NDArray[np.bool_]:
     ground = world.height_fields[0]
     far = ground.origin_xy + ground.cell_m * (np.array(ground.heights.shape) - 1.0)
     return np.asarray(((positions[:, :2] < ground.origin_xy) | (positions[:, :2] > far)).any(axis=1))
-
-
-def _refuse_first(
-    refused: NDArray[np.bool_],
-    whither: str,
-    simulation: Simulation,
-    positions: FloatArray,
-    times: FloatArray,
-    name: str,
-) -> None:
-    if refused.any():
-        first = int(refused.argmax())
-        x, y, z = positions[first]
-        raise InputError(
-            f"{name}: leads {whither} in {simulation.world.name}, seed {simulation.world.seed}, at x {x:.1f},"
-            f" y {y:.1f}, z {z:.1f} m, {times[first]:.1f} s after its start;"
-            " only --world street is built around a trajectory"
-        )

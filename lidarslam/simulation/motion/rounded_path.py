@@ -15,14 +15,10 @@ class RoundedPath:
     With u the length along the polyline and k the window (15/16h)(1 - (x/h)^2)^2 of half width h, the path is the
     polyline convolved with k: straight where the polyline is straight within h, its second derivative at a corner the
     change of direction times k. Each corner has its own h, so that there are closed forms throughout.
-
-    Attributes:
-        vertices: (M, D) of the polyline.
-        half_widths: (M,) of the window at each vertex; the ends are not rounded.
     """
 
-    vertices: FloatArray
-    half_widths: FloatArray
+    vertices: FloatArray  # (M, D) of the polyline
+    half_widths: FloatArray  # (M,) of the window at each vertex; the ends are not rounded
 
     @cached_property
     def lengths(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""How fast along a way, from rest to rest or round and round: within limits, without jerks."""
+"""Speed profiles along a way, from rest to rest or round and round: within limits, without jerks."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -10,8 +10,8 @@ TIME_STEP_S = 0.01
 
 def rest_to_rest(
     positions: FloatArray, speed_limits: FloatArray, acceleration: float, smoothing_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """Positions (N,) and speeds (N,) at steps of `TIME_STEP_S` on the quickest way that keeps the limits.
+) -> FloatArray:
+    """Positions (N,) at steps of `TIME_STEP_S` on the quickest way that keeps the limits.
 
     The quickest way has constant acceleration between the limits; averaged in time over a window of `smoothing_s` to
     either side it keeps both limits on speed and acceleration (the average of what keeps a limit keeps it too), and
@@ -28,13 +28,12 @@ def rest_to_rest(
     speeds = _within_acceleration(positions, limits, acceleration)
     times = _arrivals(positions, speeds)
     moments = TIME_STEP_S * np.arange(int(np.ceil(times[-1] / TIME_STEP_S)) + 1, dtype=np.float64)
-    smooth = smoothed(_travelled(positions, speeds, times, moments), smoothing_s, ends="rest")
-    return smooth, np.gradient(smooth, TIME_STEP_S)
+    return smoothed(_travelled(positions, speeds, times, moments), smoothing_s, ends="rest")
 
 
 def round_and_round(
     positions: FloatArray, speed_limits: FloatArray, acceleration: float, smoothing_s: float
-) -> tuple[FloatArray, FloatArray]:
+) -> FloatArray:
     """As `rest_to_rest` for one lap of a closed way, whose last position is the first: at speed where it closes.
 
     The lap's time is rounded up to whole steps, all speeds that much lower.
@@ -47,10 +46,14 @@ def round_and_round(
     times = _arrivals(positions, speeds)
     steps = int(np.ceil(times[-1] / TIME_STEP_S))
     travelled = _travelled(positions, speeds, times, float(times[-1]) / steps * np.arange(steps + 1, dtype=np.float64))
-    laps = np.concatenate([travelled[:-1] - lap, travelled, travelled[1:] + lap])
-    smooth = smoothed(laps, smoothing_s)
-    rates = np.gradient(smooth, TIME_STEP_S)
-    return smooth[steps : 2 * steps + 1] - smooth[steps], rates[steps : 2 * steps + 1]
+    smooth = smoothed(np.concatenate([travelled[:-1] - lap, travelled, travelled[1:] + lap]), smoothing_s)
+    return np.asarray(smooth[steps : 2 * steps + 1] - smooth[steps])
+
+
+def travelled_at(lengths: FloatArray, parameters: FloatArray, travelled: FloatArray) -> FloatArray:
+    """Parameters (N,) of a path at travelled lengths (N,), from those (M,) at increasing lengths (M,); never back."""
+    found = CubicSpline(lengths, parameters)(travelled)
+    return np.clip(np.maximum.accumulate(found), parameters[0], parameters[-1])
 
 
 def _within_acceleration(positions: FloatArray, speed_limits: FloatArray, acceleration: float) -> FloatArray:
@@ -75,22 +78,12 @@ def _travelled(positions: FloatArray, speeds: FloatArray, times: FloatArray, mom
 
 
 def smoothed(values: FloatArray, half_width_s: float, ends: str = "same") -> FloatArray:
-    """Values (N,) averaged over a window of time.
+    """Values (N,) at steps of `TIME_STEP_S` averaged over a window of twice that width, the first and last held.
 
-    Args:
-        values: at steps of `TIME_STEP_S`.
-        half_width_s: half the window.
-        ends: "same" keeps the number of values, taking those outside as the first and last; "rest" adds the window's
-            width, so that the result starts and ends exactly at the first and last value.
+    Ends "same" keep the number of values; "rest" adds the window's width, so that the result starts and ends exactly
+    at the first and last value.
     """
     n = max(round(half_width_s / TIME_STEP_S), 1)
     weights = (1.0 - (np.arange(-n, n + 1) / (n + 1.0)) ** 2) ** 2
-    padding = n if ends == "same" else 2 * n
-    padded = np.pad(values, padding, mode="edge")
-    averaged = np.convolve(padded, weights / weights.sum(), mode="valid")
-    return np.asarray(averaged)
-
-
-def invert(values: FloatArray, positions: FloatArray) -> CubicSpline[np.float64]:
-    """A smooth function from increasing values (M,) to the positions (M,) where they are taken."""
-    return CubicSpline(values, positions)
+    padded = np.pad(values, n if ends == "same" else 2 * n, mode="edge")
+    return np.asarray(np.convolve(padded, weights / weights.sum(), mode="valid"))

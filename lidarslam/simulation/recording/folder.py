@@ -28,8 +28,8 @@ def new_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
         OutputError: there is something already, or it cannot be written.
     """
     out = out.resolve()
-    _refuse_to_replace(out, overwrite)
     try:
+        _refuse_to_replace(out, overwrite)
         out.parent.mkdir(parents=True, exist_ok=True)
         # Beside its final place, so that renaming is enough; hidden, so that a killed process leaves nothing to find.
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as workplace:
@@ -44,28 +44,19 @@ def new_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def _refuse_to_replace(out: Path, overwrite: bool) -> None:
-    if not out.exists():
-        return
-    if not out.is_dir():
+    if out.exists() and not out.is_dir():
         raise OutputError(f"{out}: a file is in the way; name another folder")
-    try:
-        names = sorted(entry.name for entry in out.iterdir())
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be read ({error.strerror or error})") from error
+    names = sorted(entry.name for entry in out.iterdir()) if out.exists() else []
     if not names:
         return
-    if not _is_simulated(out):
+    readme = out / README
+    if not readme.is_file() or MADE_BY not in readme.read_text(encoding="utf-8", errors="replace"):
         raise OutputError(f"{out}: holds other files ({_listing(names)}); name another folder")
-    others = [name for name in names if not any(fnmatchcase(name, pattern) for pattern in _FILES)]
     if not overwrite:
         raise OutputError(f"{out}: holds a recording already; name another folder, or replace it with --overwrite")
+    others = [name for name in names if not any(fnmatchcase(name, pattern) for pattern in _FILES)]
     if others:
         raise OutputError(f"{out}: holds more than a simulated recording ({_listing(others)}); move that away first")
-
-
-def _is_simulated(folder: Path) -> bool:
-    readme = folder / README
-    return readme.is_file() and MADE_BY in readme.read_text(encoding="utf-8", errors="replace")
 
 
 def _listing(names: list[str]) -> str:

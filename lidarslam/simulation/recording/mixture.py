@@ -11,10 +11,10 @@ import numpy as np
 
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.simulation.motion.mounts import mount_pose
+from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.recorder import Simulation
-from lidarslam.simulation.sensors.registry import find_sensor
+from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 
 # Drawn by turns.
@@ -38,12 +38,7 @@ _FIRST_SEED = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """Some consecutive scans of a recording, as a recording of their own.
-
-    Attributes:
-        whole: the recording.
-        first, count: which of its scans.
-    """
+    """Some consecutive scans of a recording, as a recording of their own."""
 
     whole: ScanSequence
     first: int
@@ -70,7 +65,7 @@ class Excerpt:
 
 @dataclass(frozen=True)
 class Ingredients:
-    """What a recording of a mixture is of, by name; `speed_mps` where it is not the carrier's own."""
+    """The names of a recording's parts; `speed_mps` where it is not the carrier's own."""
 
     world: str
     sensor: str
@@ -80,35 +75,29 @@ class Ingredients:
 
 
 def mixture(recordings: int, scans: int, seed: int, first: int = 0) -> Iterator[Excerpt]:
-    """Recordings of so many scans each; number i of a seed is the same whatever comes before it."""
+    """Recordings of so many scans each; number i of a seed is the same for any `first`."""
     for number in range(first, first + recordings):
-        yield _draw(number, scans, seed)
+        rng = np.random.default_rng([seed, number])
+        chosen = _draw(rng, number)
+        sensor = find_sensor(chosen.sensor)
+        world_seed = _FIRST_SEED * (seed + 1) + number
+        world = build_world(chosen.world, world_seed)
+        motion = motion_along_route(chosen.carrier, world, world_seed, chosen.speed_mps)
+        start = int(rng.integers(max(1, int(motion.duration_s * sensor.rate_hz) - scans)))
+        T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
+        yield Excerpt(Simulation(world, sensor, motion, T_body_lidar, start + scans, world_seed), start, scans)
 
 
 def ingredients_of(number: int, seed: int) -> Ingredients:
-    """What a recording of a mixture is of; its world is not built."""
-    return _ingredients(np.random.default_rng([seed, number]), number)
+    """The parts of a recording of a mixture; its world is not built."""
+    return _draw(np.random.default_rng([seed, number]), number)
 
 
-def _ingredients(rng: np.random.Generator, number: int) -> Ingredients:
+def _draw(rng: np.random.Generator, number: int) -> Ingredients:
     world = MIXED_WORLDS[number % len(MIXED_WORLDS)]
     carriers = _CARRIER_WEIGHTS | ({"car-fast": _FAST_WEIGHT} if world in _ROADS else {})
     sensor, carrier, mount = (_pick(rng, weights) for weights in (SENSOR_WEIGHTS, carriers, _MOUNT_WEIGHTS))
-    speed_mps = float(rng.uniform(*_FAST_MPS)) if carrier == "car-fast" else None
-    return Ingredients(world, sensor, carrier, mount, speed_mps)
-
-
-def _draw(number: int, scans: int, seed: int) -> Excerpt:
-    rng = np.random.default_rng([seed, number])
-    chosen = _ingredients(rng, number)
-    sensor = find_sensor(chosen.sensor)
-    world_seed = _FIRST_SEED * (seed + 1) + number
-    world = build_world(chosen.world, world_seed)
-    motion = motion_along_route(chosen.carrier, world, world_seed, chosen.speed_mps)
-    lap = int(motion.duration_s * sensor.rate_hz)
-    first = int(rng.integers(max(1, lap - scans)))
-    T_body_lidar = mount_pose(chosen.mount, motion.sensor_height_m)
-    return Excerpt(Simulation(world, sensor, motion, T_body_lidar, first + scans, world_seed), first, scans)
+    return Ingredients(world, sensor, carrier, mount, float(rng.uniform(*_FAST_MPS)) if carrier == "car-fast" else None)
 
 
 def _pick(rng: np.random.Generator, weights: dict[str, float]) -> str:

@@ -1,4 +1,4 @@
-"""How the sensor of a recording moves: a carrier on the world's route, or along a trajectory from a file."""
+"""The motion of a recording's sensor: a carrier on the world's route, or along a trajectory from a file."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
-from lidarslam.simulation.motion.carriers import find_carrier
-from lidarslam.simulation.motion.given_motion import motion_along, path_along
+from lidarslam.simulation.motion.carriers import Carrier, find_carrier
+from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.motion.motions import Motion
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recording.request import RecordRequest
@@ -18,8 +18,10 @@ from lidarslam.simulation.world import World
 
 _SCANS = 300
 _KITTI_RATE_HZ = 10.0
-_KITTI_SMOOTHING_S = 0.25  # its poses jump by centimetres, as its GPS did
+# KITTI's poses jump by centimetres, as the GPS behind them did: at 10 Hz more than a car's acceleration.
+_KITTI_SMOOTHING_S = 0.25
 _KITTI_COLUMNS = 12
+_PATH_STEP_S = 0.05
 # KITTI's pose files are in the frame of a camera: x to the right, y down, z forward.
 _T_CAM_BODY = make_transform([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], np.zeros(3))
 
@@ -27,10 +29,7 @@ _T_CAM_BODY = make_transform([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0
 def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[Motion, int]:
     """The motion and the number of scans: as many as asked for, else 300 or as long as the trajectory lasts.
 
-    A KITTI pose file is smoothed over a quarter of a second: its poses jump by centimetres, as the GPS behind them
-    did, and at 10 Hz that is more than a car's acceleration. A TUM file is followed through every pose.
-
-    What leans with the ground follows a trajectory on the ground, everything else takes its poses as they are.
+    Carriers that lean with the ground follow a trajectory on the ground, the others take its poses as they are.
 
     Raises:
         InputError: there is no such carrier, it cannot go along the route, or the trajectory cannot be followed, is too
@@ -42,9 +41,7 @@ def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[M
     if request.speed_mps is not None:
         raise InputError(f"{request.trajectory}: a trajectory has its own speed; leave out --speed")
     trajectory = read_trajectory(request.trajectory)
-    carrier = find_carrier(request.motion)
-    smoothing_s = _smoothing_s(request.trajectory)
-    motion = motion_along(trajectory, world, carrier.leans_with_ground, carrier.name, smoothing_s)
+    motion = _along(request.trajectory, trajectory, world, find_carrier(request.motion))
     most = int(trajectory.duration_s * sensor.rate_hz + 1e-6)  # the last sweep has to end before the trajectory does
     if not 1 <= (request.scans or most) <= most:
         raise InputError(
@@ -54,19 +51,21 @@ def plan_motion(request: RecordRequest, world: World, sensor: Sensor) -> tuple[M
     return motion, request.scans or most
 
 
+def _along(path: Path, trajectory: Trajectory, world: World | None, carrier: Carrier) -> Motion:
+    on_ground = carrier.leans_with_ground and world is not None
+    return motion_along(trajectory, world, on_ground, carrier.name, _KITTI_SMOOTHING_S if _is_kitti(path) else 0.0)
+
+
 def given_path(path: Path, motion: str) -> FloatArray:
-    """Where a carrier goes along a trajectory: (N, 2), or for what does not follow the ground (N, 3).
+    """Way of a carrier along a trajectory: (N, 2), or for carriers that do not follow the ground (N, 3).
 
     The third column is the height of the ground that fits the trajectory: as far below it as the carrier holds or
-    flies the sensor.
-
-    Raises:
-        InputError: there is no such carrier, or the file is no trajectory of two poses or more.
+    flies the sensor. Raises InputError as `plan_motion` does.
     """
     trajectory, carrier = read_trajectory(path), find_carrier(motion)
-    if len(trajectory) < 2:
-        raise InputError(f"{path}: a motion needs two poses or more, the trajectory has {len(trajectory)}")
-    positions = path_along(trajectory, _smoothing_s(path))
+    given = _along(path, trajectory, None, carrier)
+    steps = max(1, int(np.ceil(given.duration_s / _PATH_STEP_S)))
+    positions = given.pose_at(np.linspace(0.0, given.duration_s, steps + 1))[:, :3, 3]
     if carrier.leans_with_ground:
         return np.asarray(positions[:, :2])
     return positions - [0.0, 0.0, carrier.sensor_height_m + carrier.flight_height_m]
@@ -83,10 +82,6 @@ def read_trajectory(path: Path) -> Trajectory:
     T_cam0_cam = read_kitti_poses(path)
     stamps = np.arange(len(T_cam0_cam)) / _KITTI_RATE_HZ
     return Trajectory(stamps, inverse(_T_CAM_BODY) @ T_cam0_cam @ _T_CAM_BODY)
-
-
-def _smoothing_s(path: Path) -> float:
-    return _KITTI_SMOOTHING_S if _is_kitti(path) else 0.0
 
 
 def _is_kitti(path: Path) -> bool:

@@ -11,13 +11,12 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.casting.caster import Caster, Hits
-from lidarslam.simulation.casting.grass import ranges_in_grass
 from lidarslam.simulation.casting.mesh import first_ground_triangle
 from lidarslam.simulation.motion.motions import Motion
-from lidarslam.simulation.sensors.noise import bloom, intensities, measure, reflectivity, scan_rng
+from lidarslam.simulation.sensors.noise import bloom, intensities, measure, ranges_in_grass, reflectivity
 from lidarslam.simulation.sensors.scan_patterns import Rays
 from lidarslam.simulation.sensors.sensor import Sensor
-from lidarslam.simulation.world import Grass, World
+from lidarslam.simulation.world import World
 
 # Blades stand every way; half of a beam's power is what they reflect on average.
 _BLADE_COSINE = 0.5
@@ -25,37 +24,27 @@ _BLADE_COSINE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SimulatedScan:
-    """A scan and the truth about it; all arrays in the order of the scan's points.
+    """A scan and the truth about it; all arrays in the order of the scan's N points.
 
-    Attributes:
-        scan: points exact in float32, stamped at the sweep's start, as the drivers' message headers are.
-        intensities: (N,) float32, whole numbers from 0 to 255.
-        true_ranges: (N,) float64 along the rays that were measured, before noise, edge effects and grass; inf where a
-            point came from its neighbour's surface alone. None if unknown.
-        moving: (N,) whether the ray met something that moves; None if unknown.
+    The points are exact in float32, stamped at the sweep's start, as the drivers' message headers are. The true ranges
+    are those along the rays before noise, edge effects and grass; inf where a point came from its neighbour's surface
+    alone.
     """
 
     scan: Scan
-    intensities: NDArray[np.float32]
-    true_ranges: FloatArray | None = None
-    moving: NDArray[np.bool_] | None = None
+    intensities: NDArray[np.float32]  # (N,) whole numbers from 0 to 255
+    true_ranges: FloatArray | None = None  # (N,) or None if unknown
+    moving: NDArray[np.bool_] | None = None  # (N,) whether the ray met a mover, or None if unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
-    """The truth about one sweep, of all N rays fired.
+    """The truth about one sweep, of all N rays fired, each from the pose at its own time."""
 
-    Attributes:
-        rays: in the LiDAR frame.
-        times: (N,) seconds.
-        origins, directions: (N, 3) of the rays, in the world, each from the pose at its own time.
-        hits: what they met.
-    """
-
-    rays: Rays
-    times: FloatArray
-    origins: FloatArray
-    directions: FloatArray
+    rays: Rays  # in the LiDAR frame
+    times: FloatArray  # (N,) seconds
+    origins: FloatArray  # (N, 3) in the world
+    directions: FloatArray  # (N, 3) in the world
     hits: Hits
 
 
@@ -63,21 +52,15 @@ class Echoes:
 class Simulation:
     """A recording that is made while it is read; a `ScanSequence` that takes no memory but the world's.
 
-    Scan i starts at i / rate seconds of simulated time.
-
-    Attributes:
-        world, sensor, motion: see there.
-        T_body_lidar: (4, 4) how the sensor is mounted.
-        scan_count: number of scans.
-        seed: of the noise.
+    Scan i starts at i / rate seconds of simulated time and depends on nothing but the attributes and i.
     """
 
     world: World
     sensor: Sensor
     motion: Motion
-    T_body_lidar: FloatArray
+    T_body_lidar: FloatArray  # (4, 4) how the sensor is mounted
     scan_count: int
-    seed: int = 0
+    seed: int = 0  # of the noise
 
     @property
     def name(self) -> str:
@@ -108,7 +91,7 @@ class Simulation:
         return Caster(self.world)
 
     def distance_to_surfaces(self, points: FloatArray) -> FloatArray:
-        """Distances (N,) of points (N, 3) in the world from what stands still there."""
+        """Distances (N,) of points (N, 3) in the world from the nearest static surface."""
         return self._caster.distances(points)
 
     def __len__(self) -> int:
@@ -116,25 +99,22 @@ class Simulation:
 
     def scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`; the ones between are not made."""
-        for simulated in self.simulated_scans(start, stop, step):
-            yield simulated.scan
-
-    def simulated_scans(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[SimulatedScan]:
-        """The same with intensities and truth."""
         for index in range(self.scan_count)[start:stop:step]:
-            yield self.scan(index)
+            yield self.scan(index).scan
 
-    def scan(self, index: int) -> SimulatedScan:
-        """One scan; depends on nothing but the simulation's attributes and the index."""
-        echoes = self.echoes(index)
-        hits, model = echoes.hits, self.sensor.ranging
-        rng = scan_rng(self.seed, index)
-        pattern = self.sensor.pattern
+    def scan(self, index: int, echoes: Echoes | None = None) -> SimulatedScan:
+        """One scan with intensities and truth, from the sweep's echoes if they are known already."""
+        echoes = echoes or self.echoes(index)
+        hits, model, pattern = echoes.hits, self.sensor.ranging, self.sensor.pattern
+        rng = np.random.default_rng([self.seed, index])
         ranges, bloomed = bloom(model, hits.ranges, pattern.lasers, pattern.column_angle, rng)
-        # What only grazes an edge meets no surface whose slant would matter.
+        # A ray that only grazes an edge meets no surface whose slant would matter.
         cosines = np.where(bloomed, 1.0, hits.cosines)
         if self.world.grass is not None:
-            ranges, cosines = self._through_grass(self.world.grass, echoes, ranges, cosines, ~bloomed, rng)
+            ground = np.flatnonzero(~bloomed & (hits.surfaces >= first_ground_triangle(self.world)))
+            points = echoes.origins[ground] + ranges[ground, None] * echoes.directions[ground]
+            shorter, is_blade = ranges_in_grass(self.world.grass, points, ranges[ground], cosines[ground], rng)
+            ranges[ground], cosines[ground[is_blade]] = shorter, _BLADE_COSINE
         shares = reflectivity(hits.surfaces)
         measured = measure(model, ranges, cosines, shares, rng)
         returned = np.flatnonzero(np.isfinite(measured))
@@ -148,27 +128,9 @@ class Simulation:
         brightness = intensities(cosines[returned], shares[returned])
         return SimulatedScan(scan, brightness, hits.ranges[returned], hits.moving[returned])
 
-    def _through_grass(
-        self,
-        grass: Grass,
-        echoes: Echoes,
-        ranges: FloatArray,
-        cosines: FloatArray,
-        is_clear: NDArray[np.bool_],
-        rng: np.random.Generator,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Ranges and cosines (N,) of a sweep's rays; of those that meet the ground, some end at a blade before it."""
-        ground = np.flatnonzero(is_clear & (echoes.hits.surfaces >= first_ground_triangle(self.world)))
-        points = echoes.origins[ground] + ranges[ground, None] * echoes.directions[ground]
-        shortened, is_blade = ranges_in_grass(grass, points, ranges[ground], cosines[ground], rng)
-        ranges, cosines = ranges.copy(), cosines.copy()
-        ranges[ground] = shortened
-        cosines[ground[is_blade]] = _BLADE_COSINE
-        return ranges, cosines
-
     def echoes(self, index: int) -> Echoes:
-        """What the rays of one sweep meet in truth, every one cast from the pose at its own time."""
-        rays = self.sensor.rays(index)
+        """The true intersections of the rays of one sweep, every one cast from the pose at its own time."""
+        rays = self.sensor.pattern.rays(index)
         times = index / self.sensor.rate_hz + rays.fractions * self.sensor.period_s
         # Lasers that fire together share a pose.
         fresh = np.diff(times, prepend=-np.inf) > 0.0

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.casting.mesh import Mesh, world_mesh
-from lidarslam.simulation.casting.mesh_pieces import PIECE_VOXELS, Pieces, pieces_near
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.casting.mesh_pieces import Pieces, pieces_near
+from lidarslam.simulation.recording.recorder import Echoes, Simulation
 
 KeyArray = NDArray[np.int64]
 
@@ -32,21 +32,26 @@ class ReferenceMap(NamedTuple):
 
 @dataclass(eq=False)
 class SeenSurfaces:
-    """Where noise-free rays have met surfaces: voxels, and in each which way the surface faces.
+    """Surfaces that noise-free rays have met: voxels, and in each the directions that the surface faces.
 
     The direction keeps the far side of a wall out of the map when only the near side was seen.
-
-    Attributes:
-        voxel_m: edge of a voxel.
     """
 
     voxel_m: float = 0.2
     _keys: KeyArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _pending: list[KeyArray] = field(default_factory=list)
 
+    def add_sweep(self, echoes: Echoes, min_range_m: float) -> None:
+        """Add the true hits of one sweep on static surfaces within the sensor's range."""
+        hits = echoes.hits
+        met = np.flatnonzero(np.isfinite(hits.ranges) & ~hits.moving & (hits.ranges >= min_range_m))
+        points = echoes.origins[met] + hits.ranges[met, None] * echoes.directions[met]
+        normals = hits.normals[met].astype(np.float64)
+        self.add(points, normals, np.einsum("ij,ij->i", normals, echoes.directions[met]) > 0.0)
+
     def add(self, points: FloatArray, normals: FloatArray, from_behind: NDArray[np.bool_]) -> None:
         """Add hits (N, 3) with their surfaces' outward normals (N, 3) and whether they were met from inside (N,)."""
-        self._pending.append(_unique(_keys(points, normals, self.voxel_m) | from_behind))
+        self._pending.append(_unique(_voxels(points, self.voxel_m) | _sectors(normals) | from_behind))
         if sum(map(len, self._pending)) > max(_BLOCK, len(self._keys)):
             self._merge()
 
@@ -60,38 +65,24 @@ class SeenSurfaces:
         self._pending.clear()
 
 
-def reference_map(
-    simulation: Simulation, spacing_m: float | None = None, start: int = 0, stop: int | None = None, step: int = 1
-) -> ReferenceMap:
-    """The map of what the chosen scans of a simulation saw of the world that stands still.
+def reference_map(simulation: Simulation, spacing_m: float | None = None, step: int = 1) -> ReferenceMap:
+    """The map of the static world that every `step`-th scan of a simulation saw.
 
     Its points are `spacing_m` apart, by default as the world says.
     """
     seen = SeenSurfaces()
-    for index in range(len(simulation))[start:stop:step]:
-        add_sweep(seen, simulation, index)
+    for index in range(0, len(simulation), step):
+        seen.add_sweep(simulation.echoes(index), simulation.sensor.ranging.min_range_m)
     return sample_seen(world_mesh(simulation.world), seen, spacing_m or simulation.world.map_spacing_m)
-
-
-def add_sweep(seen: SeenSurfaces, simulation: Simulation, index: int) -> None:
-    """Add what one sweep met, in truth, of what stands still within the sensor's range."""
-    echoes = simulation.echoes(index)
-    hits = echoes.hits
-    met = np.flatnonzero(
-        np.isfinite(hits.ranges) & ~hits.moving & (hits.ranges >= simulation.sensor.ranging.min_range_m)
-    )
-    points = echoes.origins[met] + hits.ranges[met, None] * echoes.directions[met]
-    normals = hits.normals[met].astype(np.float64)
-    seen.add(points, normals, np.einsum("ij,ij->i", normals, echoes.directions[met]) > 0.0)
 
 
 def sample_seen(mesh: Mesh, seen: SeenSurfaces, spacing_m: float = 0.05) -> ReferenceMap:
     """Samples of the mesh, one to each `spacing_m` squared, in or next to voxels that were seen.
 
-    Time and memory are those of what was seen, not of the mesh, which is gone through once.
+    Time and memory are those of the seen surfaces, not of the mesh, which is gone through once.
     """
     around = seen.around()
-    pieces = _facing_seen(pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m), around, seen.voxel_m)
+    pieces = pieces_near(mesh, _cells(_unique(around >> 4)), seen.voxel_m)
     facing = pieces.normals
     sectors = _sectors(facing)
     points, normals = [np.empty((0, 3))], [np.empty((0, 3))]
@@ -131,11 +122,6 @@ def _even_in_triangle(numbers: NDArray[np.int64]) -> tuple[FloatArray, FloatArra
     return np.where(v > u, less, u - less), np.where(v > u, v - less, less)
 
 
-def _keys(points: FloatArray, normals: FloatArray, voxel_m: float) -> KeyArray:
-    """One number for each point's voxel and the sector that its normal lies in; the lowest bit is free."""
-    return _voxels(points, voxel_m) | _sectors(normals)
-
-
 def _voxels(points: FloatArray, voxel_m: float) -> KeyArray:
     """The upper bits (N,) of the keys of points (N, 3)."""
     i, j, k = np.floor(points.T / voxel_m).astype(np.int64) + _HALF
@@ -152,16 +138,6 @@ def _sectors(normals: FloatArray) -> KeyArray:
 def _cells(upper_bits: KeyArray) -> KeyArray:
     """The voxels (N, 3) of keys (N,) without their lowest four bits."""
     return np.asarray((upper_bits[:, None] >> _BITS * np.arange(3) & (1 << _BITS) - 1) - _HALF)
-
-
-def _facing_seen(pieces: Pieces, around: KeyArray, voxel_m: float) -> Pieces:
-    """The pieces without those that face another way than everything seen nearby: the far sides of walls."""
-    coarse_m = PIECE_VOXELS * voxel_m
-    middles = np.asarray((_cells(around >> 4) + 0.5) * voxel_m, dtype=np.float64)
-    seen_keys = _spread(_unique(_voxels(middles, coarse_m) | (around & 0b1111)))
-    low, high = pieces.bounds
-    front, behind = _sides(seen_keys, _voxels(0.5 * (low + high), coarse_m) | _sectors(pieces.normals))
-    return pieces[front | behind]
 
 
 def _spread(keys: KeyArray) -> KeyArray:

@@ -1,4 +1,4 @@
-"""What recording is to be made, and what came of it."""
+"""A recording to be made, and the recording that was made."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,50 +6,38 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class RecordRequest:
-    """A recording to be made.
+    """A recording to be made; the same request gives the same bytes."""
 
-    Attributes:
-        out: the folder it becomes.
-        world, sensor, motion, mount, format: names in their registries.
-        scans: how many; None: 300, or as many as the trajectory lasts.
-        seed: of the world, the motion and the noise; the same request gives the same bytes.
-        trajectory: TUM or KITTI file to move along instead of the world's route; `motion` is what moves along it.
-        speed_mps: of the carrier where no bend slows it down, instead of its own and of the route's limit.
-        overwrite: whether an earlier recording in `out` is replaced.
-    """
-
-    out: Path
-    world: str
+    out: Path  # the folder it becomes
+    world: str  # names in their registries
     sensor: str
     motion: str
     mount: str
-    scans: int | None
-    seed: int
+    scans: int | None  # None: 300, or as many as the trajectory lasts
+    seed: int  # of the world, the motion and the noise
     format: str
-    trajectory: Path | None = None
-    speed_mps: float | None = None
-    overwrite: bool = False
+    trajectory: Path | None = None  # TUM or KITTI file that `motion` moves along instead of the world's route
+    speed_mps: float | None = None  # where no bend slows it down, instead of the carrier's own and the route's limit
+    overwrite: bool = False  # whether an earlier recording in `out` is replaced
+
+    @property
+    def moved(self) -> str:
+        """The carrier, and its way or speed where it is not the usual one."""
+        if self.trajectory is not None:
+            return f"{self.motion} along {self.trajectory.name}"
+        return self.motion + (f" at {self.speed_mps:g} m/s" if self.speed_mps is not None else "")
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """A recording that was made.
+    """A recording that was made."""
 
-    Attributes:
-        source: what to give to `lidarslam run`.
-        rate_hz: of the sensor, sweeps a second.
-        scans, points_per_scan: how many; the points are the mean.
-        duration_s, length_m: from the first stamp to the last.
-        map_points, map_spacing_m: points of the reference map, and how far apart they are.
-        size_mb: of the whole folder.
-    """
-
-    source: Path
-    rate_hz: float
+    source: Path  # the argument for `lidarslam run`
+    rate_hz: float  # of the sensor, sweeps a second
     scans: int
-    points_per_scan: int
-    duration_s: float
+    points_per_scan: int  # mean
+    duration_s: float  # from the first stamp to the last
     length_m: float
     map_points: int
-    map_spacing_m: float
-    size_mb: float
+    map_spacing_m: float  # between the points of the reference map
+    size_mb: float  # of the whole folder

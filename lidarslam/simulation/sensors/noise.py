@@ -1,4 +1,4 @@
-"""What a sensor makes of true ranges: pure functions of the truth, the sensor's figures and random numbers.
+"""Measurement noise: pure functions of the true ranges, the sensor's figures and random numbers.
 
 All take and give whole sweeps (N,), in the order of the pattern's rays, so that what happens to one ray does not
 depend on how many others returned; inf stands for no return.
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.sensors.sensor import RangeModel
+from lidarslam.simulation.world import Grass
 
 # A surface seen at a smaller cosine than this (87 degrees) behaves as at it.
 _LEAST_COSINE = 0.05
@@ -21,11 +22,8 @@ _MIXED_STEP_M = 1.5
 _REFERENCE_REFLECTIVITY = 0.8
 # Stands for the range of a ray that meets nothing, where it has to be compared.
 _NOTHING_M = 1e6
-
-
-def scan_rng(seed: int, scan_index: int) -> np.random.Generator:
-    """The random numbers of one scan, the same whichever scans were made before."""
-    return np.random.default_rng([seed, scan_index])
+# The tips of the blades are between this share of the grass's height and all of it.
+_SHORTEST_BLADE = 0.5
 
 
 def reflectivity(surfaces: NDArray[np.int64]) -> FloatArray:
@@ -51,11 +49,10 @@ def return_probability(
     """Probability (N,) that a ray comes back.
 
     The echo's power falls with reflectivity * cosine / range^2; detection turns over from certain to none around the
-    power of a surface of 80 % reflectivity met head-on at the maximum range.
+    power of a surface of 80 % reflectivity met head-on at the maximum range. The fourth power makes the turnover as
+    wide as the published 10 % and 90 % ranges are apart.
     """
     power = reflectivities / _REFERENCE_REFLECTIVITY * np.maximum(cosines, _LEAST_COSINE)
-    # The fourth power of the power ratio makes the turnover about as wide as the published 10 % and 90 % ranges are
-    # apart.
     weakness = (ranges / model.max_range_m) ** 2 / power
     return np.asarray((1.0 - model.dropout) / (1.0 + weakness**4))
 
@@ -99,3 +96,18 @@ def measure(
 def intensities(cosines: FloatArray, reflectivities: FloatArray) -> NDArray[np.float32]:
     """Calibrated intensities (N,), whole numbers on the drivers' scale of 0 to 255, without the effect of range."""
     return np.round(255.0 * reflectivities * cosines).astype(np.float32)
+
+
+def ranges_in_grass(
+    grass: Grass, points: FloatArray, ranges: FloatArray, cosines: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Ranges (N,) of rays to points (N, 3) on the ground that blades may shorten, and which (N,) ended at a blade.
+
+    The path among blades of height h at incidence cosine c is h / c long; until a blade is met it is exponentially
+    distributed (Beer and Lambert's law). Close by most rays reach the ground, far away hardly any.
+    """
+    tips = grass.heights.height_at(points[:, :2]) * rng.uniform(_SHORTEST_BLADE, 1.0, len(points))
+    path = np.minimum(tips / np.maximum(cosines, _LEAST_COSINE), ranges)
+    until_blade = rng.exponential(grass.free_path_m, len(points))
+    is_blade = until_blade < path
+    return ranges - np.where(is_blade, path - until_blade, 0.0), is_blade

@@ -1,4 +1,4 @@
-"""Where a LiDAR looks during one sweep, and when."""
+"""Scan patterns: the directions and times of a sweep's rays."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,21 +11,15 @@ from lidarslam.core.geometry import FloatArray
 
 
 class Rays(NamedTuple):
-    """The rays of one sweep in the order of time, shot by shot: `lasers` rays to each of the `columns` shots.
+    """The rays of one sweep in the order of time, shot by shot: `lasers` rays to each of the `columns` shots."""
 
-    Attributes:
-        directions: (N, 3) float64, unit, in the LiDAR frame (x forward, z up).
-        fractions: (N,) when within the sweep each is fired, 0 at its start, below 1 at its end; never decreasing.
-        rings: (N,) int32, the laser.
-    """
-
-    directions: FloatArray
-    fractions: FloatArray
-    rings: NDArray[np.int32]
+    directions: FloatArray  # (N, 3) unit, in the LiDAR frame (x forward, z up)
+    fractions: FloatArray  # (N,) of the sweep when each is fired, in [0, 1), never decreasing
+    rings: NDArray[np.int32]  # (N,) the laser
 
 
 class ScanPattern(Protocol):
-    """What a sensor needs to know of its optics; N = columns * lasers."""
+    """A LiDAR's optics; N = columns * lasers."""
 
     @property
     def columns(self) -> int:
@@ -45,23 +39,14 @@ class ScanPattern(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Spinning:
-    """A column of lasers that turns once a sweep.
+    """A column of lasers that turns once a sweep."""
 
-    Attributes:
-        elevations_deg: (L,) of each laser, by ring.
-        azimuth_offsets_deg: (L,) seen from above, counter-clockwise from the middle of the column.
-        firing: (L,) when within its column's time slot each laser fires, in [0, 1); the column turns on meanwhile.
-        columns: number of columns in a turn.
-        start_azimuth_deg: where the turn starts, counter-clockwise from x.
-        clockwise: the sense of rotation, seen from above.
-    """
-
-    elevations_deg: FloatArray
-    azimuth_offsets_deg: FloatArray
-    firing: FloatArray
-    columns: int
-    start_azimuth_deg: float = 180.0
-    clockwise: bool = True
+    elevations_deg: FloatArray  # (L,) of each laser, by ring
+    azimuth_offsets_deg: FloatArray  # (L,) seen from above, counter-clockwise from the middle of the column
+    firing: FloatArray  # (L,) of the column's time slot when each laser fires, in [0, 1); the column turns on meanwhile
+    columns: int  # in a turn
+    start_azimuth_deg: float = 180.0  # where the turn starts, counter-clockwise from x
+    clockwise: bool = True  # the sense of rotation, seen from above
 
     def __post_init__(self) -> None:
         for name in ("azimuth_offsets_deg", "firing"):
@@ -101,18 +86,12 @@ class Rosette:
 
     The line of sight turns about z while it nods up and down; the two frequencies and the sweep rate have irrational
     ratios. The lasers nod with phases spread over a period.
-
-    Attributes:
-        elevation_range_deg: lowest and highest elevation.
-        lasers: rays fired at a time.
-        columns: shots a sweep.
-        turns_per_sweep, nods_per_sweep: of the line of sight.
     """
 
-    elevation_range_deg: tuple[float, float]
+    elevation_range_deg: tuple[float, float]  # lowest and highest
     lasers: int
     columns: int
-    turns_per_sweep: float
+    turns_per_sweep: float  # of the line of sight
     nods_per_sweep: float
 
     @property

@@ -5,9 +5,12 @@ accuracy where it is not; its growth with range is what the published figures fo
 start at the sensor's origin, as everybody's here, not on the real circle of 16 to 28 mm around it.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.choices import choose
 from lidarslam.simulation.sensors.scan_patterns import Rosette, Spinning
 from lidarslam.simulation.sensors.sensor import RangeModel, Sensor
 
@@ -33,14 +36,14 @@ _OS1_128_DEG = np.array([
 
 
 def _one_column(elevations_deg: FloatArray, columns: int, start_azimuth_deg: float, slot: float) -> Spinning:
-    """Lasers straight above one another, one pair after the other firing: the lower half's and the upper half's.
+    """Lasers straight above one another, firing in pairs of one from the lower half and one from the upper half.
 
     That is Velodyne's order: -15, 1, -13, 3, ... degrees for the VLP-16. `slot` is the part of a column's time that
     the firing takes, the rest is for recharging.
     """
     half = len(elevations_deg) // 2
     rank = np.concatenate([2 * np.arange(half), 2 * np.arange(half) + 1])
-    firing = np.asarray(slot * rank / len(elevations_deg), dtype=np.float64)
+    firing = np.asarray(slot * rank / (2 * half), dtype=np.float64)
     return Spinning(elevations_deg, np.zeros(2 * half), firing, columns, start_azimuth_deg)
 
 
@@ -48,28 +51,19 @@ def _velodyne_64(columns: int, elevation_offsets_deg: FloatArray | float = 0.0) 
     """HDL-64E S2: an upper block with a third and a lower one with half a degree between the lasers.
 
     The lasers stand side by side in groups, about 3.2 degrees apart, as the calibration files that come with the
-    devices show; both blocks fire at the same time.
-
-    Args:
-        columns: number of columns in a turn.
-        elevation_offsets_deg: (64,) calibrated minus nominal elevation of each laser, from the highest down.
+    devices show; both blocks fire at the same time. The offsets (64,) are the calibrated minus the nominal elevation
+    of each laser, from the highest down.
     """
-    upper = np.linspace(2.0, -8.33, 32)
-    lower = np.linspace(-8.83, -24.33, 32)
-    elevations = np.concatenate([upper, lower]) + elevation_offsets_deg
+    elevations = np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32)]) + elevation_offsets_deg
     side_by_side = np.array([7.9, 4.7, 1.5, -1.9, -5.1, -8.4, 9.1, 5.8, 2.6, -0.7, -3.9, -7.2])
     offsets = np.concatenate([side_by_side[(np.arange(32) + 8) % 12], side_by_side[np.arange(32) % 12]])
     firing = np.tile(np.linspace(0.0, 31.0 / 32.0, 32), 2)
     return Spinning(elevations[::-1], offsets[::-1], firing[::-1], columns)
 
 
-def _calibration_offsets_deg(lasers: int, sigma_deg: float, largest_deg: float, seed: int) -> FloatArray:
-    """Made-up offsets (lasers,) of a device's elevations from the nominal ones: normal, clipped, the same every time.
-
-    Calibration files of real HDL-64E have offsets of this size; these are not those of any device.
-    """
-    drawn = sigma_deg * np.random.default_rng(seed).standard_normal(lasers)
-    return np.asarray(np.clip(drawn, -largest_deg, largest_deg))
+def _calibration_offsets_deg() -> FloatArray:
+    """Made-up offsets (64,) of a device's elevations, of the size that calibration files of real HDL-64E have."""
+    return np.asarray(np.clip(0.06 * np.random.default_rng(64).standard_normal(64), -0.12, 0.12))
 
 
 def _ouster(altitudes_deg: FloatArray, azimuths_deg: list[float], columns: int) -> Spinning:
@@ -86,63 +80,41 @@ def _hesai_32(columns: int) -> Spinning:
 
 # Range limits: VLP-16 100 m, HDL-32E 80 to 100 m, HDL-64E 120 m, OS0 50 m and OS1 120 m at 80 % reflectivity,
 # XT32 120 m, Mid-360 70 m at 80 %. Velodyne's packets count 2 mm, Hesai's 4 mm, Ouster's and Livox's 1 mm.
+_VELODYNE_SMALL = RangeModel(0.4, 100.0, 0.010, 0.00020, 0.0030, 0.002)
+_VELODYNE_64 = RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002)
+_OS0 = RangeModel(0.3, 50.0, 0.010, 0.00050, 0.0061, 0.001)
+_OS1_64 = RangeModel(0.5, 120.0, 0.010, 0.00025, 0.0031, 0.001)
+_OS1_128 = RangeModel(0.3, 120.0, 0.008, 0.00025, 0.0031, 0.001)
+_XT32 = RangeModel(0.1, 120.0, 0.005, 0.00010, 0.0017, 0.004)
+_MID_360 = RangeModel(0.1, 70.0, 0.010, 0.00025, 0.0030, 0.001)
+
+# 55.296 us a column of 16 lasers 2.304 us apart (User Manual 63-9243), rounded to 0.2 degrees
+_VLP_16 = _one_column(np.arange(-15.0, 16.0, 2.0), 1800, 0.0, 16 * 2.304 / 55.296)
+# 46.08 us a column of 32 lasers 1.152 us apart
+_HDL_32 = _one_column(np.linspace(-30.67, 10.67, 32), 2170, 0.0, 32 * 1.152 / 46.08)
+# the first generation's design values: 33.2 degrees
+_OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024)
+# the first generation's design values: 33.2 degrees
+_OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024)
+# after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
+_ROSETTE = Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5)
+
 _TABLE = (
-    Sensor(  # 55.296 us a column of 16 lasers 2.304 us apart (User Manual 63-9243), rounded to 0.2 degrees
-        "vlp-16",
-        "velodyne",
-        10.0,
-        _one_column(np.arange(-15.0, 16.0, 2.0), 1800, 0.0, 16 * 2.304 / 55.296),
-        RangeModel(0.4, 100.0, 0.010, 0.00020, 0.0030, 0.002),
-    ),
-    Sensor(  # 46.08 us a column of 32 lasers 1.152 us apart
-        "hdl-32e",
-        "velodyne",
-        10.0,
-        _one_column(np.linspace(-30.67, 10.67, 32), 2170, 0.0, 32 * 1.152 / 46.08),
-        RangeModel(0.5, 100.0, 0.010, 0.00020, 0.0030, 0.002),
-    ),
-    Sensor(  # 48 us a column; KITTI's starts each turn at the rear
-        "hdl-64e",
-        "velodyne",
-        10.0,
-        _velodyne_64(2083),
-        RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002),
-    ),
-    Sensor(  # the same with uneven rings, as every real one has
-        "hdl-64e-calibrated",
-        "velodyne",
-        10.0,
-        _velodyne_64(2083, _calibration_offsets_deg(64, sigma_deg=0.06, largest_deg=0.12, seed=64)),
-        RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002),
-    ),
-    Sensor(
-        "os0-64",
-        "ouster",
-        10.0,
-        _ouster(_OS0_64_DEG, [9.2, -3.0], 1024),
-        RangeModel(0.3, 50.0, 0.010, 0.00050, 0.0061, 0.001),
-    ),
-    Sensor(  # the first generation's design values: 33.2 degrees
-        "os1-64",
-        "ouster",
-        10.0,
-        _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024),
-        RangeModel(0.5, 120.0, 0.010, 0.00025, 0.0031, 0.001),
-    ),
-    Sensor(
-        "os1-128",
-        "ouster",
-        10.0,
-        _ouster(_OS1_128_DEG, [4.21, 1.41, -1.40, -4.21], 1024),
-        RangeModel(0.3, 120.0, 0.008, 0.00025, 0.0031, 0.001),
-    ),
-    Sensor("xt32", "hesai", 10.0, _hesai_32(2000), RangeModel(0.1, 120.0, 0.005, 0.00010, 0.0017, 0.004)),
-    Sensor(  # after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
-        "livox",
-        "livox",
-        10.0,
-        Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5),
-        RangeModel(0.1, 70.0, 0.010, 0.00025, 0.0030, 0.001),
-    ),
+    Sensor("vlp-16", "velodyne", 10.0, _VLP_16, _VELODYNE_SMALL),
+    Sensor("hdl-32e", "velodyne", 10.0, _HDL_32, replace(_VELODYNE_SMALL, min_range_m=0.5)),
+    # 48 us a column; KITTI's starts each turn at the rear
+    Sensor("hdl-64e", "velodyne", 10.0, _velodyne_64(2083), _VELODYNE_64),
+    # the same with uneven rings, as every real one has
+    Sensor("hdl-64e-calibrated", "velodyne", 10.0, _velodyne_64(2083, _calibration_offsets_deg()), _VELODYNE_64),
+    Sensor("os0-64", "ouster", 10.0, _ouster(_OS0_64_DEG, [9.2, -3.0], 1024), _OS0),
+    Sensor("os1-64", "ouster", 10.0, _OS1_64_COLUMN, _OS1_64),
+    Sensor("os1-128", "ouster", 10.0, _ouster(_OS1_128_DEG, [4.21, 1.41, -1.40, -4.21], 1024), _OS1_128),
+    Sensor("xt32", "hesai", 10.0, _hesai_32(2000), _XT32),
+    Sensor("livox", "livox", 10.0, _ROSETTE, _MID_360),
 )
 SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in _TABLE}
+
+
+def find_sensor(name: str) -> Sensor:
+    """The sensor of that name."""
+    return choose("sensor", name, SENSORS)

@@ -1,4 +1,4 @@
-"""What stands outdoors: cars, people, poles, benches; each drawn in its own frame, the origin on the ground, z up."""
+"""Outdoor furniture: cars, people, poles, benches; each drawn in its own frame, the origin on the ground, z up."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,12 +12,12 @@ SUNK_M = 0.3
 
 
 def upright(ground: HeightField, xy: FloatArray, yaw: float) -> FloatArray:
-    """T_world_part (4, 4) of something that stands plumb at (2,), whatever the slope."""
+    """T_world_part (4, 4) of a part that stands plumb at (2,), whatever the slope."""
     return make_transform(rotation_z(yaw), np.append(xy, ground.height_at(np.asarray(xy)[None])))
 
 
 def on_slope(ground: HeightField, xy: FloatArray, yaw: float, length: float, width: float) -> FloatArray:
-    """T_world_part (4, 4) of something of that size that stands on the ground with all of its feet, such as a car."""
+    """T_world_part (4, 4) of a part of that size that stands on the ground with all of its feet, such as a car."""
     R = rotation_z(yaw)
     ahead, left = 0.5 * length * R[:2, 0], 0.5 * width * R[:2, 1]
     z = ground.height_at(xy + np.stack([ahead, -ahead, left, -left]))
@@ -44,33 +44,26 @@ def car(rng: np.random.Generator, round_wheels: bool = True) -> Builder:
     front, back = a - bonnet - slant, -a + boot + 0.3 * (not is_van)
     part.block((back, -b + 0.1, waist - 0.1), (front, b - 0.1, roof))
     for foot, head in ((front + slant, front - 0.03), (back - 0.28 * (not is_van) - 0.03, back + 0.02)):
-        start, end = np.array([foot, 0.0, waist - 0.06]), np.array([head, 0.0, roof - 0.05])
-        part.beam(start, end, width - 0.22, 0.08)
+        part.beam((foot, 0.0, waist - 0.06), (head, 0.0, roof - 0.05), width - 0.22, 0.08)
     for side in (-1.0, 1.0):
         part.box((front + 0.1, side * (b + 0.08), waist + 0.06), (0.12, 0.18, 0.14))
-    _wheels(part, a, b, round_wheels)
+    for x in (-0.62 * a, 0.64 * a):
+        for side in (-1.0, 1.0):
+            if round_wheels:
+                part.cylinder((x, side * (b - 0.2), 0.31), (x, side * (b + 0.01), 0.31), 0.33)
+            else:
+                part.box((x, side * (b - 0.1), 0.3), (0.56, 0.22, 0.68))
     return part
 
 
-def _wheels(part: Builder, a: float, b: float, are_round: bool) -> None:
-    for x in (-0.62 * a, 0.64 * a):
-        for side in (-1.0, 1.0):
-            if are_round:
-                inner, outer = np.array([x, side * (b - 0.2), 0.31]), np.array([x, side * (b + 0.01), 0.31])
-                part.cylinder(inner, outer, 0.33)
-            else:
-                part.box((x, side * (b - 0.1), 0.3), (0.56, 0.22, 0.68))
-
-
 def pedestrian(rng: np.random.Generator) -> Builder:
-    """Somebody walking towards x, in a few boxes."""
+    """A pedestrian walking towards x, in a few boxes."""
     part = Builder()
     tall = rng.uniform(0.88, 1.06)
     for side in (-1.0, 1.0):
         stride = side * rng.uniform(0.08, 0.16)
-        part.beam(np.array([2.2 * stride, side * 0.09, -0.05]), np.array([0.0, side * 0.09, 0.88 * tall]), 0.14, 0.16)
-        hand = np.array([-1.8 * stride, side * 0.27, 0.8 * tall])
-        part.beam(hand, np.array([0.0, side * 0.25, 1.42 * tall]), 0.09, 0.1)
+        part.beam((2.2 * stride, side * 0.09, -0.05), (0.0, side * 0.09, 0.88 * tall), 0.14, 0.16)
+        part.beam((-1.8 * stride, side * 0.27, 0.8 * tall), (0.0, side * 0.25, 1.42 * tall), 0.09, 0.1)
     part.block((-0.12, -0.21, 0.82 * tall), (0.13, 0.21, 1.46 * tall))
     part.block((-0.09, -0.08, 1.46 * tall), (0.11, 0.08, 1.75 * tall))
     return part
@@ -79,11 +72,11 @@ def pedestrian(rng: np.random.Generator) -> Builder:
 def lamp_post(height: float, reach: float) -> Builder:
     """A tapering lamp post with its arm along x; with no reach, a lantern on top."""
     part = Builder()
-    part.pole(np.zeros(2), (-SUNK_M, 1.1), 0.1)
-    part.pole(np.zeros(2), (1.1, height), 0.065)
+    part.pole((0.0, 0.0), (-SUNK_M, 1.1), 0.1)
+    part.pole((0.0, 0.0), (1.1, height), 0.065)
     if reach > 0.0:
-        tip = np.array([reach, 0.0, height + 0.25])
-        part.cylinder(np.array([0.0, 0.0, height - 0.05]), tip, 0.045)
+        tip = (reach, 0.0, height + 0.25)
+        part.cylinder((0.0, 0.0, height - 0.05), tip, 0.045)
         part.box(tip, (0.7, 0.28, 0.13))
     else:
         part.block((-0.22, -0.22, height - 0.05), (0.22, 0.22, height + 0.35))
@@ -95,7 +88,7 @@ def sign(rng: np.random.Generator) -> Builder:
     """A traffic sign, its plate facing x."""
     part = Builder()
     size, top = rng.uniform(0.5, 0.8), rng.uniform(2.2, 2.8)
-    part.pole(np.zeros(2), (-SUNK_M, top + 0.05), 0.035)
+    part.pole((0.0, 0.0), (-SUNK_M, top + 0.05), 0.035)
     turn = Rotation.from_euler("x", rng.choice([0.0, 0.25 * np.pi])).as_matrix()
     part.box((0.05, 0.0, top - 0.5 * size), (0.025, size, size), R=turn)
     if rng.random() < 0.4:
@@ -130,9 +123,8 @@ def bin_row(rng: np.random.Generator, count: int) -> Builder:
 def litter_bin() -> Builder:
     """A round litter bin."""
     part = Builder()
-    part.pole(np.zeros(2), (-SUNK_M, 0.85), 0.24)
-    part.pole(np.zeros(2), (0.95, 1.0), 0.26)
-    part.pole(np.zeros(2), (0.8, 1.0), 0.03)
+    for z, radius in (((-SUNK_M, 0.85), 0.24), ((0.95, 1.0), 0.26), ((0.8, 1.0), 0.03)):
+        part.pole((0.0, 0.0), z, radius)
     return part
 
 
@@ -145,7 +137,7 @@ def bus_shelter(rng: np.random.Generator) -> Builder:
     part.block((-0.7, half - 0.05, 0.15), (0.35, half, 2.35))
     part.block((-0.6, -0.6 * half, 0.42), (-0.25, 0.6 * half, 0.48))
     for x, y in ((-0.7, -half + 0.05), (-0.7, half - 0.05), (0.6, -half + 0.05), (0.6, half - 0.05), (-0.5, 0.0)):
-        part.pole(np.array([x, y]), (-SUNK_M, 2.4 if y else 0.44), 0.04)
+        part.pole((x, y), (-SUNK_M, 2.4 if y else 0.44), 0.04)
     return part
 
 
@@ -157,8 +149,8 @@ def log_pile(rng: np.random.Generator, rows: int) -> Builder:
         for k in range(rows - level):
             y, z = (2.0 * k - (rows - level - 1)) * radius, radius * (0.7 + 1.74 * level)
             shift, r = rng.normal(0.0, 0.08), radius * rng.uniform(0.85, 1.0)
-            part.cylinder(np.array([shift - half, y, z]), np.array([shift + half, y, z]), r)
+            part.cylinder((shift - half, y, z), (shift + half, y, z), r)
     for x in (-0.6 * half, 0.6 * half):
         for side in (-1.0, 1.0):
-            part.pole(np.array([x, side * (rows * radius + 0.06)]), (-SUNK_M, 1.3), 0.05)
+            part.pole((x, side * (rows * radius + 0.06)), (-SUNK_M, 1.3), 0.05)
     return part

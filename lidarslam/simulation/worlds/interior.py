@@ -1,57 +1,29 @@
-"""Furniture, each piece drawn in its own frame: x along the wall it stands at, y away from it, z up from the floor."""
+"""Furniture: each piece fills a width, depth and height in a spot's frame, x along its width, z up from the floor.
 
-from dataclasses import dataclass
+Pieces for walls have their back at y = 0 and reach to y = depth; the others have their middle at the spot.
+"""
+
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import Builder, rotation_z
+from lidarslam.simulation.worlds.building import HAIR_M, Limits, Spot, rotation_z
 
-# Things hover or touch at a millimetre, so that no two faces lie in one plane.
-HAIR_M = 0.002
+Size = tuple[float, float, float]  # width, depth, height
+Piece = Callable[[Spot, Size, np.random.Generator], None]
 
-
-@dataclass(frozen=True)
-class Spot:
-    """A place to draw at: a frame on the floor, turned about the vertical.
-
-    Attributes:
-        builder: what is drawn into.
-        origin: (3,) in the world.
-        yaw: of the spot's x axis in the world.
-    """
-
-    builder: Builder
-    origin: FloatArray
-    yaw: float
-
-    def point(self, x: float, y: float, z: float) -> FloatArray:
-        """A point (3,) of the spot, in the world."""
-        return np.asarray(self.origin + rotation_z(self.yaw) @ np.array([x, y, z]))
-
-    def shifted(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> "Spot":
-        """A spot within this one."""
-        return Spot(self.builder, self.point(x, y, z), self.yaw + yaw)
-
-    def box(self, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> None:
-        """A box between the given limits on the spot's axes."""
-        centre = self.point(0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]), 0.5 * (z[0] + z[1]))
-        self.builder.box(centre, (x[1] - x[0], y[1] - y[0], z[1] - z[0]), yaw=self.yaw)
-
-    def rod(self, start: tuple[float, float, float], end: tuple[float, float, float], radius: float) -> None:
-        """A cylinder between two points of the spot."""
-        self.builder.cylinder(self.point(*start), self.point(*end), radius)
+# --- at walls
 
 
-def desk(spot: Spot, width: float, depth: float, rng: np.random.Generator) -> None:
+def desk(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A desk with legs, a drawer unit, and a screen or two."""
-    top, half = rng.uniform(0.70, 0.76), 0.5 * width
+    top, half, depth = rng.uniform(0.70, 0.76), 0.5 * size[0], size[1]
     spot.box((-half, half), (0.0, depth), (top, top + 0.035))
     for x in (-half + 0.04, half - 0.04):
         spot.box((x - 0.025, x + 0.025), (0.06, depth - 0.06), (0.0, top))
     side = rng.choice([-1.0, 1.0])
-    spot.box(tuple(sorted((side * (half - 0.5), side * (half - 0.08)))), (0.08, depth - 0.1), (0.0, 0.58))
+    spot.box((side * (half - 0.5), side * (half - 0.08)), (0.08, depth - 0.1), (0.0, 0.58))
     for k in range(int(rng.integers(1, 3))):
         x = (k - 0.5) * 0.58 + rng.uniform(-0.05, 0.05)
         spot.box((x - 0.27, x + 0.27), (0.16, 0.19), (top + 0.14, top + 0.48))
@@ -60,24 +32,21 @@ def desk(spot: Spot, width: float, depth: float, rng: np.random.Generator) -> No
     spot.box((-0.22, 0.22), (0.42, 0.56), (top + 0.035, top + 0.06))
 
 
-def chair(spot: Spot, rng: np.random.Generator) -> None:
-    """A chair on five castors or four legs, its back towards +y of the spot."""
-    seat = rng.uniform(0.43, 0.5)
-    spot.box((-0.23, 0.23), (-0.23, 0.23), (seat, seat + 0.06))
-    spot.box((-0.21, 0.21), (0.2, 0.26), (seat + 0.12, seat + 0.52))
-    spot.box((-0.03, 0.03), (0.2, 0.24), (seat - 0.02, seat + 0.3))
-    if rng.random() < 0.6:
-        spot.rod((0.0, 0.0, 0.08), (0.0, 0.0, seat), 0.03)
-        for angle in np.arange(5) * 0.4 * np.pi:
-            spot.rod((0.0, 0.0, 0.09), (0.29 * np.cos(angle), 0.29 * np.sin(angle), 0.04), 0.022)
-    else:
-        for x, y in ((-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2), (0.2, 0.2)):
-            spot.rod((x, y, 0.0), (x, y, seat), 0.017)
+def workplace(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A desk and a chair before it."""
+    depth = size[1] - 0.75
+    desk(spot, (size[0], depth, size[2]), rng)
+    chair(spot.shifted(rng.uniform(-0.2, 0.2), depth + 0.35, yaw=rng.uniform(-0.25, 0.25)), rng)
 
 
-def shelf(spot: Spot, width: float, depth: float, height: float, rng: np.random.Generator) -> None:
+def spare_chair(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+    """A chair with its back to the wall."""
+    chair(spot.shifted(0.0, 0.3, yaw=np.pi), rng)
+
+
+def shelf(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """An open shelf with a back, boards, and rows of books and boxes."""
-    half = 0.5 * width
+    half, depth, height = 0.5 * size[0], size[1], size[2]
     spot.box((-half, half), (0.0, 0.02), (0.0, height))
     for x in (-half, half - 0.03):
         spot.box((x, x + 0.03), (0.02, depth), (0.0, height))
@@ -88,113 +57,164 @@ def shelf(spot: Spot, width: float, depth: float, height: float, rng: np.random.
     spot.box((-half + 0.03, half - 0.03), (0.02, depth - 0.01), (boards[-1], boards[-1] + 0.025))
 
 
-def _goods(spot: Spot, x: tuple[float, float], depth: float, z: tuple[float, float], rng: np.random.Generator) -> None:
+def _goods(spot: Spot, x: Limits, depth: float, z: Limits, rng: np.random.Generator) -> None:
     """Blocks of books or boxes in a row, with gaps."""
     at = x[0]
     while at < x[1] - 0.15:
         length = min(rng.uniform(0.15, 0.5), x[1] - at)
         if rng.random() < 0.75:
-            spot.box(
-                (at, at + length),
-                (0.03, depth * rng.uniform(0.55, 0.95)),
-                (z[0], z[0] + (z[1] - z[0]) * rng.uniform(0.5, 0.95)),
-            )
+            y = (0.03, depth * rng.uniform(0.55, 0.95))
+            spot.box((at, at + length), y, (z[0], z[0] + (z[1] - z[0]) * rng.uniform(0.5, 0.95)))
         at += length + rng.choice([0.01, 0.12])
 
 
-def cabinet(spot: Spot, width: float, depth: float, height: float, rng: np.random.Generator) -> None:
-    """A closed cabinet on a plinth, with doors or drawers standing a little proud, and handles."""
-    half = 0.5 * width
+def cabinet(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A closed cabinet on a plinth, with doors or drawers standing a little proud."""
+    (width, depth, height), half = size, 0.5 * size[0]
     spot.box((-half + 0.02, half - 0.02), (0.0, depth - 0.05), (0.0, 0.08))
     spot.box((-half, half), (0.0, depth - 0.02), (0.08, height))
     columns = max(1, round(width / 0.45))
     rows = 1 if rng.random() < 0.5 else max(2, round(height / 0.4))
-    xs, zs = np.linspace(-half, half, columns + 1), np.linspace(0.08, height, rows + 1)
-    for x0, x1 in pairwise(xs):
-        for z0, z1 in pairwise(zs):
+    for x0, x1 in pairwise(np.linspace(-half, half, columns + 1)):
+        for z0, z1 in pairwise(np.linspace(0.08, height, rows + 1)):
             spot.box((x0 + 0.01, x1 - 0.01), (depth - 0.02, depth), (z0 + 0.01, z1 - 0.01))
 
 
-def table(spot: Spot, width: float, depth: float, rng: np.random.Generator) -> None:
-    """A long table on two trestles, its middle at the spot."""
-    a, b = 0.5 * width, 0.5 * depth
-    spot.box((-a, a), (-b, b), (0.72, 0.76))
-    for x in (-a + 0.3, a - 0.3):
-        spot.box((x - 0.04, x + 0.04), (-b + 0.15, b - 0.15), (0.0, 0.72))
-    for _ in range(int(rng.integers(0, 4))):
-        x, y = rng.uniform(-a + 0.2, a - 0.2), rng.uniform(-b + 0.2, b - 0.2)
-        spot.shifted(x, y, 0.76, rng.uniform(0.0, 3.0)).box(
-            (-0.15, 0.15), (-0.11, 0.11), (0.0, rng.uniform(0.02, 0.25))
-        )
+def counter(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A kitchen counter 0.6 m deep with cupboards over it, a sink's tap and a machine on it."""
+    width, half = size[0], 0.5 * size[0]
+    cabinet(spot, (width, 0.58, 0.86), rng)
+    spot.box((-half, half), (0.0, 0.62), (0.86, 0.9))
+    cabinet(spot.shifted(0.0, 0.0, 1.4), (width, 0.34, 0.7), rng)
+    spot.pillar(-0.3 * width, 0.12, (0.9, 1.18), 0.015)
+    spot.rod((-0.3 * width, 0.12, 1.17), (-0.3 * width, 0.3, 1.15), 0.012)
+    x = rng.uniform(0.0, 0.25 * width)
+    spot.box((x, x + 0.3), (0.1, 0.45), (0.9, rng.uniform(1.15, 1.3)))
 
 
-def round_table(spot: Spot, radius: float) -> None:
-    """A round table on one foot, its middle at the spot."""
-    spot.rod((0.0, 0.0, 0.72), (0.0, 0.0, 0.75), radius)
-    spot.rod((0.0, 0.0, 0.02), (0.0, 0.0, 0.72), 0.045)
-    spot.rod((0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 0.55 * radius)
-
-
-def sofa(spot: Spot, width: float, rng: np.random.Generator) -> None:
-    """A sofa with its back to the wall, 0.85 m deep."""
-    half, seat = 0.5 * width, rng.uniform(0.38, 0.44)
+def sofa(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A sofa, 0.85 m deep."""
+    half, seat = 0.5 * size[0], rng.uniform(0.38, 0.44)
     spot.box((-half, half), (0.04, 0.85), (0.06, seat - 0.1))
     spot.box((-half, half), (0.0, 0.22), (0.06, seat + 0.4))
     for x in (-half, half - 0.16):
         spot.box((x, x + 0.16), (0.1, 0.83), (0.06, seat + 0.18))
-    cushions = max(1, round((width - 0.32) / 0.65))
-    edges = np.linspace(-half + 0.16, half - 0.16, cushions + 1)
-    for x0, x1 in pairwise(edges):
+    cushions = max(1, round((size[0] - 0.32) / 0.65))
+    for x0, x1 in pairwise(np.linspace(-half + 0.16, half - 0.16, cushions + 1)):
         spot.box((x0 + 0.01, x1 - 0.01), (0.2, 0.84), (seat - 0.1, seat))
 
 
-def plant(spot: Spot, height: float, rng: np.random.Generator) -> None:
+def plant(spot: Spot, size: Size, rng: np.random.Generator) -> None:
     """A pot with leaves standing out to all sides, about 0.35 m around its middle."""
-    pot = rng.uniform(0.28, 0.42)
-    spot.rod((0.0, 0.0, 0.0), (0.0, 0.0, pot), rng.uniform(0.14, 0.19))
-    spot.rod((0.0, 0.0, pot), (0.0, 0.0, 0.75 * height), 0.02)
+    spot = spot.shifted(0.0, 0.5 * size[1] - 0.005)
+    pot, height = rng.uniform(0.28, 0.42), size[2]
+    spot.pillar(0.0, 0.0, (0.0, pot), rng.uniform(0.14, 0.19))
+    spot.pillar(0.0, 0.0, (pot, 0.75 * height), 0.02)
+    turn = rotation_z(spot.yaw)
     for _ in range(int(rng.integers(9, 15))):
         angle, rise = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 1.2)
         direction = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         side = np.array([-np.sin(angle), np.cos(angle), 0.0])
-        R = rotation_z(spot.yaw) @ np.stack([direction, side, np.cross(direction, side)], axis=1)
+        R = turn @ np.stack([direction, side, np.cross(direction, side)], axis=1)
         length = rng.uniform(0.22, 0.34)
         root = np.array([0.0, 0.0, rng.uniform(pot, 0.78 * height)])
-        centre = spot.origin + rotation_z(spot.yaw) @ (root + 0.5 * length * direction)
+        centre = spot.origin + turn @ (root + 0.5 * length * direction)
         spot.builder.box(centre, (length, rng.uniform(0.06, 0.14), 0.012), R=R)
 
 
-def board(spot: Spot, width: float, low: float, high: float) -> None:
-    """A board with a frame on the wall: white board, notice board, picture."""
-    half = 0.5 * width
+def board(spot: Spot, size: Size, rng: np.random.Generator, low: float = 0.1) -> None:  # noqa: ARG001
+    """A white board, notice board or picture with a frame, 0.2 m less high than its space."""
+    half, high = 0.5 * size[0], low + size[2] - 0.2
     spot.box((-half, half), (0.0, 0.02), (low, high))
     for z in (low, high - 0.03):
         spot.box((-half, half), (0.02, 0.035), (z, z + 0.03))
+
+
+def pilaster(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+    """A pillar that stands out of the wall."""
+    spot.box((-0.5 * size[0], 0.5 * size[0]), (-HAIR_M, size[1]), (0.0, size[2]))
+
+
+def extinguisher(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+    """A fire extinguisher on its bracket."""
+    spot.pillar(0.0, 0.1, (0.05, 0.6), 0.075)
+    spot.box((-0.04, 0.04), (0.0, 0.1), (0.3, 0.36))
 
 
 def radiator(spot: Spot, width: float) -> None:
     """A ribbed radiator a hand's breadth above the floor, 0.12 m deep."""
     for x in np.arange(-0.5 * width, 0.5 * width - 0.05, 0.12):
         spot.box((x, x + 0.09), (0.04, 0.12), (0.12, 0.68))
-    spot.rod((-0.5 * width, 0.07, 0.17), (0.5 * width, 0.07, 0.17), 0.02)
-    spot.rod((-0.5 * width, 0.07, 0.62), (0.5 * width, 0.07, 0.62), 0.02)
+    for z in (0.17, 0.62):
+        spot.rod((-0.5 * width, 0.07, z), (0.5 * width, 0.07, z), 0.02)
 
 
-def partition(spot: Spot, width: float, height: float) -> None:
-    """A free-standing screen with feet, its middle line on the spot's x axis."""
-    half = 0.5 * width
-    spot.box((-half, half), (-0.025, 0.025), (0.04, height))
-    for x in (-half + 0.15, half - 0.15):
-        spot.box((x - 0.03, x + 0.03), (-0.2, 0.2), (0.0, 0.04))
+# --- on floors
 
 
-def counter(spot: Spot, width: float, rng: np.random.Generator) -> None:
-    """A kitchen counter 0.6 m deep with cupboards over it, a sink's tap and a machine on it."""
-    half = 0.5 * width
-    cabinet(spot, width, 0.58, 0.86, rng)
-    spot.box((-half, half), (0.0, 0.62), (0.86, 0.9))
-    cabinet(spot.shifted(0.0, 0.0, 1.4), width, 0.34, 0.7, rng)
-    spot.rod((-0.3 * width, 0.12, 0.9), (-0.3 * width, 0.12, 1.18), 0.015)
-    spot.rod((-0.3 * width, 0.12, 1.17), (-0.3 * width, 0.3, 1.15), 0.012)
-    x = rng.uniform(0.0, 0.25 * width)
-    spot.box((x, x + 0.3), (0.1, 0.45), (0.9, rng.uniform(1.15, 1.3)))
+def chair(spot: Spot, rng: np.random.Generator) -> None:
+    """A chair on five castors or four legs, its back towards +y of the spot."""
+    seat = rng.uniform(0.43, 0.5)
+    spot.box((-0.23, 0.23), (-0.23, 0.23), (seat, seat + 0.06))
+    spot.box((-0.21, 0.21), (0.2, 0.26), (seat + 0.12, seat + 0.52))
+    spot.box((-0.03, 0.03), (0.2, 0.24), (seat - 0.02, seat + 0.3))
+    if rng.random() < 0.6:
+        spot.pillar(0.0, 0.0, (0.08, seat), 0.03)
+        for angle in np.arange(5) * 0.4 * np.pi:
+            spot.rod((0.0, 0.0, 0.09), (0.29 * np.cos(angle), 0.29 * np.sin(angle), 0.04), 0.022)
+    else:
+        for x, y in ((-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2), (0.2, 0.2)):
+            spot.pillar(x, y, (0.0, seat), 0.017)
+
+
+def table(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A long table on two trestles, with a few things on it."""
+    a, b = 0.5 * size[0], 0.5 * size[1]
+    spot.box((-a, a), (-b, b), (0.72, 0.76))
+    for x in (-a + 0.3, a - 0.3):
+        spot.box((x - 0.04, x + 0.04), (-b + 0.15, b - 0.15), (0.0, 0.72))
+    for _ in range(int(rng.integers(0, 4))):
+        x, y = rng.uniform(-a + 0.2, a - 0.2), rng.uniform(-b + 0.2, b - 0.2)
+        thing = spot.shifted(x, y, 0.76, rng.uniform(0.0, 3.0))
+        thing.box((-0.15, 0.15), (-0.11, 0.11), (0.0, rng.uniform(0.02, 0.25)))
+
+
+def conference(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A long table with chairs along both sides."""
+    width, depth = size[0], size[1] - 1.1
+    table(spot, (width, depth, size[2]), rng)
+    for x in np.arange(-0.5 * width + 0.35, 0.5 * width - 0.2, 0.68):
+        for side in (0.0, np.pi):
+            if rng.random() < 0.85:
+                turned = spot.shifted(0.0, 0.0, yaw=side)
+                chair(turned.shifted(x, 0.5 * depth + 0.22, yaw=rng.uniform(-0.2, 0.2)), rng)
+
+
+def round_table(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+    """A round table on one foot, with a margin of 5 cm."""
+    radius = 0.5 * size[0] - 0.05
+    spot.pillar(0.0, 0.0, (0.72, 0.75), radius)
+    spot.pillar(0.0, 0.0, (0.02, 0.72), 0.045)
+    spot.pillar(0.0, 0.0, (0.0, 0.02), 0.55 * radius)
+
+
+def round_table_with_chairs(spot: Spot, size: Size, rng: np.random.Generator) -> None:
+    """A round table and three chairs."""
+    radius = 0.5 * size[0] - 0.45
+    round_table(spot, (2.0 * radius + 0.1, 2.0 * radius + 0.1, size[2]), rng)
+    for angle in np.arange(3) * 2.1 + rng.uniform(0.0, 2.0):
+        chair(spot.shifted(0.0, 0.0, yaw=angle).shifted(0.0, radius + 0.12), rng)
+
+
+def screened_workplace(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+    """A workplace behind a free-standing screen with feet."""
+    screen, height = spot.shifted(0.0, -0.77), rng.uniform(1.2, 1.5)
+    screen.box((-0.75, 0.75), (-0.025, 0.025), (0.04, height))
+    for x in (-0.6, 0.6):
+        screen.box((x - 0.03, x + 0.03), (-0.2, 0.2), (0.0, 0.04))
+    workplace(spot.shifted(0.0, -0.72), (1.4, 1.5, 1.3), rng)
+
+
+def crate(spot: Spot, size: Size, rng: np.random.Generator) -> None:  # noqa: ARG001
+    """A closed box."""
+    spot.box((-0.5 * size[0], 0.5 * size[0]), (-0.5 * size[1], 0.5 * size[1]), (0.0, size[2]))

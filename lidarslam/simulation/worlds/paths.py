@@ -1,4 +1,4 @@
-"""Closed lines on the plane: ways through a world, and how far things are from them."""
+"""Closed lines on the plane: ways through a world, and distances from them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +7,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route
-from lidarslam.simulation.worlds.building import Builder
-from lidarslam.simulation.worlds.clearance import sample_route
+from lidarslam.simulation.worlds.building import Builder, heading, left_of
 
 
 def loop_length(loop: FloatArray) -> float:
@@ -16,20 +15,37 @@ def loop_length(loop: FloatArray) -> float:
     return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
 
 
+def lengths_along(line: FloatArray) -> FloatArray:
+    """(M,) distance from the first point along the open polyline (M, D)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def points_along(line: FloatArray, lengths: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Points (N, D) at wanted lengths (N,) of the polyline (M, D), whose vertices are at lengths (M,)."""
+    return np.stack([np.interp(wanted, lengths, column) for column in line.T], axis=1)
+
+
 def resample_loop(loop: FloatArray, spacing_m: float) -> FloatArray:
     """Points (N, D) at equal distances, about `spacing_m`, along the closed polyline (M, D)."""
     closed = np.concatenate([loop, loop[:1]])
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    at = lengths_along(closed)
     count = max(3, round(at[-1] / spacing_m))
-    wanted = np.arange(count) * (at[-1] / count)
-    return np.stack([np.interp(wanted, at, column) for column in closed.T], axis=1)
+    return points_along(closed, at, np.arange(count) * (at[-1] / count))
+
+
+def subdivide_loop(loop: FloatArray, spacing_m: float) -> FloatArray:
+    """The closed polyline (M, D) with points (N, D) added, so that none is farther than `spacing_m` from the next."""
+    following = np.roll(loop, -1, axis=0)
+    counts = np.maximum(1, np.ceil(np.linalg.norm(following - loop, axis=1) / spacing_m).astype(int))
+    legs = zip(loop, following, counts, strict=True)
+    return np.concatenate([a + (b - a) * (np.arange(count) / count)[:, None] for a, b, count in legs])
 
 
 def offset_loop(corners: FloatArray, right_m: float) -> FloatArray:
     """The closed polyline (M, 2) moved to the right of its direction; corners must not be hairpins."""
     along = np.roll(corners, -1, axis=0) - corners
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    after = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    after = -left_of(along)
     before = np.roll(after, 1, axis=0)
     mitre = (before + after) / (1.0 + (before * after).sum(axis=1, keepdims=True))
     return np.asarray(corners + right_m * mitre)
@@ -50,28 +66,19 @@ def round_corners(corners: FloatArray, radii: FloatArray, step_m: float) -> Floa
         out = (after - corner) / np.linalg.norm(after - corner)
         turn = np.arctan2(into[0] * out[1] - into[1] * out[0], into @ out)
         start = corner - radius * np.tan(0.5 * abs(turn)) * into
-        left = np.array([-into[1], into[0]])
         angles = abs(turn) * np.linspace(0.0, 1.0, 1 + max(1, int(np.ceil(radius * abs(turn) / step_m))))
         sideways = np.sign(turn) * (1.0 - np.cos(angles))
-        pieces.append(start + radius * (np.sin(angles)[:, None] * into + sideways[:, None] * left))
+        pieces.append(start + radius * (np.sin(angles)[:, None] * into + sideways[:, None] * left_of(into)))
     return np.concatenate(pieces)
-
-
-def subdivide_loop(loop: FloatArray, spacing_m: float) -> FloatArray:
-    """The closed polyline (M, D) with points (N, D) added, so that none is farther than `spacing_m` from the next."""
-    following = np.roll(loop, -1, axis=0)
-    counts = np.maximum(1, np.ceil(np.linalg.norm(following - loop, axis=1) / spacing_m).astype(int))
-    legs = zip(loop, following, counts, strict=True)
-    return np.concatenate([a + (b - a) * (np.arange(count) / count)[:, None] for a, b, count in legs])
 
 
 def winding_loop(
     rng: np.random.Generator, length_m: float, harmonics: int, wobble: float, min_radius_m: float
 ) -> FloatArray:
-    """A smooth closed line (N, 2) around the origin, counter-clockwise, points half a metre apart.
+    """A smooth closed line (N, 2) around the origin, in either sense, points half a metre apart.
 
-    The distance from the origin sways with `harmonics` waves per turn at most; lines with bends tighter than
-    `min_radius_m` are drawn again, with ever smaller sway.
+    Its distance from the origin sways with `harmonics` waves a turn at most; lines with bends tighter than
+    `min_radius_m` are drawn again, with less and less sway.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 181)[:-1]
     wave = np.arange(2, harmonics + 1)
@@ -86,14 +93,14 @@ def winding_loop(
         curvature = np.abs(speed[:, 0] * bend[:, 1] - speed[:, 1] * bend[:, 0]) / np.linalg.norm(speed, axis=1) ** 3
         if curvature.max() * min_radius_m <= 1.0 and radius.min() > 0.3:
             fine = spline(np.linspace(0.0, 2.0 * np.pi, 4001)[:-1])
-            return resample_loop(fine, 0.5)
+            return resample_loop(fine, 0.5)[:: rng.choice([-1, 1])]
         wobble *= 0.97
 
 
 def distance_to_loop(xy: FloatArray, loop: FloatArray, farthest_m: float = np.inf) -> FloatArray:
-    """Distance (N,) of points (N, 2) from the closed polyline (M, 2), good to 0.1 m from a decimetre on.
+    """Distance (...) of points (..., 2) from the closed polyline (M, 2), to 0.1 m from a decimetre on.
 
-    What is farther than `farthest_m` counts as that far, and is soon done.
+    Distances beyond `farthest_m` are given as `farthest_m`, without a search.
     """
     distance, _ = cKDTree(resample_loop(loop, 0.2)).query(xy, distance_upper_bound=farthest_m)
     return np.minimum(distance, farthest_m)
@@ -101,9 +108,14 @@ def distance_to_loop(xy: FloatArray, loop: FloatArray, farthest_m: float = np.in
 
 def beside_loop(loop: FloatArray, index: int, left_m: float) -> tuple[FloatArray, float]:
     """A place (2,) to the left of a point of the closed polyline (M, 2), and the polyline's heading there."""
-    ahead = loop[(index + 1) % len(loop)] - loop[index - 1]
-    yaw = float(np.arctan2(ahead[1], ahead[0]))
+    yaw = heading(loop[(index + 1) % len(loop)] - loop[index - 1])
     return loop[index] + left_m * np.array([-np.sin(yaw), np.cos(yaw)]), yaw
+
+
+def grid_nodes(low: FloatArray, high: FloatArray, cell_m: float) -> FloatArray:
+    """Nodes (X, Y, 2) of a regular grid from the corner low to the corner high (2,) or a little beyond."""
+    counts = np.ceil((high - low) / cell_m).astype(int) + 1
+    return np.asarray(low + cell_m * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1))
 
 
 def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:
@@ -112,11 +124,11 @@ def on_ground(xy: FloatArray, ground: HeightField) -> FloatArray:
 
 
 def prune(part: Builder, route: Route, margin_m: float = 0.1) -> Builder:
-    """Cut leaves and branches out of the route's free space: those that come near it at all go entirely.
+    """The part without the leaves and branches that reach into the route's free space.
 
     A box counts as large as the upright round block around it, so this is for small things.
     """
-    boxes, cylinders = part.boxes, part.cylinders
+    boxes, cylinders = part.solids
     reach = (np.abs(boxes.R_world_box) @ boxes.half_sizes[:, :, None])[:, :, 0]
     floor = _highest_within(boxes.centres[:, :2], np.hypot(reach[:, 0], reach[:, 1]) + margin_m, route)
     keep_boxes = boxes.centres[:, 2] - reach[:, 2] > floor + route.free_height_m + margin_m
@@ -132,6 +144,6 @@ def prune(part: Builder, route: Route, margin_m: float = 0.1) -> Builder:
 
 def _highest_within(xy: FloatArray, margins_m: FloatArray, route: Route) -> FloatArray:
     """z (N,) of the highest point of the route whose free side comes within the margins (N,) of (N, 2), or -inf."""
-    path = sample_route(route, 0.2)
+    path = subdivide_loop(route.waypoints, 0.2)
     near = cKDTree(path[:, :2]).query_ball_point(xy, route.free_side_m + margins_m)
     return np.array([path[indices, 2].max(initial=-np.inf) for indices in near])

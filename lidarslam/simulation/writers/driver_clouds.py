@@ -4,58 +4,38 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from lidarslam.core.errors import InputError
+from lidarslam.simulation.choices import choose
 from lidarslam.simulation.recording.recorder import SimulatedScan
 
 Records = NDArray[np.void]
+_FIRST_RETURN = 0x10
 
 
 @dataclass(frozen=True)
 class DriverCloud:
-    """How a driver publishes.
+    """A driver's topic and point layout."""
 
-    Attributes:
-        topic, frame_id: the driver's defaults.
-        record: the type of a point, padding included.
-        fill: writes what only this driver has, given the records, the sweep and its stamp in nanoseconds.
-        custom_message: whether the message is Livox's own rather than PointCloud2.
-    """
-
-    topic: str
+    topic: str  # the driver's defaults
     frame_id: str
-    record: np.dtype[np.void]
-    fill: Callable[[Records, SimulatedScan, int], None]
-    custom_message: bool = False
+    record: np.dtype[np.void]  # type of a point, padding included
+    columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # beside x, y, z, by the sweep and its stamp_ns
+    custom_message: bool = False  # Livox's own rather than PointCloud2
 
     def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
         """The points (N,) of a sweep whose message is stamped `stamp_ns`."""
         records = np.zeros(len(simulated.scan), self.record)
         for column, axis in enumerate("xyz"):
             records[axis] = simulated.scan.points[:, column]
-        self.fill(records, simulated, stamp_ns)
+        for name, values in self.columns(simulated, stamp_ns).items():
+            records[name] = values
         return records
 
 
 def find_driver(name: str) -> DriverCloud:
-    """The layout of a driver.
-
-    Raises:
-        InputError: there is no such driver.
-    """
-    if name not in DRIVERS:
-        raise InputError(f"no driver is called {name!r}; there are: {', '.join(DRIVERS)}")
-    return DRIVERS[name]
-
-
-def _record(size: int, **fields: tuple[str, int]) -> np.dtype[np.void]:
-    """A record of `size` bytes from `name=(type, offset)`."""
-    types, offsets = zip(*fields.values(), strict=True)
-    return np.dtype({"names": list(fields), "formats": list(types), "offsets": list(offsets), "itemsize": size})
-
-
-_XYZ = {"x": ("<f4", 0), "y": ("<f4", 4), "z": ("<f4", 8)}
+    """The layout of a driver."""
+    return choose("driver", name, DRIVERS)
 
 
 def _offsets(simulated: SimulatedScan) -> NDArray[np.float64]:
@@ -63,91 +43,59 @@ def _offsets(simulated: SimulatedScan) -> NDArray[np.float64]:
     return np.zeros(len(simulated.scan)) if offsets is None else offsets
 
 
-def _offsets_ns(simulated: SimulatedScan) -> NDArray[np.float64]:
-    return np.round(1e9 * _offsets(simulated))
-
-
-def _rings(simulated: SimulatedScan) -> NDArray[np.int32]:
-    rings = simulated.scan.rings
-    return np.zeros(len(simulated.scan), dtype=np.int32) if rings is None else rings
+def _rings(simulated: SimulatedScan) -> ArrayLike:
+    return 0 if simulated.scan.rings is None else simulated.scan.rings
 
 
 # Intensities are whole numbers from 0 to 255, the scale of all four drivers.
-def _fill_velodyne(records: Records, simulated: SimulatedScan, stamp_ns: int) -> None:  # noqa: ARG001
-    records["intensity"] = simulated.intensities
-    records["ring"] = _rings(simulated)
-    records["time"] = _offsets(simulated)
+def _velodyne(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
+    return {"intensity": simulated.intensities, "ring": _rings(simulated), "time": _offsets(simulated)}
 
 
-def _fill_ouster(records: Records, simulated: SimulatedScan, stamp_ns: int) -> None:  # noqa: ARG001
-    # `ambient`, sunlight, stays zero: the simulated night is dark.
-    records["intensity"] = records["reflectivity"] = simulated.intensities
-    records["t"] = _offsets_ns(simulated)
-    records["ring"] = _rings(simulated)
-    records["range"] = np.round(1e3 * np.linalg.norm(simulated.scan.points, axis=1))
+def _ouster(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
+    return {  # `ambient`, sunlight, stays zero: the simulated night is dark
+        "intensity": simulated.intensities,
+        "t": np.round(1e9 * _offsets(simulated)),
+        "reflectivity": simulated.intensities,
+        "ring": _rings(simulated),
+        "range": np.round(1e3 * np.linalg.norm(simulated.scan.points, axis=1)),
+    }
 
 
-def _fill_hesai(records: Records, simulated: SimulatedScan, stamp_ns: int) -> None:
-    records["intensity"] = simulated.intensities
-    records["ring"] = _rings(simulated)
-    records["timestamp"] = stamp_ns / 10**9 + _offsets(simulated)
+def _hesai(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:
+    timestamps = stamp_ns / 10**9 + _offsets(simulated)
+    return {"intensity": simulated.intensities, "ring": _rings(simulated), "timestamp": timestamps}
 
 
-def _fill_livox(records: Records, simulated: SimulatedScan, stamp_ns: int) -> None:  # noqa: ARG001
-    records["offset_time"] = _offsets_ns(simulated)
-    records["reflectivity"] = simulated.intensities
-    records["tag"] = _FIRST_RETURN
-    records["line"] = _rings(simulated)
+def _livox(simulated: SimulatedScan, stamp_ns: int) -> dict[str, ArrayLike]:  # noqa: ARG001
+    return {
+        "offset_time": np.round(1e9 * _offsets(simulated)),
+        "reflectivity": simulated.intensities,
+        "tag": _FIRST_RETURN,
+        "line": _rings(simulated),
+    }
 
 
-_FIRST_RETURN = 0x10
+_XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+# velodyne_pointcloud, PointXYZIRT: packed
+_VELODYNE_POINT = np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")])
+# ouster-ros, point type "original": laid out by PCL, which keeps 16 bytes for the coordinates
+_OUSTER_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
+        "offsets": [0, 4, 8, 16, 20, 24, 26, 28, 32],
+        "itemsize": 48,
+    }
+)
+# HesaiLidar_ROS_2.0: packed
+_HESAI_POINT = np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("timestamp", "<f8")])
+# livox_ros_driver2, CustomPoint: 19 bytes
+_LIVOX_POINT = np.dtype([("offset_time", "<u4"), *_XYZ, ("reflectivity", "|u1"), ("tag", "|u1"), ("line", "|u1")])
 
 DRIVERS: dict[str, DriverCloud] = {
-    # velodyne_pointcloud, PointXYZIRT: packed
-    "velodyne": DriverCloud(
-        "/velodyne_points",
-        "velodyne",
-        _record(22, **_XYZ, intensity=("<f4", 12), ring=("<u2", 16), time=("<f4", 18)),
-        _fill_velodyne,
-    ),
-    # ouster-ros, point type "original": laid out by PCL, which keeps 16 bytes for the coordinates
-    "ouster": DriverCloud(
-        "/ouster/points",
-        "os_lidar",
-        _record(
-            48,
-            **_XYZ,
-            intensity=("<f4", 16),
-            t=("<u4", 20),
-            reflectivity=("<u2", 24),
-            ring=("<u2", 26),
-            ambient=("<u2", 28),
-            range=("<u4", 32),
-        ),
-        _fill_ouster,
-    ),
-    # HesaiLidar_ROS_2.0: packed
-    "hesai": DriverCloud(
-        "/lidar_points",
-        "hesai_lidar",
-        _record(26, **_XYZ, intensity=("<f4", 12), ring=("<u2", 16), timestamp=("<f8", 18)),
-        _fill_hesai,
-    ),
-    # livox_ros_driver2, CustomPoint: 19 bytes
-    "livox": DriverCloud(
-        "/livox/lidar",
-        "livox_frame",
-        _record(
-            19,
-            offset_time=("<u4", 0),
-            x=("<f4", 4),
-            y=("<f4", 8),
-            z=("<f4", 12),
-            reflectivity=("|u1", 16),
-            tag=("|u1", 17),
-            line=("|u1", 18),
-        ),
-        _fill_livox,
-        custom_message=True,
-    ),
+    "velodyne": DriverCloud("/velodyne_points", "velodyne", _VELODYNE_POINT, _velodyne),
+    "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, _ouster),
+    "hesai": DriverCloud("/lidar_points", "hesai_lidar", _HESAI_POINT, _hesai),
+    "livox": DriverCloud("/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, custom_message=True),
 }

@@ -1,7 +1,6 @@
 """The layout of the KITTI odometry benchmark: `sequences/00/{velodyne/*.bin, times.txt, calib.txt}`, `poses/00.txt`."""
 
 from collections.abc import Iterable
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,7 @@ def write_kitti(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
     sequence = folder / "sequences" / SEQUENCE
     (sequence / "velodyne").mkdir(parents=True)
     (folder / "poses").mkdir()
-    (sequence / "calib.txt").write_text(format_calibration(), encoding="utf-8")
+    (sequence / "calib.txt").write_text(_format_calibration(), encoding="utf-8")
     with (
         (sequence / "times.txt").open("w", encoding="utf-8") as times,
         (folder / "poses" / f"{SEQUENCE}.txt").open("w", encoding="utf-8") as poses,
@@ -70,15 +69,11 @@ def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
     return np.column_stack([correct_elevation(points, -ELEVATION_DEG), intensities]).astype("<f4")
 
 
-def format_calibration() -> str:
+def _format_calibration() -> str:
     """calib.txt: the projections P0 to P3 of the four rectified cameras, and Tr, which is T_cam_lidar."""
-    out = StringIO()
+    lines = {"Tr": T_CAM_LIDAR[:3]}
     for camera, beside_m in enumerate(_BESIDE_M):
-        P = [[_FOCAL_PX, 0.0, _CENTRE_PX[0], _FOCAL_PX * beside_m], [0.0, _FOCAL_PX, _CENTRE_PX[1], 0.0], [0, 0, 1, 0]]
-        out.write(f"P{camera}: {_numbers(np.array(P))}\n")
-    out.write(f"Tr: {_numbers(T_CAM_LIDAR[:3])}\n")
-    return out.getvalue()
-
-
-def _numbers(rows: FloatArray) -> str:
-    return " ".join(f"{value:.12e}" for value in rows.reshape(-1))
+        focal_row, centre = [_FOCAL_PX, 0.0, _CENTRE_PX[0], _FOCAL_PX * beside_m], [0.0, _FOCAL_PX, _CENTRE_PX[1], 0.0]
+        lines[f"P{camera}"] = np.array([focal_row, centre, [0.0, 0.0, 1.0, 0.0]])
+    texts = {name: " ".join(f"{value:.12e}" for value in rows.reshape(-1)) for name, rows in lines.items()}
+    return "".join(f"{name}: {texts[name]}\n" for name in sorted(texts))

@@ -1,14 +1,13 @@
 """A folder of binary PLY files, one a scan, with the time and the ring of every point."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lidarslam.simulation.recording.recorder import SimulatedScan
-from lidarslam.simulation.writers.clock import clock_s
-from lidarslam.simulation.writers.interface import Rig
+from lidarslam.simulation.writers.interface import Rig, clock_s
 
 _PROPERTY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<u2": "ushort", "<u4": "uint"}
 
@@ -18,8 +17,26 @@ def write_ply_scans(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> N
     folder.mkdir()
     with (folder / "timestamps.txt").open("w", encoding="utf-8") as stamps:
         for number, simulated in enumerate(scans):
-            write_ply(folder / f"scan_{number:06d}.ply", _vertices(simulated))
-            stamps.write(f"{clock_s(simulated.scan.stamp):.9f}\n")
+            scan = simulated.scan
+            columns: dict[str, tuple[str, ArrayLike]] = {}
+            for axis, coordinates in zip("xyz", scan.points.T, strict=True):
+                columns[axis] = ("<f4", coordinates)
+            columns["intensity"] = ("<f4", simulated.intensities)
+            if scan.time_offsets is not None:
+                columns["t"] = ("<u4", np.round(1e9 * scan.time_offsets))
+            if scan.rings is not None:
+                columns["ring"] = ("<u2", scan.rings)
+            write_ply(folder / f"scan_{number:06d}.ply", as_records(columns))
+            stamps.write(f"{clock_s(scan.stamp):.9f}\n")
+
+
+def as_records(columns: Mapping[str, tuple[str, ArrayLike]]) -> NDArray[np.void]:
+    """A structured array (N,) of columns (N,), each with its type."""
+    count = len(np.asarray(next(iter(columns.values()))[1]))
+    records = np.empty(count, np.dtype([(name, kind) for name, (kind, _) in columns.items()]))
+    for name, (_, values) in columns.items():
+        records[name] = values
+    return records
 
 
 def write_ply(path: Path, vertices: NDArray[np.void]) -> None:
@@ -31,22 +48,4 @@ def write_ply(path: Path, vertices: NDArray[np.void]) -> None:
     names = vertices.dtype.names or ()
     properties = [f"property {_PROPERTY_TYPES[vertices.dtype[name].str]} {name}\n" for name in names]
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{''.join(properties)}end_header\n"
-    with path.open("wb") as out:
-        out.write(header.encode("ascii"))
-        out.write(vertices.tobytes())
-
-
-def _vertices(simulated: SimulatedScan) -> NDArray[np.void]:
-    scan = simulated.scan
-    columns: dict[str, tuple[str, NDArray[np.generic]]] = {
-        **{axis: ("<f4", scan.points[:, column]) for column, axis in enumerate("xyz")},
-        "intensity": ("<f4", simulated.intensities),
-    }
-    if scan.time_offsets is not None:
-        columns["t"] = ("<u4", np.round(1e9 * scan.time_offsets))
-    if scan.rings is not None:
-        columns["ring"] = ("<u2", scan.rings)
-    vertices = np.empty(len(scan), np.dtype([(name, kind) for name, (kind, _) in columns.items()]))
-    for name, (_, values) in columns.items():
-        vertices[name] = values
-    return vertices
+    path.write_bytes(header.encode("ascii") + vertices.tobytes())

@@ -3,19 +3,43 @@
 import sqlite3
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
 from lidarslam.simulation.recording.recorder import SimulatedScan
-from lidarslam.simulation.writers.bag_messages import MessageSerializer
-from lidarslam.simulation.writers.clock import clock_ns
-from lidarslam.simulation.writers.driver_clouds import find_driver
-from lidarslam.simulation.writers.interface import Rig
+from lidarslam.simulation.writers.driver_clouds import DriverCloud, Records, find_driver
+from lidarslam.simulation.writers.interface import Rig, clock_ns
 
+_POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
+_CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
+_CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
+
+# livox_ros_driver2's own definitions; their checksums go into the bag, so order and types are as there.
+_CUSTOM_MESSAGE_DEFINITION = """\
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+"""
+_CUSTOM_POINT_DEFINITION = """\
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+"""
+_LIDAR_ID = 192  # the last byte of the sensor's address
+_CDR_ALIGNMENT = 4
 # The newest version that ROS 2 Humble still reads.
 _ROSBAG2_VERSION: Literal[8] = 8
 
@@ -50,3 +74,65 @@ def _write(bag: Rosbag1Writer | Rosbag2Writer, scans: Iterable[SimulatedScan], r
                 bag.write(connection, stamp_ns + latency_ns, serializer.serialize(driver, records, stamp_ns, number))
     except sqlite3.Error as error:
         raise OutputError(f"{bag.path}: cannot be written ({error}); is the disk full?") from error
+
+
+class MessageSerializer:
+    """Serialises clouds for ROS 1 (packed) or ROS 2 (CDR)."""
+
+    def __init__(self, ros2: bool) -> None:
+        self._ros2 = ros2
+        self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+        self.store.register(get_types_from_msg(_CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
+        self.store.register(get_types_from_msg(_CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
+
+    def message_type(self, driver: DriverCloud) -> str:
+        """The name of the driver's message type."""
+        return _CUSTOM_MESSAGE if driver.custom_message else _POINT_CLOUD2
+
+    def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
+        """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
+        stamp = self.store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        counted = {} if self._ros2 else {"seq": sequence}
+        header = self.store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=driver.frame_id, **counted)
+        message_type = self.message_type(driver)
+        if not driver.custom_message:
+            return self._serialized(self._cloud(header, records), message_type)
+        rsvd = np.zeros(3, np.uint8)
+        message = self.store.types[message_type](header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
+        # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
+        # empty list, which ends the message with its length.
+        without_points = self._serialized(message, message_type)[:-4]
+        return without_points + len(records).to_bytes(4, "little") + self._packed(records)
+
+    def _serialized(self, message: Any, message_type: str) -> bytes:
+        serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
+        return bytes(serialize(message, message_type))
+
+    def _cloud(self, header: Any, records: Records) -> Any:
+        point_field: Any = self.store.types["sensor_msgs/msg/PointField"]
+        # The message names its constants FLOAT32, UINT16 and so on, as NumPy names its types.
+        fields = [
+            point_field(name=name, offset=offset, datatype=getattr(point_field, kind.name.upper()), count=1)
+            for name, (kind, offset, *_) in (records.dtype.fields or {}).items()
+        ]
+        step = records.dtype.itemsize
+        return self.store.types[_POINT_CLOUD2](
+            header=header,
+            height=1,
+            width=len(records),
+            fields=fields,
+            is_bigendian=False,
+            point_step=step,
+            row_step=step * len(records),
+            data=np.frombuffer(records.tobytes(), np.uint8),
+            is_dense=True,
+        )
+
+    def _packed(self, records: Records) -> bytes:
+        """Points one after the other; in CDR each begins at a multiple of four bytes."""
+        size = records.dtype.itemsize
+        if not self._ros2 or not len(records):
+            return records.tobytes()
+        aligned = np.zeros((len(records), -(-size // _CDR_ALIGNMENT) * _CDR_ALIGNMENT), np.uint8)
+        aligned[:, :size] = np.frombuffer(records.tobytes(), np.uint8).reshape(-1, size)
+        return aligned.tobytes()[: aligned.size - (aligned.shape[1] - size)]  # nothing follows that needs alignment

@@ -9,11 +9,11 @@ from lidarslam.simulation.worlds.building import UP, Builder
 from lidarslam.simulation.worlds.clearance import Clearance
 from lidarslam.simulation.worlds.hall.plan import LANE_M, Deck, HallPlan, Ramp
 
-SLAB_M, RAIL_M = 0.25, 1.1
+_SLAB_M, _RAIL_M = 0.25, 1.1
 
 
 def draw_decks(plan: HallPlan, builder: Builder, clearance: Clearance) -> None:
-    """All ramps, decks and stairs; what they fill is taken."""
+    """All ramps, decks and stairs; their space is taken."""
     for ramp in plan.ramps:
         _draw_ramp(ramp, builder, clearance)
     for deck in plan.decks:
@@ -25,27 +25,25 @@ def _draw_ramp(ramp: Ramp, builder: Builder, clearance: Clearance) -> None:
     step = ramp.head - ramp.foot
     along = step / np.linalg.norm(step)
     side = np.array([-along[1], along[0], 0.0]) / np.hypot(along[0], along[1])
-    down = 0.5 * SLAB_M * np.cross(side, along)
-    builder.beam(ramp.foot + down, ramp.head + down, LANE_M, SLAB_M)
+    down = 0.5 * _SLAB_M * np.cross(side, along)
+    builder.beam(ramp.foot + down, ramp.head + down, LANE_M, _SLAB_M)
     for sign in (-1.0, 1.0):
         edge = sign * (0.5 * LANE_M - 0.06) * side
         builder.beam(ramp.foot + edge + 0.06 * UP, ramp.head + edge + 0.06 * UP, 0.12, 0.14)
         _draw_railing(ramp.foot + edge, ramp.head + edge, builder)
-    pieces = np.linspace(0.0, 1.0, round(float(np.linalg.norm(step))) + 1)
-    for k, (a, b) in enumerate(pairwise(pieces)):
+    reach = np.abs(side) * 0.5 * LANE_M
+    for k, (a, b) in enumerate(pairwise(np.linspace(0.0, 1.0, round(float(np.linalg.norm(step))) + 1))):
         low, high = ramp.foot + a * step, ramp.foot + b * step
-        reach = np.abs(side) * 0.5 * LANE_M
-        clearance.take(
-            np.minimum(low, high) - reach - (SLAB_M + 0.25) * UP, np.maximum(low, high) + reach + RAIL_M * UP
-        )
+        bottom, top = np.minimum(low, high) - reach, np.maximum(low, high) + reach
+        clearance.take(bottom - (_SLAB_M + 0.25) * UP, top + _RAIL_M * UP)
         if k % 5 == 4 and low[2] > 1.0:
             for sign in (-1.0, 1.0):
-                _stand(low + sign * (0.5 * LANE_M - 0.2) * side, SLAB_M, builder, clearance)
+                _stand(low + sign * (0.5 * LANE_M - 0.2) * side, _SLAB_M, builder, clearance)
 
 
 def _stand(top: FloatArray, thickness: float, builder: Builder, clearance: Clearance) -> None:
     """A square column from the ground to below a slab, where the way and other things leave room."""
-    low, high = np.array([*(top[:2] - 0.1), 0.0]), np.array([*(top[:2] + 0.1), top[2] - thickness])
+    low, high = np.append(top[:2] - 0.1, 0.0), np.append(top[:2] + 0.1, top[2] - thickness)
     if not clearance.on_route(low, high):
         clearance.take(low, high)
         builder.box(0.5 * (low + high), high - low + 0.1 * UP)
@@ -56,25 +54,24 @@ def _draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
     length = float(np.linalg.norm(b - a))
     for t in np.linspace(0.0, 1.0, max(2, round(length / 1.6) + 1)):
         foot = a + t * (b - a)
-        builder.cylinder(foot, foot + RAIL_M * UP, 0.025)
-    for z in (0.55, RAIL_M):
+        builder.cylinder(foot, foot + _RAIL_M * UP, 0.025)
+    for z in (0.55, _RAIL_M):
         builder.cylinder(a + z * UP, b + z * UP, 0.025)
 
 
 def _draw_deck(deck: Deck, builder: Builder, clearance: Clearance) -> None:
     """Slab, beams below it, columns at its corners and between, railings along its open edges."""
     size = deck.high - deck.low
-    low, high = np.array([*deck.low, deck.z - SLAB_M]), np.array([*deck.high, deck.z])
+    low, high = np.append(deck.low, deck.z - _SLAB_M), np.append(deck.high, deck.z)
     builder.box(0.5 * (low + high), high - low)
     clearance.take(low - 0.35 * UP, high)
-    xs = np.linspace(deck.low[0] + 0.15, deck.high[0] - 0.15, max(2, round(size[0] / 4.5) + 1))
-    ys = np.linspace(deck.low[1] + 0.15, deck.high[1] - 0.15, max(2, round(size[1] / 4.5) + 1))
+    xs, ys = (np.linspace(low[k] + 0.15, high[k] - 0.15, max(2, round(size[k] / 4.5) + 1)) for k in (0, 1))
     for x in xs:
-        builder.box((x, 0.5 * (deck.low[1] + deck.high[1]), deck.z - SLAB_M - 0.15), (0.18, size[1] - 0.02, 0.3))
+        builder.box((x, 0.5 * (low[1] + high[1]), deck.z - _SLAB_M - 0.15), (0.18, size[1] - 0.02, 0.3))
         for y in ys:
-            _stand(np.array([x, y, deck.z]), SLAB_M + 0.3, builder, clearance)
+            _stand(np.array([x, y, deck.z]), _SLAB_M + 0.3, builder, clearance)
     for a, b in deck.railings:
-        _draw_railing(np.array([*a, deck.z]), np.array([*b, deck.z]), builder)
+        _draw_railing(np.append(a, deck.z), np.append(b, deck.z), builder)
 
 
 def _draw_stairs(plan: HallPlan, builder: Builder, clearance: Clearance) -> None:

@@ -15,18 +15,18 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Route
 
-STRIP_M = 9.0
-DECK_2_WIDTH_M = 10.0
-LANDING_WIDTH_M = 7.0
+_STRIP_M = 9.0
+_DECK_2_WIDTH_M = 10.0
+_LANDING_WIDTH_M = 7.0
 LANE_M = 3.0
 # From a wall to the middle of the lane along it, and to the middle of the next lane.
-LANE_AT_M, NEXT_LANE_AT_M = 2.5, 7.0
-FREE_SIDE_M, FREE_HEIGHT_M = 0.9, 2.2
+_LANE_AT_M, _NEXT_LANE_AT_M = 2.5, 7.0
+_FREE_SIDE_M, _FREE_HEIGHT_M = 0.9, 2.2
 
 
 @dataclass(frozen=True)
 class Ramp:
-    """A ramp `LANE_M` wide, by the middle of its upper face's ends (3,); the lower end first."""
+    """A ramp `LANE_M` wide, by the middle of its upper face's ends (3,)."""
 
     foot: FloatArray
     head: FloatArray
@@ -34,102 +34,72 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Deck:
-    """A level floor on columns.
+    """A level floor on columns."""
 
-    Attributes:
-        low, high: (2,) corners.
-        z: of its upper face.
-        railings: (K, 2, 2) from and to, its open edges.
-    """
-
-    low: FloatArray
+    low: FloatArray  # (2,) corners
     high: FloatArray
-    z: float
-    railings: FloatArray
+    z: float  # of its upper face
+    railings: FloatArray  # (K, 2, 2) from and to, its open edges
 
 
 @dataclass(frozen=True)
 class HallPlan:
-    """What is where; the hall fills x from 0 to `width`, y from 0 to `depth`.
-
-    Attributes:
-        width, depth, height: inside.
-        aisle_y: of the two aisles across the ground floor.
-        turn_x: where the way changes from one aisle to the other.
-        ramps, decks: as in the picture above, A to D, and deck 1, deck 2, landing.
-        route: all the way around.
-    """
+    """The hall; it fills x from 0 to `width`, y from 0 to `depth`."""
 
     width: float
     depth: float
-    height: float
-    aisle_y: tuple[float, float]
-    turn_x: float
-    ramps: tuple[Ramp, ...]
-    decks: tuple[Deck, ...]
+    height: float  # inside
+    aisle_y: tuple[float, float]  # of the two aisles across the ground floor
+    turn_x: float  # where the way changes from one aisle to the other
+    ramps: tuple[Ramp, ...]  # A to D in the picture above
+    decks: tuple[Deck, ...]  # deck 1, deck 2, landing
     route: Route
 
 
 def draw_hall(rng: np.random.Generator) -> HallPlan:
     """A hall no two seeds share, its route 230 to 300 m long, its ramps at most 11.7 % steep."""
     width, depth, height = rng.uniform(58.0, 64.0), rng.uniform(40.0, 43.0), rng.uniform(11.5, 13.0)
-    run = rng.uniform(25.0, depth - STRIP_M - 4.8)
+    run = rng.uniform(25.0, depth - _STRIP_M - 4.8)
     rise = run * rng.uniform(0.106, 0.117)
-    near, next_lane, far = LANE_AT_M, depth - NEXT_LANE_AT_M, depth - LANE_AT_M
-    deck_1_x, landing_y = DECK_2_WIDTH_M + run, depth - STRIP_M - run
-    ramps = (
-        _ramp((DECK_2_WIDTH_M, next_lane, 0.0), (deck_1_x, next_lane, rise)),
-        _ramp((deck_1_x, far, rise), (DECK_2_WIDTH_M, far, 2.0 * rise)),
-        _ramp((near, landing_y, rise), (near, depth - STRIP_M, 2.0 * rise)),
-        _ramp((LANDING_WIDTH_M + run, near, 0.0), (LANDING_WIDTH_M, near, rise)),
-    )
+    near, next_lane, far = _LANE_AT_M, depth - _NEXT_LANE_AT_M, depth - _LANE_AT_M
+    deck_1_x, landing_y = _DECK_2_WIDTH_M + run, depth - _STRIP_M - run
+    ramp_a = [(_DECK_2_WIDTH_M, next_lane, 0.0), (deck_1_x, next_lane, rise)]
+    ramp_b = [(deck_1_x, far, rise), (_DECK_2_WIDTH_M, far, 2.0 * rise)]
+    ramp_c = [(near, landing_y, rise), (near, depth - _STRIP_M, 2.0 * rise)]
+    ramp_d = [(_LANDING_WIDTH_M + run, near, 0.0), (_LANDING_WIDTH_M, near, rise)]
     aisles = (rng.uniform(0.32, 0.4) * depth, depth - rng.uniform(12.5, 14.0))
     turn_x, deck_turn_x = rng.uniform(0.3, 0.55) * width, deck_1_x + rng.uniform(7.0, 12.0)
-    lower = [(width - 4.0, near), (width - 4.0, aisles[0]), (turn_x, aisles[0]), (turn_x, aisles[1])]
-    lower += [(6.5, aisles[1]), (6.5, next_lane)]
     waypoints = [
-        *[np.array([x, y, 0.0]) for x, y in lower],
-        ramps[0].foot,
-        ramps[0].head,
-        np.array([deck_turn_x, next_lane, rise]),
-        np.array([deck_turn_x, far, rise]),
-        ramps[1].foot,
-        ramps[1].head,
-        np.array([near, far, 2.0 * rise]),
-        ramps[2].head,
-        ramps[2].foot,
-        np.array([near, near, rise]),
-        ramps[3].head,
-        ramps[3].foot,
+        *((width - 4.0, near, 0.0), (width - 4.0, aisles[0], 0.0), (turn_x, aisles[0], 0.0)),
+        *((turn_x, aisles[1], 0.0), (6.5, aisles[1], 0.0), (6.5, next_lane, 0.0)),
+        *(*ramp_a, (deck_turn_x, next_lane, rise), (deck_turn_x, far, rise)),
+        *(*ramp_b, (near, far, 2.0 * rise), *ramp_c[::-1], (near, near, rise), *ramp_d[::-1]),
     ]
-    route = Route(np.stack(waypoints), 0.8, FREE_SIDE_M, FREE_HEIGHT_M, 2.0)
+    route = Route(np.array(waypoints), 0.8, _FREE_SIDE_M, _FREE_HEIGHT_M, 2.0)
+    ramps = tuple(Ramp(np.array(foot), np.array(head)) for foot, head in (ramp_a, ramp_b, ramp_c, ramp_d))
     decks = _decks(width, depth, rise, deck_1_x, landing_y)
     return HallPlan(width, depth, height, aisles, turn_x, ramps, decks, route)
 
 
-def _ramp(foot: tuple[float, float, float], head: tuple[float, float, float]) -> Ramp:
-    return Ramp(np.array(foot), np.array(head))
-
-
 def _decks(width: float, depth: float, rise: float, deck_1_x: float, landing_y: float) -> tuple[Deck, ...]:
     """Deck 1, deck 2 and the landing, with railings wherever no ramp joins and no wall is."""
-    front, half = depth - STRIP_M, 0.5 * LANE_M
-    far, second, near = depth - LANE_AT_M, depth - NEXT_LANE_AT_M, LANE_AT_M
-    west_of_1 = [(front, second - half), (second + half, far - half), (far + half, depth)]
-    east_of_2 = [(front, far - half), (far + half, depth)]
-    railings_1 = [((deck_1_x, a), (deck_1_x, b)) for a, b in west_of_1]
-    # A gap for the stairs.
-    railings_1 += [((deck_1_x, front), (width - 3.2, front)), ((width - 1.8, front), (width, front))]
-    railings_2 = [((DECK_2_WIDTH_M, a), (DECK_2_WIDTH_M, b)) for a, b in east_of_2]
-    railings_2 += [((0.0, front), (near - half, front)), ((near + half, front), (DECK_2_WIDTH_M, front))]
-    railings_3 = [
-        ((0.0, landing_y), (near - half, landing_y)),
-        ((near + half, landing_y), (LANDING_WIDTH_M, landing_y)),
-    ]
-    railings_3 += [((LANDING_WIDTH_M, 0.0), (LANDING_WIDTH_M, near - half))]
-    railings_3 += [((LANDING_WIDTH_M, near + half), (LANDING_WIDTH_M, landing_y))]
+    front, half = depth - _STRIP_M, 0.5 * LANE_M
+    far, second, near = depth - _LANE_AT_M, depth - _NEXT_LANE_AT_M, _LANE_AT_M
+
+    def along_y(x: float, *spans: tuple[float, float]) -> list[list[tuple[float, float]]]:
+        return [[(x, a), (x, b)] for a, b in spans]
+
+    def along_x(y: float, *spans: tuple[float, float]) -> list[list[tuple[float, float]]]:
+        return [[(a, y), (b, y)] for a, b in spans]
+
+    railings_1 = along_y(deck_1_x, (front, second - half), (second + half, far - half), (far + half, depth))
+    railings_1 += along_x(front, (deck_1_x, width - 3.2), (width - 1.8, width))  # a gap for the stairs
+    railings_2 = along_y(_DECK_2_WIDTH_M, (front, far - half), (far + half, depth))
+    railings_2 += along_x(front, (0.0, near - half), (near + half, _DECK_2_WIDTH_M))
+    railings_3 = along_x(landing_y, (0.0, near - half), (near + half, _LANDING_WIDTH_M))
+    railings_3 += along_y(_LANDING_WIDTH_M, (0.0, near - half), (near + half, landing_y))
     return (
         Deck(np.array([deck_1_x, front]), np.array([width, depth]), rise, np.array(railings_1)),
-        Deck(np.array([0.0, front]), np.array([DECK_2_WIDTH_M, depth]), 2.0 * rise, np.array(railings_2)),
-        Deck(np.zeros(2), np.array([LANDING_WIDTH_M, landing_y]), rise, np.array(railings_3)),
+        Deck(np.array([0.0, front]), np.array([_DECK_2_WIDTH_M, depth]), 2.0 * rise, np.array(railings_2)),
+        Deck(np.zeros(2), np.array([_LANDING_WIDTH_M, landing_y]), rise, np.array(railings_3)),
     )

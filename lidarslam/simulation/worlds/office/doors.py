@@ -7,34 +7,45 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import Route
 from lidarslam.simulation.worlds.office.plan import CORRIDOR, Plan, Room, WallLine
+from lidarslam.simulation.worlds.paths import loop_length
 
 # How long the route may get, drawn between these.
-ROUTE_LENGTHS_M = (76.0, 89.0)
-FREE_SIDE_M = 0.4
+_ROUTE_LENGTHS_M = (76.0, 89.0)
+_FREE_SIDE_M = 0.4
 DOOR_HEIGHT_M = 2.12
 # From a wall's middle line to where a walker would turn.
-TURN_M = 1.0
+_TURN_M = 1.0
 
 
 @dataclass(frozen=True)
 class Door:
-    """A door from a corridor into a room.
+    """A door from a corridor into a room."""
 
-    Attributes:
-        wall: index of the wall that it is in.
-        along: of its middle, from the wall's start.
-        width: clear.
-        room: label.
-        opened: angle of the leaf, 0 when closed.
-        hinge: +1 or -1, the side that it hangs on, along the wall.
-    """
+    wall: int  # index of the wall that it is in
+    along: float  # of its middle, from the wall's start
+    width: float  # clear
+    room: int  # label
+    opened: float  # angle of the leaf, 0 when closed
+    hinge: float  # +1 or -1, the side that it hangs on, along the wall
 
-    wall: int
+
+@dataclass(frozen=True)
+class _Visit:
+    """A way (K, 2) from a leg of the loop into a room, around in it, and back to the same point."""
+
+    door: Door
+    leg: int
     along: float
-    width: float
-    room: int
-    opened: float
-    hinge: float
+    path: FloatArray
+
+    @property
+    def length(self) -> float:
+        return loop_length(self.path)
+
+    def excludes(self, other: "_Visit") -> bool:
+        """Whether two visits are to the same room, or branch off the loop too close to one another."""
+        is_close = self.leg == other.leg and abs(self.along - other.along) < 1.0
+        return self.door.room == other.door.room or is_close
 
 
 def into_room(wall: WallLine) -> FloatArray:
@@ -58,43 +69,23 @@ def draw_doors(plan: Plan, rng: np.random.Generator) -> tuple[list[Door], Route]
     visited = {visit.door.room for visit in visits.values()}
     others = [replace(door, opened=0.0) if door.room in visited else door for door in candidates]
     doors = [visits[k].door if k in visits else door for k, door in enumerate(others)]
-    corners = np.concatenate([plan.loop, np.zeros((len(plan.loop), 1))], axis=1)
-    waypoints: list[FloatArray] = []
-    for leg, corner in enumerate(corners):
-        waypoints.append(corner)
-        for visit in sorted((v for v in visits.values() if v.leg == leg), key=lambda v: v.along):
-            waypoints += list(np.concatenate([visit.path, np.zeros((len(visit.path), 1))], axis=1))
-    return doors, Route(np.stack(waypoints), 0.3, FREE_SIDE_M, DOOR_HEIGHT_M - 0.07, 1.2)
-
-
-@dataclass(frozen=True)
-class _Visit:
-    """A way (K, 2) from a leg of the loop into a room, around in it, and back to the same point."""
-
-    door: Door
-    leg: int
-    along: float
-    path: FloatArray
-
-    @property
-    def length(self) -> float:
-        return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
+    parts: list[FloatArray] = []
+    for leg, corner in enumerate(plan.loop):
+        visited_here = sorted((v for v in visits.values() if v.leg == leg), key=lambda v: v.along)
+        parts += [corner[None], *(visit.path for visit in visited_here)]
+    way = np.concatenate(parts)
+    waypoints = np.column_stack([way, np.zeros(len(way))])
+    return doors, Route(waypoints, 0.3, _FREE_SIDE_M, DOOR_HEIGHT_M - 0.07, 1.2)
 
 
 def _choose_visits(plan: Plan, doors: list[Door], rng: np.random.Generator) -> dict[int, _Visit]:
     """Visits by the index of their door: in random order while the route has length to spare."""
-    closed = np.concatenate([plan.loop, plan.loop[:1]])
-    length = float(np.linalg.norm(np.diff(closed, axis=0), axis=1).sum())
-    longest = rng.uniform(*ROUTE_LENGTHS_M)
+    length = loop_length(plan.loop)
+    longest = rng.uniform(*_ROUTE_LENGTHS_M)
     chosen: dict[int, _Visit] = {}
     for k in rng.permutation(len(doors)):
         visit = _visit(plan, doors[k], rng)
-        if visit is None or length + visit.length > longest:
-            continue
-        if any(
-            v.door.room == visit.door.room or (v.leg == visit.leg and abs(v.along - visit.along) < 1.0)
-            for v in chosen.values()
-        ):
+        if visit is None or length + visit.length > longest or any(map(visit.excludes, chosen.values())):
             continue
         chosen[int(k)] = visit
         length += visit.length
@@ -104,30 +95,21 @@ def _choose_visits(plan: Plan, doors: list[Door], rng: np.random.Generator) -> d
 def _visit(plan: Plan, door: Door, rng: np.random.Generator) -> _Visit | None:
     """The way in through a door and around a rectangle, or None where room or loop does not allow it."""
     wall, room = plan.walls[door.wall], plan.rooms[door.room]
-    threshold = wall.a + door.along * wall.direction
-    leg = _leg_at(plan.loop, threshold, into_room(wall))
+    threshold, inwards = wall.a + door.along * wall.direction, into_room(wall)
+    leg = _leg_at(plan.loop, threshold, inwards)
     sides = _extent(room, threshold, wall.direction)
     side = 1.0 if sides[1] > -sides[0] else -1.0
-    across = max(sides[1], -sides[0]) - TURN_M
-    depth = _extent(room, threshold, into_room(wall))[1] - TURN_M
-    if leg is None or across < 1.2 or depth < TURN_M + 0.9:
+    across = max(sides[1], -sides[0]) - _TURN_M
+    depth = _extent(room, threshold, inwards)[1] - _TURN_M
+    if leg is None or across < 1.2 or depth < _TURN_M + 0.9:
         return None
-    start, along = leg[1], leg[2]
-    inwards, sidewards = into_room(wall), side * wall.direction
+    index, start, along = leg
     across, depth = min(across, rng.uniform(1.6, 2.6)), min(depth, rng.uniform(2.4, 3.4))
-    path = np.stack(
-        [
-            start,
-            threshold + TURN_M * inwards,
-            threshold + TURN_M * inwards + across * sidewards,
-            threshold + depth * inwards + across * sidewards,
-            threshold + depth * inwards,
-            start,
-        ]
-    )
+    near, far, aside = threshold + _TURN_M * inwards, threshold + depth * inwards, across * (side * wall.direction)
+    path = np.stack([start, near, near + aside, far + aside, far, start])
     # The leaf hangs on the side that the way does not turn to, and lies back against the wall.
     open_door = Door(door.wall, door.along, rng.uniform(1.1, 1.2), door.room, rng.uniform(1.65, 1.8), -side)
-    return _Visit(open_door, leg[0], along, path)
+    return _Visit(open_door, index, along, path)
 
 
 def _leg_at(loop: FloatArray, threshold: FloatArray, inwards: FloatArray) -> tuple[int, FloatArray, float] | None:

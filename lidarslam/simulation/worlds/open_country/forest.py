@@ -6,11 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Route, World
-from lidarslam.simulation.worlds import furnishing
+from lidarslam.simulation.worlds import furnishing, paths
 from lidarslam.simulation.worlds.building import Builder, smooth_noise
 from lidarslam.simulation.worlds.furnishing import on_slope, upright
 from lidarslam.simulation.worlds.open_country import plants
-from lidarslam.simulation.worlds.paths import distance_to_loop, on_ground, prune, resample_loop, winding_loop
 
 _CELL_M = 0.4
 _MARGIN_M = 32.0
@@ -21,25 +20,20 @@ _TREES = (320, 400)
 def build(seed: int) -> World:
     """A forest; its track is just wide enough to pass."""
     rng = np.random.default_rng(seed)
-    track = winding_loop(rng, rng.uniform(160.0, 290.0), 6, 0.6, 4.0)
-    track = track[:: rng.choice([-1, 1])]
+    track = paths.winding_loop(rng, rng.uniform(160.0, 290.0), 6, 0.6, 4.0)
     ground = _ground(rng, track)
     part = Builder()
     _trees(part, rng, track, ground)
     _floor(part, rng, track, ground)
-    route = Route(on_ground(resample_loop(track, 1.5), ground), 1.5, _FREE_SIDE_M, 2.6, 3.0)
-    part = prune(part, route)
-    return World(
-        "forest", seed, route, boxes=part.boxes, cylinders=part.cylinders, height_fields=(ground,), map_spacing_m=0.1
-    )
+    route = Route(paths.on_ground(paths.resample_loop(track, 1.5), ground), 1.5, _FREE_SIDE_M, 2.6, 3.0)
+    return World("forest", seed, route, *paths.prune(part, route).solids, (ground,), map_spacing_m=0.1)
 
 
 def _ground(rng: np.random.Generator, track: FloatArray) -> HeightField:
     """Slopes of up to a sixth or so, knolls, and bumps that are worn down on the track."""
     low = np.floor(track.min(axis=0) - _MARGIN_M)
-    shape = tuple(np.ceil((track.max(axis=0) + _MARGIN_M - low) / _CELL_M).astype(int) + 1)
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    distance = distance_to_loop((low + _CELL_M * grid).reshape(-1, 2), track).reshape(shape)
+    distance = paths.distance_to_loop(paths.grid_nodes(low, track.max(axis=0) + _MARGIN_M, _CELL_M), track)
+    shape = distance.shape
     untrodden = np.clip((distance - 0.5) / 1.5, 0.3, 1.0)
     heights = rng.uniform(1.0, 2.0) * smooth_noise(rng, shape, 16.0 / _CELL_M)
     heights += 0.22 * smooth_noise(rng, shape, 4.0 / _CELL_M)
@@ -53,7 +47,7 @@ def _scatter(
     """Up to `count` places (N, 2) at that distance from the track and no closer to one another than `apart_m`."""
     low, high = track.min(axis=0) - _MARGIN_M + 2.0, track.max(axis=0) + _MARGIN_M - 2.0
     darts = rng.uniform(low, high, (12 * count, 2))
-    distance = distance_to_loop(darts, track)
+    distance = paths.distance_to_loop(darts, track)
     darts = darts[(distance > from_track_m[0]) & (distance < from_track_m[1])]
     near = cKDTree(darts).query_ball_point(darts, apart_m)
     is_kept = np.zeros(len(darts), dtype=bool)
@@ -77,11 +71,11 @@ def _trees(part: Builder, rng: np.random.Generator, track: FloatArray, ground: H
 
 
 def _floor(part: Builder, rng: np.random.Generator, track: FloatArray, ground: HeightField) -> None:
-    """What lies and grows under the trees."""
+    """Fallen trunks, boulders, bushes, stumps and piles of logs under the trees."""
     for where in _scatter(rng, track, 26, (_FREE_SIDE_M + 0.8, 25.0), 6.0):
         length, radius, yaw = rng.uniform(4.0, 11.0), rng.uniform(0.14, 0.38), rng.uniform(0.0, np.pi)
         ends = where + np.outer([-0.5, -0.25, 0.25, 0.5], length * np.array([np.cos(yaw), np.sin(yaw)]))
-        if distance_to_loop(ends, track).min() > _FREE_SIDE_M + 4.0 * radius:
+        if paths.distance_to_loop(ends, track).min() > _FREE_SIDE_M + 4.0 * radius:
             pose = on_slope(ground, where, yaw, 0.7 * length, 1.0)
             part.place(plants.fallen_trunk(rng, length, radius), pose)
     for where in _scatter(rng, track, 45, (_FREE_SIDE_M + 1.5, 25.0), 3.0):

@@ -4,18 +4,10 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
-from lidarslam.simulation.worlds import furnishing
+from lidarslam.simulation.worlds import furnishing, paths
 from lidarslam.simulation.worlds.building import Builder, smooth_noise
 from lidarslam.simulation.worlds.furnishing import upright
 from lidarslam.simulation.worlds.open_country import plants
-from lidarslam.simulation.worlds.paths import (
-    beside_loop,
-    distance_to_loop,
-    on_ground,
-    prune,
-    resample_loop,
-    winding_loop,
-)
 
 _CELL_M = 0.5
 _MARGIN_M = 60.0
@@ -27,34 +19,23 @@ _LAMP_SPACING_M = 24.0
 def build(seed: int) -> World:
     """A park; the path has something upright in sight everywhere, but little of it."""
     rng = np.random.default_rng(seed)
-    path = winding_loop(rng, rng.uniform(240.0, 390.0), 4, 0.35, 12.0)
-    path = path[:: rng.choice([-1, 1])]
+    path = paths.winding_loop(rng, rng.uniform(240.0, 390.0), 4, 0.35, 12.0)
     ground = _ground(rng, path)
     solid, green = Builder(), Builder()
     _along_the_path(solid, rng, path, ground)
     taken = _pavilion(solid, rng, path, ground)
     _trees(green, rng, path, ground, taken)
     _borders(solid, green, rng, path, ground, taken)
-    route = Route(on_ground(resample_loop(path, 2.0), ground), 3.0, _FREE_SIDE_M, 3.0, 6.0)
-    solid.place(prune(green, route), np.eye(4))
-    return World(
-        "park",
-        seed,
-        route,
-        boxes=solid.boxes,
-        cylinders=solid.cylinders,
-        height_fields=(ground,),
-        movers=tuple(_strollers(rng, path, ground)),
-        map_spacing_m=0.1,
-    )
+    route = Route(paths.on_ground(paths.resample_loop(path, 2.0), ground), 3.0, _FREE_SIDE_M, 3.0, 6.0)
+    solid.place(paths.prune(green, route), np.eye(4))
+    return World("park", seed, route, *solid.solids, (ground,), _strollers(rng, path, ground), map_spacing_m=0.1)
 
 
 def _ground(rng: np.random.Generator, path: FloatArray) -> HeightField:
     """Swells some 25 m wide and up to a few metres high; the path itself is smoother than the grass."""
     low = np.floor(path.min(axis=0) - _MARGIN_M)
-    shape = tuple(np.ceil((path.max(axis=0) + _MARGIN_M - low) / _CELL_M).astype(int) + 1)
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    distance = distance_to_loop((low + _CELL_M * grid).reshape(-1, 2), path).reshape(shape)
+    distance = paths.distance_to_loop(paths.grid_nodes(low, path.max(axis=0) + _MARGIN_M, _CELL_M), path)
+    shape = distance.shape
     on_grass = np.clip((distance - 1.0) / 1.5, 0.1, 1.0)
     heights = rng.uniform(0.9, 1.5) * smooth_noise(rng, shape, 22.0 / _CELL_M)
     heights += on_grass * (0.03 * smooth_noise(rng, shape, 1.5 / _CELL_M) + 0.012 * smooth_noise(rng, shape, 0.7))
@@ -67,41 +48,46 @@ def _along_the_path(solid: Builder, rng: np.random.Generator, path: FloatArray, 
     side = 1.0
     for place in np.arange(count) + rng.uniform(-0.2, 0.2, count):
         at = int(place / count * len(path)) % len(path)
-        where, yaw = beside_loop(path, at, side * rng.uniform(2.4, 3.2))
+        where, yaw = paths.beside_loop(path, at, side * rng.uniform(2.4, 3.2))
         solid.place(furnishing.lamp_post(3.6, 0.0), upright(ground, where, yaw))
         between = (at + int(rng.integers(14, 30))) % len(path)
         if rng.random() < 0.5:
-            where, yaw = beside_loop(path, between, side * rng.uniform(2.9, 3.3))
+            where, yaw = paths.beside_loop(path, between, side * rng.uniform(2.9, 3.3))
             solid.place(furnishing.bench(rng), upright(ground, where, yaw - side * 0.5 * np.pi))
-            where, yaw = beside_loop(path, (between + 4) % len(path), side * 2.8)
+            where, yaw = paths.beside_loop(path, (between + 4) % len(path), side * 2.8)
             solid.place(furnishing.litter_bin(), upright(ground, where, yaw))
         elif rng.random() < 0.3:
-            where, yaw = beside_loop(path, between, -side * 2.6)
+            where, yaw = paths.beside_loop(path, between, -side * 2.6)
             solid.place(furnishing.sign(rng), upright(ground, where, yaw))
         side = -side
 
 
 def _pavilion(solid: Builder, rng: np.random.Generator, path: FloatArray, ground: HeightField) -> FloatArray:
-    """An open pavilion on columns beside the path; its middle and radius (1, 3), where nothing else may stand."""
+    """An open pavilion on columns beside the path; its middle and radius (3,), where nothing else may stand."""
     size, high = rng.uniform(5.0, 8.0), rng.uniform(2.9, 3.4)
-    where, yaw = beside_loop(path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0))
-    while distance_to_loop(where[None], path)[0] < 0.75 * size + 2.5:
-        where, yaw = beside_loop(path, int(rng.integers(len(path))), rng.choice([-1.0, 1.0]) * (0.75 * size + 4.0))
+    where, yaw = path[0], 0.0
+    while paths.distance_to_loop(where[None], path)[0] < 0.75 * size + 2.5:
+        index, side = int(rng.integers(len(path))), rng.choice([-1.0, 1.0])
+        where, yaw = paths.beside_loop(path, index, side * (0.75 * size + 4.0))
     part, half = Builder(), 0.5 * size
     part.block((-half - 0.3, -half - 0.3, -1.2), (half + 0.3, half + 0.3, 0.18))
     for x in np.linspace(-half, half, 3):
         for y in (-half, half):
-            part.pole(np.array([x, y]), (-1.2, high), 0.14)
+            part.pole((x, y), (-1.2, high), 0.14)
     part.block((-half, half - 0.1, 0.1), (half, half + 0.1, high))  # the back wall
     part.block((-half + 0.3, half - 0.6, 0.1), (half - 0.3, half - 0.1, 0.6))
     for y in (-half - 0.6, half + 0.6):
-        part.beam(np.array([0.0, y, high - 0.15]), np.array([0.0, 0.0, high + 0.3 * size]), size + 1.0, 0.12)
+        part.beam((0.0, y, high - 0.15), (0.0, 0.0, high + 0.3 * size), size + 1.0, 0.12)
     for x in (-half, half):
         part.block((x - 0.08, -0.12, high), (x + 0.08, 0.12, high + 0.28 * size))
     part.block((-half - 0.2, -half - 0.2, high - 0.2), (half + 0.2, half + 0.2, high))
-    pose = upright(ground, where, yaw)
-    solid.place(part, pose)
-    return np.append(where, 0.75 * size)[None]
+    solid.place(part, upright(ground, where, yaw))
+    return np.append(where, 0.75 * size)
+
+
+def _from_pavilion(xy: FloatArray, taken: FloatArray) -> float:
+    """Distance of the nearest of points (..., 2) from the pavilion, a circle (3,)."""
+    return float(np.linalg.norm(xy - taken[:2], axis=-1).min() - taken[2])
 
 
 def _trees(green: Builder, rng: np.random.Generator, path: FloatArray, ground: HeightField, taken: FloatArray) -> None:
@@ -109,15 +95,15 @@ def _trees(green: Builder, rng: np.random.Generator, path: FloatArray, ground: H
     low, high = path.min(axis=0) - 0.6 * _MARGIN_M, path.max(axis=0) + 0.6 * _MARGIN_M
     stands = np.empty((0, 2))
     for where in rng.uniform(low, high, (400, 2)):
-        distance = float(distance_to_loop(where[None], path)[0])
+        distance = float(paths.distance_to_loop(where[None], path)[0])
         apart = np.linalg.norm(stands - where, axis=1).min(initial=np.inf)
-        is_clear = np.linalg.norm(taken[:, :2] - where, axis=1).min() > taken[:, 2].max() + 5.0
-        if distance < 4.0 or distance > 45.0 or apart < 15.0 or not is_clear or rng.random() < 0.45:
+        is_crowded = apart < 15.0 or _from_pavilion(where, taken) <= 5.0
+        if distance < 4.0 or distance > 45.0 or is_crowded or rng.random() < 0.45:
             continue
         group = where + rng.normal(0.0, 3.0, (int(rng.integers(1, 4)) if rng.random() < 0.25 else 1, 2))
         group[0] = where
         for foot in group:
-            if distance_to_loop(foot[None], path)[0] > 3.5:
+            if paths.distance_to_loop(foot[None], path)[0] > 3.5:
                 tree = plants.broadleaf(rng, rng.uniform(7.0, 13.0), rng.uniform(0.18, 0.4), 80)
                 green.place(tree, upright(ground, foot, rng.uniform(0.0, 2.0 * np.pi)))
         stands = np.concatenate([stands, group])
@@ -128,13 +114,11 @@ def _borders(
 ) -> None:
     """A few low walls, hedges and bushes along the path."""
     for at in rng.integers(0, len(path), 9):
-        left = rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 9.0)
-        start, yaw = beside_loop(path, int(at), left)
+        start, yaw = paths.beside_loop(path, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 9.0))
         length, high = rng.uniform(5.0, 12.0), rng.uniform(0.5, 1.2)
         end = start + length * np.array([np.cos(yaw), np.sin(yaw)])
         line = start + np.linspace(0.0, 1.0, 9)[:, None] * (end - start)
-        away = np.linalg.norm(line[:, None] - taken[:, :2], axis=2).min() - taken[:, 2].max()
-        if distance_to_loop(line, path).min() < 3.0 or away < 1.5:
+        if paths.distance_to_loop(line, path).min() < 3.0 or _from_pavilion(line, taken) < 1.5:
             continue
         level = float(ground.height_at(line).mean())
         if rng.random() < 0.45:
@@ -144,20 +128,20 @@ def _borders(
             for a, b in zip(line[:-1:2], line[2::2], strict=True):  # steps down a slope with the ground
                 green.place(plants.hedge(rng, 0.25 * length, high, 0.7), upright(ground, 0.5 * (a + b), yaw))
     for at in rng.integers(0, len(path), 14):
-        where, yaw = beside_loop(path, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0))
-        if np.linalg.norm(taken[:, :2] - where, axis=1).min() > taken[:, 2].max() + 1.5:
+        where, yaw = paths.beside_loop(path, int(at), rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0))
+        if _from_pavilion(where, taken) > 1.5:
             green.place(plants.bush(rng, rng.uniform(0.6, 1.3), 24), upright(ground, where, yaw))
 
 
-def _strollers(rng: np.random.Generator, path: FloatArray, ground: HeightField) -> list[Mover]:
+def _strollers(rng: np.random.Generator, path: FloatArray, ground: HeightField) -> tuple[Mover, ...]:
     """People who walk or run round the meadow beside the path, never on it."""
     movers = []
-    middle = path.mean(axis=0)
     for _ in range(int(rng.integers(2, 5))):
         radius, phase = rng.uniform(4.0, 8.0), rng.uniform(0.0, 2.0 * np.pi)
         angle = np.linspace(0.0, 2.0 * np.pi, 73)[:-1] * rng.choice([-1.0, 1.0]) + phase
-        circle = middle + rng.normal(0.0, 4.0, 2) + radius * np.stack([np.cos(angle), 0.7 * np.sin(angle)], axis=1)
-        if distance_to_loop(circle, path).min() > _FREE_SIDE_M + 1.0:
-            waypoints = on_ground(circle, ground)
-            movers.append(Mover(furnishing.pedestrian(rng).boxes, waypoints, rng.uniform(1.0, 2.8), 0.0))
-    return movers
+        ellipse = radius * np.stack([np.cos(angle), 0.7 * np.sin(angle)], axis=1)
+        circle = path.mean(axis=0) + rng.normal(0.0, 4.0, 2) + ellipse
+        if paths.distance_to_loop(circle, path).min() > _FREE_SIDE_M + 1.0:
+            body = furnishing.pedestrian(rng).boxes
+            movers.append(Mover(body, paths.on_ground(circle, ground), rng.uniform(1.0, 2.8), 0.0))
+    return tuple(movers)

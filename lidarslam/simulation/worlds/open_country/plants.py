@@ -1,4 +1,4 @@
-"""What grows: trees, bushes and hedges, each drawn in its own frame, the foot at the origin, z up."""
+"""Vegetation: trees, bushes, hedges and grass; plants are drawn in their own frame, the foot at the origin, z up."""
 
 from itertools import pairwise
 
@@ -6,16 +6,35 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.worlds.building import Builder
+from lidarslam.simulation.world import Grass, HeightField
+from lidarslam.simulation.worlds.building import Builder, smooth_noise
 
 # Roots go this far down, so that nothing hovers on a slope.
 SUNK_M = 0.4
+# Of meadows: at 10 degrees of incidence a ray sees half a decimetre deep.
+_FREE_PATH_M = 0.3
+_EDGE_M = 0.6
+
+
+def grass(rng: np.random.Generator, ground: HeightField, height_m: FloatArray, distance_m: FloatArray) -> Grass:
+    """Tussocks on the ground's grid (X, Y).
+
+    Args:
+        rng: of the tussocks.
+        ground: gives the grid.
+        height_m: (X, Y) mean height of the blades, 0 where none grow.
+        distance_m: (X, Y) from where the ground is kept free of grass, negative there.
+    """
+    shape = ground.heights.shape
+    tussocks = 1.0 + 0.3 * smooth_noise(rng, shape, 1.0) + 0.3 * smooth_noise(rng, shape, 8.0)
+    heights = height_m * np.clip(tussocks, 0.2, 2.0) * np.clip(distance_m / _EDGE_M, 0.0, 1.0)
+    return Grass(HeightField(ground.origin_xy, ground.cell_m, heights), _FREE_PATH_M)
 
 
 def leaf_clump(
     part: Builder, rng: np.random.Generator, centre: FloatArray, radii: FloatArray, count: int, leaf_m: float
 ) -> None:
-    """Flat boxes, turned anyhow, scattered in an ellipsoid of semi-axes `radii` (3,), denser towards its surface."""
+    """Flat boxes of any rotation, scattered in an ellipsoid of semi-axes `radii` (3,), denser towards its surface."""
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     centres = centre + radii * direction * rng.uniform(0.2, 1.0, (count, 1)) ** 0.5
@@ -70,18 +89,16 @@ def bush(rng: np.random.Generator, radius: float, leaves: int) -> Builder:
     """A clump of small boxes, about as wide as high."""
     part = Builder()
     high = rng.uniform(0.7, 1.1) * radius
-    leaf_clump(
-        part, rng, np.array([0.0, 0.0, 0.55 * high]), np.array([radius, radius, 0.75 * high]), leaves, 0.4 * radius
-    )
-    part.cylinder(np.array([0.0, 0.0, -SUNK_M]), np.array([0.0, 0.0, high]), 0.08 * radius)
+    middle, radii = np.array([0.0, 0.0, 0.55 * high]), np.array([radius, radius, 0.75 * high])
+    leaf_clump(part, rng, middle, radii, leaves, 0.4 * radius)
+    part.pole((0.0, 0.0), (-SUNK_M, high), 0.08 * radius)
     return part
 
 
 def hedge(rng: np.random.Generator, length: float, height: float, thickness: float) -> Builder:
     """A clipped hedge along x, from 0 to `length`, of uneven blocks about 0.8 m long."""
     part = Builder()
-    edges = np.linspace(0.0, length, max(2, round(length / 0.8) + 1))
-    for a, b in pairwise(edges):
+    for a, b in pairwise(np.linspace(0.0, length, max(2, round(length / 0.8) + 1))):
         top = height + rng.normal(0.0, 0.04)
         size = (b - a + 0.1, thickness * rng.uniform(0.85, 1.1), top + SUNK_M)
         part.box((0.5 * (a + b), rng.normal(0.0, 0.03), 0.5 * (top - SUNK_M)), size, yaw=rng.normal(0.0, 0.05))
@@ -92,16 +109,13 @@ def fallen_trunk(rng: np.random.Generator, length: float, radius: float) -> Buil
     """A lying trunk along x, its middle at the origin, half sunk, with stubs of boughs and a plate of roots."""
     part = Builder()
     half, low = 0.5 * length, 0.6 * radius
-    part.cylinder(np.array([-half, 0.0, low]), np.array([0.1 * half, 0.0, low]), radius)
-    part.cylinder(np.array([0.1 * half, 0.0, low]), np.array([half, 0.0, low]), 0.75 * radius)
+    part.cylinder((-half, 0.0, low), (0.1 * half, 0.0, low), radius)
+    part.cylinder((0.1 * half, 0.0, low), (half, 0.0, low), 0.75 * radius)
     for x in rng.uniform(-0.2 * half, 0.9 * half, int(rng.integers(2, 5))):
         angle = rng.uniform(0.2, np.pi - 0.2)
         tip = np.array([x + 0.3, np.cos(angle), low + np.sin(angle)]) * [1.0, 0.9, 0.9]
-        part.cylinder(np.array([x, 0.0, low]), tip, 0.12 * radius + 0.01)
+        part.cylinder((x, 0.0, low), tip, 0.12 * radius + 0.01)
     if rng.random() < 0.5:
-        part.box(
-            (-half, 0.0, low + 0.2),
-            (0.35, 5.0 * radius, 4.5 * radius),
-            R=Rotation.from_rotvec([0.0, 0.15, 0.1]).as_matrix(),
-        )
+        roots = Rotation.from_rotvec([0.0, 0.15, 0.1]).as_matrix()
+        part.box((-half, 0.0, low + 0.2), (0.35, 5.0 * radius, 4.5 * radius), R=roots)
     return part

@@ -3,32 +3,48 @@
 Everything keeps its distance from all of the path, so also from where it crosses itself, comes back or turns round.
 """
 
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+
 import numpy as np
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField, Mover, Route, World
 from lidarslam.simulation.worlds import furnishing
-from lidarslam.simulation.worlds.building import Builder, smooth_noise
-from lidarslam.simulation.worlds.paths import on_ground
-from lidarslam.simulation.worlds.street.course import STEP_M, Course
-from lidarslam.simulation.worlds.street.network import KERB_HEIGHT_M, KERB_WIDTH_M
-from lidarslam.simulation.worlds.street.rows import FREE_SIDE_M, HALF_WIDTH_M, Rows
+from lidarslam.simulation.worlds.building import Builder, heading, left_of, smooth_noise
+from lidarslam.simulation.worlds.furnishing import on_slope, upright
+from lidarslam.simulation.worlds.open_country import plants
+from lidarslam.simulation.worlds.paths import grid_nodes, lengths_along, on_ground, points_along, prune
+from lidarslam.simulation.worlds.street.houses import house
+from lidarslam.simulation.worlds.street.network import KERB_WIDTH_M, RISE_M, STONE_M
+from lidarslam.simulation.worlds.street.street import furnish_pavement, house_pose, lay_kerbs, pave
 
+_STEP_M = 0.5
+# The road goes on straight for this long before the path and behind it.
+_BEYOND_M = 12.0
+# Directions are averaged over this length: a path has jitter, and a row of houses none.
+_SMOOTH_M = 3.0
+HALF_WIDTH_M = 5.0
+FREE_SIDE_M = 2.5
+_FRONT_M = HALF_WIDTH_M + 3.8
+_CAR_M = (5.4, 2.0)
 _MARGIN_M = 45.0
-_CELL_M = 0.5
 # Above this the ground's grid becomes wider, so that a path of kilometres takes no more memory than this.
 _MOST_GROUND_POINTS = 600_000
 _LONGEST_SIDE_M = 5_000.0
-_STONE_M = 3.0
-_MOST_PEOPLE = 24
+# A longer street has plainer houses and fewer things, so that the number of primitives grows slowly.
+_FULL_M = 700.0
 
 
 def build_along(path: FloatArray, seed: int) -> World:
     """A street with the path in its middle; within `FREE_SIDE_M` of the path, at any height, there is only the road.
 
-    The route goes along the path and back. Long streets have plainer houses and fewer things, so that the number of
-    primitives grows slowly, and a wider grid for the ground.
+    The route goes along the path and back.
 
     Args:
         path: (N, 2) polyline, or (N, 3) with the height of the ground; else the ground is gently hilly.
@@ -47,82 +63,188 @@ def build_along(path: FloatArray, seed: int) -> World:
     rng = np.random.default_rng(seed)
     course = Course.along(path)
     ground = _ground(rng, course)
-    solid = Builder()
-    rows = Rows(rng, course, ground)
-    rows.build(solid)
-    _kerbs(solid, course, ground)
-    there = course.points[:: round(2.0 / STEP_M), :2]
+    there = course.points[:: round(2.0 / _STEP_M), :2]
     route = Route(on_ground(np.concatenate([there, there[-2:0:-1]]), ground), 2.0, FREE_SIDE_M, 4.0, 11.0)
-    return World(
-        "street",
-        seed,
-        route,
-        boxes=solid.boxes,
-        cylinders=solid.cylinders,
-        height_fields=(ground,),
-        movers=tuple(_people(rng, rows, course, ground)),
-        map_spacing_m=0.1,
-    )
+    rows = _Rows(rng, course, ground)
+    rows.build(replace(route, free_height_m=1e3))
+    return World("street", seed, route, *rows.solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """An open path, as points half a metre apart."""
+
+    points: FloatArray  # (N, 2) or (N, 3)
+
+    @classmethod
+    def along(cls, path: FloatArray) -> "Course":
+        """The course of a polyline (M, 2) or (M, 3), at least one metre long, longer than it at either end."""
+        at = lengths_along(path[:, :2])
+        points = points_along(path, at, np.linspace(0.0, at[-1], max(4, int(np.ceil(at[-1] / _STEP_M)) + 1)))
+        first, last = (np.append(-left_of(left), np.zeros(path.shape[1] - 2)) for left in cls(points).lefts[[0, -1]])
+        ahead = _STEP_M * np.arange(1, int(_BEYOND_M / _STEP_M) + 1)[:, None]
+        return cls(np.concatenate([points[0] - ahead[::-1] * first, points, points[-1] + ahead * last]))
+
+    @property
+    def length_m(self) -> float:
+        """About how long it is."""
+        return _STEP_M * (len(self.points) - 1)
+
+    @cached_property
+    def lefts(self) -> FloatArray:
+        """(N, 2) unit, to the left of the way."""
+        smooth = gaussian_filter1d(self.points[:, :2], _SMOOTH_M / _STEP_M, axis=0, mode="nearest")
+        ahead = np.gradient(smooth, axis=0)
+        return left_of(ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9))
+
+    @cached_property
+    def tree(self) -> "cKDTree[None]":
+        """Of the points' x and y."""
+        return cKDTree(self.points[:, :2])
+
+    def sides(self) -> Iterator["Course"]:
+        """The course and its reverse: what is placed along the left of each is placed on both sides."""
+        yield self
+        yield Course(self.points[::-1])
+
+    def beside(self, at_m: FloatArray | float, left_m: float) -> FloatArray:
+        """Places (..., 2) to the left of the course, at lengths (...) along it."""
+        place = np.clip(np.asarray(at_m) / _STEP_M, 0, len(self.points) - 1).round().astype(int)
+        return np.asarray(self.points[place, :2] + left_m * self.lefts[place])
+
+    def distance(self, xy: FloatArray) -> FloatArray:
+        """Distance (M,) of points (M, 2) from the nearest part of the course."""
+        nearest = self.tree.query(xy)[0]
+        return np.asarray(
+            np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0))
+        )  # between two points it is nearer
 
 
 def _ground(rng: np.random.Generator, course: Course) -> HeightField:
-    """A cambered road, pavements a kerb higher, and roughness on both."""
     low = np.floor(course.points[:, :2].min(axis=0) - _MARGIN_M)
-    size = course.points[:, :2].max(axis=0) + _MARGIN_M - low
-    cell = max(_CELL_M, float(np.sqrt(size.prod() / _MOST_GROUND_POINTS)))
-    shape = tuple(np.ceil(size / cell).astype(int) + 1)
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    found = course.tree.query((low + cell * grid).reshape(-1, 2))
-    distance, nearest = np.asarray(found[0]).reshape(shape), np.asarray(found[1]).reshape(shape)
+    high = course.points[:, :2].max(axis=0) + _MARGIN_M
+    cell = max(RISE_M, float(np.sqrt((high - low).prod() / _MOST_GROUND_POINTS)))
+    distance, nearest = map(np.asarray, course.tree.query(grid_nodes(low, high, cell)))
     if course.points.shape[1] == 3:
-        from scipy.ndimage import gaussian_filter
-
-        heights = gaussian_filter(course.points[nearest, 2], 6.0 / cell, mode="nearest")
+        hills = gaussian_filter(course.points[nearest, 2], 6.0 / cell, mode="nearest")
     else:
-        heights = rng.uniform(0.6, 1.1) * smooth_noise(rng, shape, 40.0 / cell)
-    heights += 0.02 * smooth_noise(rng, shape, 3.0 / cell) + 0.005 * smooth_noise(rng, shape, 0.7)
-    heights += KERB_HEIGHT_M * np.clip((distance - HALF_WIDTH_M) / cell, 0.0, 1.0)
-    heights += 0.08 * (1.0 - (1.0 - np.clip(1.0 - distance / HALF_WIDTH_M, 0.0, 1.0)) ** 2)
-    return HeightField(low, cell, heights)
+        hills = rng.uniform(0.6, 1.1) * smooth_noise(rng, distance.shape, 40.0 / cell)
+    return HeightField(low, cell, pave(rng, hills, distance - HALF_WIDTH_M, cell, HALF_WIDTH_M))
 
 
-def _kerbs(solid: Builder, course: Course, ground: HeightField) -> None:
-    """Stones along the edges of the road, but not where another part of the path has its road."""
-    middle = HALF_WIDTH_M + 0.5 * KERB_WIDTH_M
-    laid: set[tuple[int, int]] = set()
-    for side in course.sides():
-        at = np.arange(0.0, side.length_m, _STONE_M)
-        starts, ends = side.beside(at, middle), side.beside(at + _STONE_M, middle)
-        lengths = np.linalg.norm(ends - starts, axis=1)
-        inside = np.minimum(course.distance(starts), course.distance(ends)) < HALF_WIDTH_M - 0.1
-        inside |= course.distance(0.5 * (starts + ends)) < HALF_WIDTH_M - 0.4
-        levels = (
-            ground.height_at(side.beside(at, middle + 0.8)),
-            ground.height_at(side.beside(at + _STONE_M, middle + 0.8)),
-        )
-        for k in np.flatnonzero(~inside & (lengths > 0.5)):
-            place = tuple(np.floor(0.5 * (starts[k] + ends[k])).astype(int).tolist())
-            if place not in laid:
-                laid.add(place)
-                solid.beam(
-                    np.append(starts[k], levels[0][k] - 0.14),
-                    np.append(ends[k], levels[1][k] - 0.14),
-                    KERB_WIDTH_M,
-                    0.3,
-                )
+@dataclass
+class _Rows:
+    """Puts things beside a course, none on another, none near any part of the course."""
+
+    rng: np.random.Generator
+    course: Course
+    ground: HeightField
+    solid: Builder = field(default_factory=Builder)
+    _loose: Builder = field(default_factory=Builder)  # may reach into the free space, and is pruned
+    _taken: set[tuple[int, int]] = field(default_factory=set)  # cells of one metre
+
+    @property
+    def _fullness(self) -> float:
+        return min(1.0, _FULL_M / self.course.length_m)
+
+    def build(self, free: Route) -> None:
+        """Add everything; houses first, they need most room."""
+        for side in self.course.sides():
+            self._houses(side)
+        for side in self.course.sides():
+            self._cars(side)
+            self._pavement(side)
+        self.solid.place(prune(self._loose, free, margin_m=0.02), np.eye(4))
+        lay_kerbs(self.solid, self._kerb_stones(), self.ground)
+
+    def _claim(self, footprint: FloatArray, nearest_m: float) -> bool:
+        """Take the cells of points (M, 2) if they are free and keep that distance from the course; whether they did."""
+        cells = {(int(x), int(y)) for x, y in np.floor(footprint)}
+        if self.course.distance(footprint).min() < nearest_m or not self._taken.isdisjoint(cells):
+            return False
+        self._taken |= cells
+        return True
+
+    def _houses(self, side: Course) -> None:
+        at = 0.0
+        while at < side.length_m:
+            wide, depth = self.rng.uniform(7.5, 15.0), self.rng.uniform(8.0, 11.0)
+            for width, setback in product((wide, 6.5), (0.0, 1.5, 3.5)):
+                start, end = side.beside(np.array([at, at + width]), _FRONT_M + setback)
+                front = float(np.linalg.norm(end - start))
+                if at + width > side.length_m or not 5.0 < front < 20.0:
+                    continue
+                along = (end - start) / front
+                # Fronts are straight where the road bends, and may come a metre closer.
+                if self._claim(_rectangle(start, along, front, depth), _FRONT_M - 1.0):
+                    self._house(start, along, front - 0.02, depth)
+                    at += width
+                    break
+            else:
+                at += 2.0
+
+    def _house(self, origin: FloatArray, along: FloatArray, width: float, depth: float) -> None:
+        """A house, or one time in eight a gap with a tree."""
+        if self.rng.random() < 0.12:
+            tree = plants.broadleaf(self.rng, self.rng.uniform(6.0, 9.0), 0.16, 24)
+            where = origin + 0.5 * width * along + 4.0 * left_of(along)
+            self._loose.place(tree, upright(self.ground, where, 0.0))
+            return
+        is_plain = bool(self.rng.random() > self._fullness)
+        part = house(self.rng, width, depth, (not is_plain, not is_plain), is_plain=is_plain)
+        self.solid.place(part, house_pose(self.ground, origin, along, width))
+
+    def _cars(self, side: Course) -> None:
+        taken = self._fullness * self.rng.uniform(0.45, 0.8)
+        for at in np.arange(4.0, side.length_m - 4.0, 6.0):
+            if self.rng.random() > taken:
+                continue
+            where = side.beside(at, HALF_WIDTH_M - 1.15 + self.rng.uniform(-0.08, 0.08))
+            ahead = -left_of(side.lefts[min(round(at / _STEP_M), len(side.points) - 1)])
+            footprint = _rectangle(where - 0.5 * (_CAR_M[0] * ahead + _CAR_M[1] * left_of(ahead)), ahead, *_CAR_M)
+            # Not on the pavement behind a bend, nor where another part of the path has its lane.
+            on_road = self.course.distance(footprint).max() <= HALF_WIDTH_M + 0.3
+            if on_road and self._claim(footprint, FREE_SIDE_M + 0.2):
+                yaw = heading(ahead) + np.pi * (self.rng.random() < 0.85)
+                self.solid.place(furnishing.car(self.rng), on_slope(self.ground, where, yaw, 3.0, 1.6))
+
+    def _pavement(self, side: Course) -> None:
+        for k, at in enumerate(np.arange(self.rng.uniform(1.0, 7.0), side.length_m, 8.0)):
+            where = side.beside(at, HALF_WIDTH_M + 0.9)
+            if self._claim(where[None], HALF_WIDTH_M + 0.7):
+                pose = upright(self.ground, where, heading(where - side.beside(at, HALF_WIDTH_M + 1.9)))
+                lamp_height = self.rng.uniform(5.0, 7.5) if k % 4 == 0 else 0.0
+                has_tree = bool(self.rng.random() < 0.45 * self._fullness)
+                furnish_pavement(self._loose, self._loose, self.rng, pose, lamp_height, has_tree)
+
+    def _kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Stones along the edges of the road, but not where another part of the path has its road."""
+        middle = HALF_WIDTH_M + RISE_M - 0.5 * KERB_WIDTH_M
+        laid: set[tuple[int, ...]] = set()
+        for side in self.course.sides():
+            for at in np.arange(0.0, side.length_m, STONE_M):
+                start, end = side.beside(np.array([at, at + STONE_M]), middle)
+                place = tuple(np.floor(0.5 * (start + end)).astype(int).tolist())
+                off = self.course.distance(np.stack([start, end, 0.5 * (start + end)]))
+                is_outside = (off > HALF_WIDTH_M + np.array([0.2, 0.2, -0.1])).all()
+                if is_outside and np.linalg.norm(end - start) > 0.5 and place not in laid:
+                    laid.add(place)
+                    yield start, end
+
+    def people(self) -> Iterator[Mover]:
+        """Pedestrians who walk up and down the pavement."""
+        rng = self.rng
+        for side in self.course.sides():
+            apart = max(40.0, side.length_m / 12.0)
+            for start in np.arange(rng.uniform(5.0, 20.0), side.length_m - 40.0, apart):
+                at = np.arange(start, start + rng.uniform(20.0, 35.0), 1.0)
+                there = side.beside(at, HALF_WIDTH_M + rng.uniform(1.9, 2.4))
+                if self._claim(there, HALF_WIDTH_M + 1.4):
+                    waypoints = on_ground(np.concatenate([there, there[-2:0:-1]]), self.ground)
+                    yield Mover(furnishing.pedestrian(rng).boxes, waypoints, rng.uniform(0.9, 1.5), 0.0)
 
 
-def _people(rng: np.random.Generator, rows: Rows, course: Course, ground: HeightField) -> list[Mover]:
-    """Pedestrians who walk up and down the pavement."""
-    movers: list[Mover] = []
-    for side in course.sides():
-        for start in np.arange(
-            rng.uniform(5.0, 20.0), side.length_m - 40.0, max(40.0, 2.0 * side.length_m / _MOST_PEOPLE)
-        ):
-            there = side.beside(
-                np.arange(start, start + rng.uniform(20.0, 35.0), 1.0), HALF_WIDTH_M + rng.uniform(1.9, 2.4)
-            )
-            if course.distance(there).min() > HALF_WIDTH_M + 1.4 and rows.land.is_free(there):
-                waypoints = on_ground(np.concatenate([there, there[-2:0:-1]]), ground)
-                movers.append(Mover(furnishing.pedestrian(rng).boxes, waypoints, rng.uniform(0.9, 1.5), 0.0))
-    return movers
+def _rectangle(origin: FloatArray, along: FloatArray, width: float, depth: float) -> FloatArray:
+    """Points (M, 2) all over a rectangle, less than a cell apart, from its corner (2,) along (2,) and to its left."""
+    x, y = (np.linspace(0.0, size, int(np.ceil(size / 0.7)) + 1) for size in (width, depth))
+    return np.asarray((origin + x[:, None, None] * along + y[:, None] * left_of(along)).reshape(-1, 2))

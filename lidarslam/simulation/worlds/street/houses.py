@@ -12,31 +12,23 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.simulation.worlds.building import Builder, rotation_z
 
 # Walls go this far down: houses stand level on streets that slope.
-FOUNDATION_M = 2.0
+_FOUNDATION_M = 2.0
 # Faces that would lie in one plane are set apart by this much.
 _OFFSET_M = 0.02
 
 
 @dataclass(frozen=True)
 class _Style:
-    """What all facades of one house have in common.
-
-    Attributes:
-        storeys, storey_m: how many, and how high each.
-        recess_m: of the windows behind the wall.
-        axis_m: about the distance between windows.
-        opening: of it, how much is window.
-        sill_m, lintel_m: where a window starts and ends above its floor; `ground_...` for the ground floor.
-    """
+    """Measures that all facades of one house share."""
 
     storeys: int
-    storey_m: float
-    recess_m: float
-    axis_m: float
-    opening: float
-    sill_m: float
+    storey_m: float  # height of a storey
+    recess_m: float  # of the windows behind the wall
+    axis_m: float  # about the distance between windows
+    opening: float  # share of it that is window
+    sill_m: float  # lower and upper edge of a window above its floor
     lintel_m: float
-    ground_sill_m: float
+    ground_sill_m: float  # the same on the ground floor
     ground_lintel_m: float
 
     @property
@@ -57,28 +49,37 @@ def house(
     depth: float,
     open_sides: tuple[bool, bool],
     storeys: tuple[int, int] = (2, 5),
+    is_plain: bool = False,
 ) -> Builder:
-    """A house of two to five storeys; `open_sides` says whether its left and right sides have windows too."""
+    """A house of two to five storeys.
+
+    Args:
+        rng: of its style.
+        width, depth: of the house.
+        open_sides: whether its left and right sides have windows too.
+        storeys: fewest and most.
+        is_plain: few wide windows and no ornaments, for streets of many kilometres.
+    """
     part = Builder()
-    style = _draw_style(rng, storeys)
+    style = _draw_style(rng, storeys, 3.0 if is_plain else 1.0)
     recess, top = style.recess_m, style.top_m
-    left, right = (recess * is_open for is_open in open_sides)
-    low, high = np.array([left, recess, -FOUNDATION_M]), np.array([width - right, depth, top])
+    x0, x1 = recess * open_sides[0], width - recess * open_sides[1]
     openings = style.openings(width)
     door = int(rng.integers(len(openings)))
     passage = bool(width > 9.0 and rng.random() < 0.2)
     if passage:  # a way through to the yard in place of the door
         middle = float(openings[door].mean())
-        x0, x1 = max(middle - 1.4, 0.4), min(middle + 1.4, width - 0.4)
-        part.block((low[0], low[1], low[2]), (x0, high[1], 3.0))
-        part.block((x1, low[1], low[2]), (high[0], high[1], 3.0))
-        part.block((low[0], low[1], 3.0), (high[0], high[1], high[2]))
-        before, after = openings[openings[:, 1] < x0 - 0.1], openings[openings[:, 0] > x1 + 0.1]
-        openings, door = np.concatenate([before, [[x0, x1]], after]), len(before)
+        a, b = max(middle - 1.4, 0.4), min(middle + 1.4, width - 0.4)
+        part.block((x0, recess, -_FOUNDATION_M), (a, depth, 3.0))
+        part.block((b, recess, -_FOUNDATION_M), (x1, depth, 3.0))
+        part.block((x0, recess, 3.0), (x1, depth, top))
+        before, after = openings[openings[:, 1] < a - 0.1], openings[openings[:, 0] > b + 0.1]
+        openings, door = np.concatenate([before, [[a, b]], after]), len(before)
     else:
-        part.block((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        part.block((x0, recess, -_FOUNDATION_M), (x1, depth, top))
     _facade(part, style, width, openings, door, passage)
-    _ornaments(part, rng, style, openings, door)
+    if not is_plain:
+        _ornaments(part, rng, style, openings, door)
     for is_open, corner, yaw in zip(open_sides, ((0.0, depth), (width, 0.0)), (-0.5 * np.pi, 0.5 * np.pi), strict=True):
         if is_open:
             side = Builder()
@@ -88,7 +89,7 @@ def house(
     return part
 
 
-def _draw_style(rng: np.random.Generator, storeys: tuple[int, int]) -> _Style:
+def _draw_style(rng: np.random.Generator, storeys: tuple[int, int], spread: float) -> _Style:
     storey = rng.uniform(2.9, 3.5)
     is_shop = rng.random() < 0.3
     sill = rng.uniform(0.7, 1.0)
@@ -96,7 +97,7 @@ def _draw_style(rng: np.random.Generator, storeys: tuple[int, int]) -> _Style:
         storeys=int(rng.integers(*storeys, endpoint=True)),
         storey_m=storey,
         recess_m=rng.uniform(0.14, 0.38),
-        axis_m=rng.uniform(2.1, 3.4),
+        axis_m=spread * rng.uniform(2.1, 3.4),
         opening=rng.uniform(0.4, 0.62),
         sill_m=sill,
         lintel_m=rng.uniform(sill + 1.2, storey - 0.25),
@@ -110,32 +111,26 @@ def _facade(
 ) -> None:
     """Piers between the columns of windows, bands between the storeys; the column `door` is open to the ground."""
     back, top = style.recess_m + _OFFSET_M, style.top_m
-    edges = np.concatenate([[0.0], openings.ravel(), [width]]).reshape(-1, 2)
-    for x0, x1 in edges:
+    for x0, x1 in np.concatenate([[0.0], openings.ravel(), [width]]).reshape(-1, 2):
         if x1 - x0 > 0.05:
-            part.block((x0, 0.0, -FOUNDATION_M), (x1, back, top))
+            part.block((x0, 0.0, -_FOUNDATION_M), (x1, back, top))
     sills = [style.ground_sill_m, *(style.storey_m * k + style.sill_m for k in range(1, style.storeys)), top]
     lintels = [style.ground_lintel_m, *(style.storey_m * k + style.lintel_m for k in range(1, style.storeys))]
     for low, high in zip(lintels, sills[1:], strict=True):
         part.block((0.01, _OFFSET_M, low), (width - 0.01, back, high))
-    spans = [(0.01, width - 0.01)]
-    if door >= 0:
-        spans = [(0.01, openings[door, 0]), (openings[door, 1], width - 0.01)]
-    for x0, x1 in spans:
-        part.block((x0, _OFFSET_M, -FOUNDATION_M), (x1, back, sills[0]))
+    ends = [0.01, width - 0.01] if door < 0 else [0.01, *openings[door], width - 0.01]
+    for x0, x1 in zip(ends[::2], ends[1::2], strict=True):
+        part.block((x0, _OFFSET_M, -_FOUNDATION_M), (x1, back, sills[0]))
     if door >= 0 and not is_passage:
-        x0, x1 = openings[door]
-        part.block((x0, -0.32, -0.6), (x1, back, 0.14))
+        part.block((openings[door, 0], -0.32, -0.6), (openings[door, 1], back, 0.14))
 
 
 def _ornaments(part: Builder, rng: np.random.Generator, style: _Style, openings: FloatArray, door: int) -> None:
-    """Cornice, downpipe, awning, and a bay or balconies on the upper floors."""
-    x0, x1 = 0.0, float(openings[-1, 1])
-    pipe = rng.choice([x0 + 0.12, x1 + 0.2])
-    part.pole(np.array([pipe, -0.07]), (-0.5, style.top_m - 0.1), 0.05)
+    """Downpipe, awning, and a bay or balconies on the upper floors."""
+    end = float(openings[-1, 1])
+    part.pole((rng.choice([0.12, end + 0.2]), -0.07), (-0.5, style.top_m - 0.1), 0.05)
     if style.ground_sill_m < 0.5 and rng.random() < 0.7:
-        start, end = np.array([0.5 * (x0 + x1), -rng.uniform(0.9, 1.3), 2.55]), np.array([0.5 * (x0 + x1), 0.05, 3.0])
-        part.beam(start, end, 0.85 * (x1 - x0), 0.05)
+        part.beam((0.5 * end, -rng.uniform(0.9, 1.3), 2.55), (0.5 * end, 0.05, 3.0), 0.85 * end, 0.05)
     elif rng.random() < 0.35:
         _bay(part, style, openings[int(rng.integers(len(openings)))], rng.uniform(0.5, 0.9))
     if rng.random() < 0.35:
@@ -171,7 +166,7 @@ def _balcony(part: Builder, opening: FloatArray, floor: float, reach: float) -> 
 
 
 def _roof(part: Builder, rng: np.random.Generator, width: float, depth: float, top: float) -> None:
-    """A flat roof behind a parapet, or a pitched one with its eaves to the street."""
+    """A cornice, and a flat roof behind a parapet or a pitched one with its eaves to the street; a chimney."""
     part.block((-0.01, -0.22, top - 0.05), (width + 0.01, 0.3, top + 0.18))
     if rng.random() < 0.45:
         high = top + rng.uniform(0.5, 0.9)
@@ -181,9 +176,8 @@ def _roof(part: Builder, rng: np.random.Generator, width: float, depth: float, t
         part.block((x, 0.4 * depth, top), (x + 2.4, 0.4 * depth + 3.0, top + 2.4))
     else:
         ridge = top + rng.uniform(0.5, 1.0) * 0.5 * depth
-        middle = np.array([0.5 * width, 0.5 * depth, ridge])
         for eave in (-0.35, depth + 0.35):
-            part.beam(np.array([0.5 * width, eave, top + 0.1]), middle, width, 0.2)
+            part.beam((0.5 * width, eave, top + 0.1), (0.5 * width, 0.5 * depth, ridge), width, 0.2)
         for fraction in (0.2, 0.5, 0.8):
             inset = 0.5 * depth * fraction
             high = top + fraction * (ridge - top)

@@ -4,34 +4,46 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.worlds.building import left_of
 
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 KERB_WIDTH_M = 0.3
 KERB_HEIGHT_M = 0.12
 # The ground rises from road to pavement over one cell of its grid, from the kerb's foot on.
 RISE_M = 0.5
-_STONE_M = 3.0
+STONE_M = 3.0
+
+
+class Side(NamedTuple):
+    """One side of a street: its middle line from a start (2,) along a direction (2,); the side is to the left."""
+
+    start: FloatArray
+    along: FloatArray
+    length_m: float
+
+    @property
+    def outward(self) -> FloatArray:
+        """(2,) away from the road."""
+        return left_of(self.along)
+
+    def at(self, along_m: float, left_m: float) -> FloatArray:
+        """A place (2,) beside the middle line."""
+        return self.start + along_m * self.along + left_m * self.outward
 
 
 @dataclass(frozen=True, eq=False)
 class StreetNetwork:
-    """Middle lines of streets.
+    """Middle lines of streets."""
 
-    Attributes:
-        nodes: (K, 2) crossings, corners and dead ends, at whole metres.
-        edges: (E, 2) pairs of nodes, each pair on a line along x or y.
-        half_width_m: from the middle line to the foot of the kerb, a multiple of `RISE_M`.
-        fillet_m: radius of the kerb where two streets meet.
-    """
-
-    nodes: FloatArray
-    edges: tuple[tuple[int, int], ...]
-    half_width_m: float
-    fillet_m: float
+    nodes: FloatArray  # (K, 2) crossings, corners and dead ends, at whole metres
+    edges: tuple[tuple[int, int], ...]  # pairs of nodes, each pair on a line along x or y
+    half_width_m: float  # from the middle line to the foot of the kerb, a multiple of `RISE_M`
+    fillet_m: float  # radius of the kerb where two streets meet
 
     def arms(self, node: int) -> FloatArray:
         """(4,) whether a street leads from the node to +x, +y, -x, -y."""
@@ -67,32 +79,29 @@ class StreetNetwork:
         ends = self.nodes[np.array(self.edges)]
         return np.stack([ends.min(axis=1), ends.max(axis=1)], axis=1)
 
-    def sides(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Both sides of each street: its first end, its last end, and the direction (2,) away from the road.
-
-        Away from the road is to the left of the way from the first end to the last.
-        """
-        for a, b in self.edges:
-            for start, end in ((self.nodes[a], self.nodes[b]), (self.nodes[b], self.nodes[a])):
-                along = (end - start) / np.linalg.norm(end - start)
-                yield start, end, np.array([-along[1], along[0]])
+    def sides(self) -> Iterator[Side]:
+        """Both sides of each street."""
+        for edge in self.edges:
+            for start, end in (self.nodes[list(edge)], self.nodes[list(edge[::-1])]):
+                length = float(np.linalg.norm(end - start))
+                yield Side(start, (end - start) / length, length)
 
     def kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Middle lines of the kerb's stones, from (2,) to (2,)."""
         middle = RISE_M - 0.5 * KERB_WIDTH_M
         reach = self.half_width_m + self.fillet_m
-        for start, end, outward in self.sides():
-            along = (end - start) / np.linalg.norm(end - start)
-            first = reach if self._leads(start, outward) else 0.0
-            last = np.linalg.norm(end - start) - (reach if self._leads(end, outward) else 0.0)
-            aside = (self.half_width_m + middle) * outward
-            at = np.linspace(first, last, max(2, 1 + round((last - first) / _STONE_M)))
-            yield from _pairs(start + at[:, None] * along + aside)
-        for at_node, one, other, streets in self.corners():
+        for side in self.sides():
+            end = side.start + side.length_m * side.along
+            first = reach if self._leads(side.start, side.outward) else 0.0
+            last = side.length_m - (reach if self._leads(end, side.outward) else 0.0)
+            aside = (self.half_width_m + middle) * side.outward
+            at = np.linspace(first, last, max(2, 1 + round((last - first) / STONE_M)))
+            yield from pairwise(side.start + at[:, None] * side.along + aside)
+        for node, one, other, streets in self.corners():
             if streets == 2:
-                yield from _pairs(_quarter(at_node + reach * (one + other), -one, -other, self.fillet_m - middle))
+                yield from pairwise(_quarter(node + reach * (one + other), -one, -other, self.fillet_m - middle))
             elif streets == 0:
-                yield from _pairs(_quarter(at_node, one, other, self.half_width_m + middle))
+                yield from pairwise(_quarter(node, one, other, self.half_width_m + middle))
 
     def _leads(self, at: FloatArray, direction: FloatArray) -> bool:
         """Whether a street leads that way from the node at (2,)."""
@@ -104,7 +113,3 @@ def _quarter(centre: FloatArray, one: FloatArray, other: FloatArray, radius: flo
     """Points (N, 2) on a quarter of a circle between two directions."""
     angle = np.linspace(0.0, 0.5 * np.pi, max(4, round(radius / 0.6)))[:, None]
     return np.asarray(centre + radius * (np.cos(angle) * one + np.sin(angle) * other))
-
-
-def _pairs(points: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    return pairwise(points)

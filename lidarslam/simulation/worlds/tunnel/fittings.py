@@ -1,4 +1,4 @@
-"""What miners left in a tunnel: supports, pipes, cables, rails, lamps, and rocks that came down."""
+"""Fittings of a tunnel: supports, pipes, cables, rails, lamps, and rocks that came down."""
 
 from itertools import pairwise
 
@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from lidarslam.simulation.worlds.building import UP, Builder
-from lidarslam.simulation.worlds.tunnel.stations import Stations
+from lidarslam.simulation.worlds.tunnel.rock import Stations
 
 
 def fit_out(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
@@ -51,9 +51,8 @@ def _lay_pipe(stations: Stations, builder: Builder, rng: np.random.Generator) ->
         if k % 4 == 0:
             along = (end - start) / np.linalg.norm(end - start)
             builder.cylinder(start - 0.03 * along, start + 0.03 * along, 1.5 * radius)
-            builder.beam(
-                start - 1.2 * radius * UP, stations.at(a, side * (wall[a] + 0.1), up - 1.2 * radius), 0.05, 0.03
-            )
+            bracket = stations.at(a, side * (wall[a] + 0.1), up - 1.2 * radius)
+            builder.beam(start - 1.2 * radius * UP, bracket, 0.05, 0.03)
 
 
 def _hang_cable(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:
@@ -62,12 +61,11 @@ def _hang_cable(stations: Stations, builder: Builder, rng: np.random.Generator) 
     aside = side * np.minimum(share * stations.wall(side, 1.8), stations.half_widths)
     for k in _stretch(len(stations), rng, 0.3, 0.9)[::3]:
         a, b = k % len(stations), (k + 3) % len(stations)
-        ends = [stations.at(j, aside[j], 0.0) for j in (a, b)]
-        for end in ends:
-            end[2] = float(stations.rock.roof.height_at(end[None, :2])[0]) - 0.06
-        ts, sag = np.linspace(0.0, 1.0, 4), rng.uniform(0.08, 0.2)
-        points = [ends[0] + t * (ends[1] - ends[0]) - 4.0 * sag * t * (1 - t) * UP for t in ts]
-        over_way = min(p[2] for p in points) - max(stations.floor[a, 2], stations.floor[b, 2])
+        ends = np.stack([stations.at(j, aside[j], 0.0) for j in (a, b)])
+        ends[:, 2] = stations.rock.roof.height_at(ends[:, :2]) - 0.06
+        t, sag = np.linspace(0.0, 1.0, 4)[:, None], rng.uniform(0.08, 0.2)
+        points = ends[0] + t * (ends[1] - ends[0]) - 4.0 * sag * t * (1 - t) * UP
+        over_way = points[:, 2].min() - max(stations.floor[a, 2], stations.floor[b, 2])
         if abs(aside[a] - aside[b]) > 1.0 or over_way < stations.free_height_m + 0.15:
             continue
         for p, q in pairwise(points):
@@ -82,26 +80,24 @@ def _set_supports(stations: Stations, builder: Builder, rng: np.random.Generator
     for k in _stretch(len(stations), rng, 0.08, 0.22)[::every]:
         j = k % len(stations)
         asides = (left[j] - 0.5 * thick, -(right[j] - 0.5 * thick))
-        if (
-            max(left[j], right[j]) > stations.half_widths[j] + 0.6
-            or min(asides[0], -asides[1]) < stations.free_side_m + thick
-        ):
+        is_wide = max(left[j], right[j]) > stations.half_widths[j] + 0.6
+        if is_wide or min(asides[0], -asides[1]) < stations.free_side_m + thick:
             continue
         across = np.array([stations.at(j, a, 0.0) for a in np.linspace(asides[1] + 0.3, asides[0] - 0.3, 9)])
         roof = float(stations.rock.roof.height_at(across[:, :2]).min())
         top = max(roof - 0.03, stations.floor[j, 2] + stations.free_height_m + thick + 0.2)
         feet = [stations.on_ground(j, a) for a in asides]
         heads = [np.array([*stations.at(j, 0.9 * a, 0.0)[:2], top - thick]) for a in asides]
-        for foot, head in zip(feet, heads, strict=True):
-            if timber:
-                builder.cylinder(foot - 0.45 * UP, head, 0.5 * thick)
-            else:
-                builder.beam(foot - 0.45 * UP, head, 0.8 * thick, 0.8 * thick)
+        lift = 0.5 * thick * UP
         if timber:
+            for foot, head in zip(feet, heads, strict=True):
+                builder.cylinder(foot - 0.45 * UP, head, 0.5 * thick)
             cap = 0.15 * (heads[0] - heads[1]) / np.linalg.norm(heads[0] - heads[1])
-            builder.cylinder(heads[1] - cap + 0.5 * thick * UP, heads[0] + cap + 0.5 * thick * UP, 0.5 * thick)
+            builder.cylinder(heads[1] - cap + lift, heads[0] + cap + lift, 0.5 * thick)
         else:
-            builder.beam(heads[1] + 0.5 * thick * UP, heads[0] + 0.5 * thick * UP, 0.8 * thick, thick)
+            for foot, head in zip(feet, heads, strict=True):
+                builder.beam(foot - 0.45 * UP, head, 0.8 * thick, 0.8 * thick)
+            builder.beam(heads[1] + lift, heads[0] + lift, 0.8 * thick, thick)
 
 
 def _lay_rails(stations: Stations, builder: Builder, rng: np.random.Generator) -> None:

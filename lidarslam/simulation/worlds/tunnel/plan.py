@@ -5,37 +5,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.simulation.worlds.building import left_of
+from lidarslam.simulation.worlds.paths import lengths_along, points_along
 
 SPACING_M = 0.25
-STEEPEST = 0.08
+_STEEPEST = 0.08
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """A drift through the rock.
+    """A drift through the rock."""
 
-    Attributes:
-        line: (N, 3) middle of its floor, every `SPACING_M`; the loop's last point is next to its first.
-        half_widths: (N,) from the middle to the wall.
-        heights: (N,) of the roof above the floor, in the middle.
-    """
-
-    line: FloatArray
-    half_widths: FloatArray
-    heights: FloatArray
+    line: FloatArray  # (N, 3) middle of its floor, every `SPACING_M`; the loop's last point is next to its first
+    half_widths: FloatArray  # (N,) from the middle to the wall
+    heights: FloatArray  # (N,) of the roof above the floor, in the middle
 
 
 @dataclass(frozen=True)
 class MinePlan:
-    """Galleries, the loop first, and pillars of rock left standing in chambers.
+    """Galleries, and pillars of rock left standing in chambers."""
 
-    Attributes:
-        galleries: the loop, then those that branch off.
-        pillars: (P, 3) middle x, y and radius.
-    """
-
-    galleries: tuple[Gallery, ...]
-    pillars: FloatArray
+    galleries: tuple[Gallery, ...]  # the loop first
+    pillars: FloatArray  # (P, 3) middle x, y and radius
 
 
 def draw_mine(rng: np.random.Generator) -> MinePlan:
@@ -52,10 +43,9 @@ def draw_mine(rng: np.random.Generator) -> MinePlan:
     return MinePlan(tuple(galleries), pillars)
 
 
-def level_normals(line: FloatArray, closed: bool) -> FloatArray:
-    """(N, 2) unit vectors to the left of a line (N, 3)."""
-    ahead = np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0) if closed else np.gradient(line, axis=0)
-    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+def loop_lefts(line: FloatArray) -> FloatArray:
+    """(N, 2) unit vectors to the left of a closed line (N, 3)."""
+    left = left_of(np.roll(line, -1, axis=0) - np.roll(line, 1, axis=0))
     return np.asarray(left / np.linalg.norm(left, axis=1, keepdims=True))
 
 
@@ -67,16 +57,14 @@ def _draw_loop(rng: np.random.Generator) -> Gallery:
         size = 0.24 / (k - 0.6) if k < 6 else 0.022
         radius += size * rng.uniform(0.4, 1.0) * np.cos(k * angle + rng.uniform(0.0, 2.0 * np.pi))
     xy = np.stack([rng.uniform(1.0, 1.5) * radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    ends = np.cumsum(np.linalg.norm(np.roll(xy, -1, axis=0) - xy, axis=1))
+    closed = np.concatenate([xy, xy[:1]])
+    along = lengths_along(closed)
     length = rng.uniform(155.0, 260.0)
-    xy *= length / ends[-1]
     n = round(length / SPACING_M)
-    along = np.concatenate([[0.0], ends]) * length / ends[-1]
-    at = np.arange(n) * (length / n)
-    line = np.stack([np.interp(at, along, np.append(xy[:, i], xy[0, i])) for i in range(2)], axis=1)
+    line = points_along(closed * (length / along[-1]), along * length / along[-1], length / n * np.arange(n))
     z = _waves(rng, n, 3)
     steepest = float(np.abs(np.roll(z, -1) - z).max()) * n / length
-    z *= rng.uniform(0.6, 1.0) * STEEPEST / steepest
+    z *= rng.uniform(0.6, 1.0) * _STEEPEST / steepest
     return Gallery(
         np.column_stack([line, z - z[0]]),
         2.25 + 0.5 * np.tanh(_waves(rng, n, 14)),
@@ -95,7 +83,7 @@ def _waves(rng: np.random.Generator, n: int, most: int) -> FloatArray:
 def _with_chambers(loop: Gallery, rng: np.random.Generator) -> tuple[Gallery, FloatArray]:
     """The loop with one to three places where it widens, and pillars that stand in them."""
     n, widths, heights = len(loop.line), loop.half_widths.copy(), loop.heights.copy()
-    left, pillars = level_normals(loop.line, closed=True), []
+    left, pillars = loop_lefts(loop.line), []
     for k in rng.choice(8, size=int(rng.integers(1, 4)), replace=False):
         middle = int((k + 0.5) * n / 8)
         away = np.minimum(np.mod(np.arange(n) - middle, n), np.mod(middle - np.arange(n), n)) * SPACING_M
@@ -125,13 +113,13 @@ def _draw_cut(loop: Gallery, rng: np.random.Generator) -> Gallery:
 def _draw_branch(loop: Gallery, rng: np.random.Generator, alcove: bool) -> Gallery:
     """A dead end off the loop: a gallery of 8 to 16 m, or an alcove a few metres deep."""
     k, side = int(rng.integers(len(loop.line))), float(rng.choice([-1.0, 1.0]))
-    left = level_normals(loop.line, closed=True)[k] * side
+    left = loop_lefts(loop.line)[k] * side
     heading = float(np.arctan2(left[1], left[0])) + rng.uniform(-0.5, 0.5)
     length = loop.half_widths[k] + (rng.uniform(1.2, 2.4) if alcove else rng.uniform(8.0, 16.0))
     at = np.arange(0.0, length, SPACING_M)
     headings = heading + rng.uniform(-0.05, 0.05) * at
     xy = loop.line[k, :2] + np.cumsum(np.stack([np.cos(headings), np.sin(headings)], axis=1), axis=0) * SPACING_M
-    z = loop.line[k, 2] + (0.0 if alcove else rng.uniform(-STEEPEST, STEEPEST)) * np.maximum(at - 2.0, 0.0)
+    z = loop.line[k, 2] + (0.0 if alcove else rng.uniform(-_STEEPEST, _STEEPEST)) * np.maximum(at - 2.0, 0.0)
     widths, heights = ((0.8, 1.3), (2.0, 2.6)) if alcove else ((1.4, 2.0), (2.4, 3.2))
     return _gallery(np.column_stack([xy, z]), rng, widths, heights)
 
@@ -140,12 +128,11 @@ def _gallery(
     line: FloatArray, rng: np.random.Generator, widths: tuple[float, float], heights: tuple[float, float]
 ) -> Gallery:
     """A gallery along a line of any spacing, its width and height varying between limits."""
-    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    ends = lengths_along(line)
     at = np.arange(0.0, ends[-1], SPACING_M)
-    resampled = np.stack([np.interp(at, ends, line[:, i]) for i in range(3)], axis=1)
     knots = np.linspace(0.0, ends[-1], max(2, int(ends[-1] / 4.0)))
-    curves = [np.interp(at, knots, rng.uniform(*limits, len(knots))) for limits in (widths, heights)]
-    return Gallery(resampled, curves[0], curves[1])
+    curves = (np.interp(at, knots, rng.uniform(*limits, len(knots))) for limits in (widths, heights))
+    return Gallery(points_along(line, ends, at), *curves)
 
 
 def _keeps_apart(branch: Gallery, others: list[Gallery]) -> bool:

@@ -1,4 +1,4 @@
-"""Rough rock around galleries: a ground and a roof that meet in the walls."""
+"""Rough rock around galleries: a ground and a roof that meet in the walls, and stations along the loop between them."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,20 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.world import HeightField
-from lidarslam.simulation.worlds.building import smooth_noise
-from lidarslam.simulation.worlds.tunnel.plan import MinePlan
+from lidarslam.simulation.worlds.building import UP, smooth_noise
+from lidarslam.simulation.worlds.paths import grid_nodes
+from lidarslam.simulation.worlds.tunnel.plan import SPACING_M, Gallery, MinePlan, loop_lefts
 
-CELL_M = 0.2
-BORDER_M = 8.0
+_CELL_M = 0.2
+_BORDER_M = 8.0
 # Walls lean: steeper than this and the grid would show as teeth.
-WALL_SLOPE = 3.2
+_WALL_SLOPE = 3.2
 # Half the width that is left open along the loop whatever the roughness, and the headroom over half of it.
-CORE_M, HEADROOM_M = 1.75, 2.35
-BEND_M = 0.12
+_CORE_M, _HEADROOM_M = 1.75, 2.35
+_BEND_M = 0.12
 # Further than this from a gallery, its rock is solid whatever its width and roughness.
-REACH_M = 10.0
+_REACH_M = 10.0
+_STATION_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -46,24 +48,22 @@ class Rock:
 def carve(plan: MinePlan, rng: np.random.Generator) -> Rock:
     """The rock around the galleries, the ground first."""
     lines = np.concatenate([gallery.line for gallery in plan.galleries])
-    low = lines[:, :2].min(axis=0) - BORDER_M
-    shape = (np.ceil((lines[:, :2].max(axis=0) + BORDER_M - low) / CELL_M) + 1).astype(int)
-    shape_xy = (int(shape[0]), int(shape[1]))
-    nodes = low + CELL_M * np.stack(np.meshgrid(*(np.arange(n) for n in shape_xy), indexing="ij"), axis=-1)
+    low = lines[:, :2].min(axis=0) - _BORDER_M
+    nodes = grid_nodes(low, lines[:, :2].max(axis=0) + _BORDER_M, _CELL_M)
+    shape = nodes.shape[:2]
     depth, floor, height, to_loop = _blend(plan, nodes)
-    warp = sum(
-        (size * smooth_noise(rng, shape_xy, scale) for size, scale in ((0.24, 9.0), (0.13, 3.5), (0.06, 1.3))),
-        np.zeros(shape_xy),
-    )
-    depth = np.maximum(np.clip(depth + warp, -3.0, None), CORE_M - to_loop)
+    warp = np.zeros(shape)
+    for size, scale in ((0.24, 9.0), (0.13, 3.5), (0.06, 1.3)):
+        warp += size * smooth_noise(rng, shape, scale)
+    depth = np.maximum(np.clip(depth + warp, -3.0, None), _CORE_M - to_loop)
     for x, y, radius in plan.pillars:
         depth = np.minimum(depth, np.hypot(nodes[..., 0] - x, nodes[..., 1] - y) - radius + 0.5 * warp)
     ground = floor + _floor_roughness(depth, to_loop, rng) + _rise(0.5 - depth)
-    bumps = 0.12 * smooth_noise(rng, shape_xy, 6.0) + 0.08 * smooth_noise(rng, shape_xy, 2.2)
+    bumps = 0.12 * smooth_noise(rng, shape, 6.0) + 0.08 * smooth_noise(rng, shape, 2.2)
     arch = 0.3 * height * np.clip(1.0 - depth / 1.9, 0.0, 1.0) ** 2
     roof = floor + height + bumps - arch - _rise(0.35 - depth)
-    headroom = floor + HEADROOM_M - WALL_SLOPE * np.maximum(to_loop - 1.05, 0.0)
-    return Rock(HeightField(low, CELL_M, ground), HeightField(low, CELL_M, np.maximum(roof, headroom)))
+    headroom = floor + _HEADROOM_M - _WALL_SLOPE * np.maximum(to_loop - 1.05, 0.0)
+    return Rock(HeightField(low, _CELL_M, ground), HeightField(low, _CELL_M, np.maximum(roof, headroom)))
 
 
 def _blend(plan: MinePlan, nodes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -71,18 +71,17 @@ def _blend(plan: MinePlan, nodes: FloatArray) -> tuple[FloatArray, FloatArray, F
 
     Where galleries meet, each counts by how deep inside of it a node is.
     """
-    distances, depths, floors, heights = [], [], [], []
+    parts = []
     for gallery in plan.galleries:
-        distance, nearest = cKDTree(gallery.line[:, :2]).query(nodes, distance_upper_bound=REACH_M)
-        distance, nearest = np.minimum(distance, REACH_M), np.minimum(nearest, len(gallery.line) - 1)
-        distances.append(distance)
-        depths.append(gallery.half_widths[nearest] - distance)
-        floors.append(gallery.line[nearest, 2])
-        heights.append(gallery.heights[nearest])
-    to_loop, deepest = distances[0], np.max(depths, axis=0)
-    weights = np.exp((np.stack(depths) - deepest) / 0.5)
+        distance, nearest = cKDTree(gallery.line[:, :2]).query(nodes, distance_upper_bound=_REACH_M)
+        distance, nearest = np.minimum(distance, _REACH_M), np.minimum(nearest, len(gallery.line) - 1)
+        depth = gallery.half_widths[nearest] - distance
+        parts.append((distance, depth, gallery.line[nearest, 2], gallery.heights[nearest]))
+    distances, depths, floors, heights = (np.stack(part) for part in zip(*parts, strict=True))
+    to_loop, deepest = distances[0], depths.max(axis=0)
+    weights = np.exp((depths - deepest) / 0.5)
     weights /= weights.sum(axis=0)
-    floor, height = (weights * np.stack(floors)).sum(axis=0), (weights * np.stack(heights)).sum(axis=0)
+    floor, height = (weights * floors).sum(axis=0), (weights * heights).sum(axis=0)
     # On the loop the floor is the loop's own, so that the way does not jerk at junctions.
     share = np.exp(-((to_loop / 1.5) ** 4))
     floor = share * floors[0] + (1.0 - share) * floor
@@ -98,5 +97,49 @@ def _floor_roughness(depth: FloatArray, to_loop: FloatArray, rng: np.random.Gene
 
 
 def _rise(x: FloatArray) -> FloatArray:
-    """0 for x well below 0, a slope of `WALL_SLOPE` above, with a short bend between."""
-    return np.asarray(WALL_SLOPE * BEND_M * np.logaddexp(0.0, x / BEND_M))
+    """0 for x well below 0, a slope of `_WALL_SLOPE` above, with a short bend between."""
+    return np.asarray(_WALL_SLOPE * _BEND_M * np.logaddexp(0.0, x / _BEND_M))
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Places along the loop, `_STATION_M` apart."""
+
+    floor: FloatArray  # (N, 3) on the ground in the middle
+    left: FloatArray  # (N, 2) unit vectors to the left
+    half_widths: FloatArray  # (N,) as planned
+    rock: Rock  # around them
+    free_side_m: float  # to be kept free of fittings, as is the height
+    free_height_m: float
+
+    def __len__(self) -> int:
+        return len(self.floor)
+
+    def at(self, k: int, aside: float, up: float) -> FloatArray:
+        """A point (3,) that far to the left of station k (counted round and round) and above its floor."""
+        k %= len(self)
+        return np.append(self.floor[k, :2] + aside * self.left[k], self.floor[k, 2] + up)
+
+    def on_ground(self, k: int, aside: float) -> FloatArray:
+        """A point (3,) on the ground that far to the left of station k."""
+        point = self.at(k, aside, 0.0)
+        point[2] = float(self.rock.ground.height_at(point[None, :2])[0])
+        return point
+
+    def is_beside(self, point: FloatArray, reach: float) -> bool:
+        """Whether what reaches that far around a point (3,) keeps out of the free space along the way."""
+        nearest = float(np.linalg.norm(self.floor[:, :2] - point[:2], axis=1).min())
+        # Between two stations the way is up to this much closer.
+        return nearest > float(np.hypot(self.free_side_m + reach + 0.05, 0.5 * _STATION_M))
+
+    def wall(self, side: float, up: float) -> FloatArray:
+        """(N,) distance to the wall on one side (+1 left, -1 right), at a height above the floor."""
+        return self.rock.reach(self.floor + up * UP, side * self.left)
+
+
+def place_stations(loop: Gallery, rock: Rock, free_side_m: float, free_height_m: float) -> Stations:
+    """Stations along the loop, on the carved ground."""
+    every = round(_STATION_M / SPACING_M)
+    line, left = loop.line[::every].copy(), loop_lefts(loop.line)[::every]
+    line[:, 2] = rock.ground.height_at(line[:, :2])
+    return Stations(line, left, loop.half_widths[::every], rock, free_side_m, free_height_m)

@@ -6,11 +6,10 @@ from lidarslam.simulation.world import Route, World
 from lidarslam.simulation.worlds.building import Builder
 from lidarslam.simulation.worlds.tunnel.fittings import fit_out
 from lidarslam.simulation.worlds.tunnel.plan import SPACING_M, draw_mine
-from lidarslam.simulation.worlds.tunnel.rock import carve
-from lidarslam.simulation.worlds.tunnel.stations import place_stations
+from lidarslam.simulation.worlds.tunnel.rock import carve, place_stations
 
-WAYPOINT_M = 1.5
-FREE_SIDE_M, FREE_HEIGHT_M = 0.8, 2.05
+_WAYPOINT_M = 1.5
+_FREE_SIDE_M, _FREE_HEIGHT_M = 0.8, 2.05
 
 
 def build(seed: int) -> World:
@@ -20,14 +19,8 @@ def build(seed: int) -> World:
     rock = carve(plan, rng)
     builder = Builder()
     loop = plan.galleries[0]
-    fit_out(place_stations(loop, rock, FREE_SIDE_M, FREE_HEIGHT_M), builder, rng)
-    waypoints = loop.line[:: round(WAYPOINT_M / SPACING_M)].copy()
+    fit_out(place_stations(loop, rock, _FREE_SIDE_M, _FREE_HEIGHT_M), builder, rng)
+    waypoints = loop.line[:: round(_WAYPOINT_M / SPACING_M)].copy()
     waypoints[:, 2] = rock.ground.height_at(waypoints[:, :2])
-    return World(
-        "tunnel",
-        seed,
-        Route(waypoints, 0.4, FREE_SIDE_M, FREE_HEIGHT_M, 1.5),
-        boxes=builder.boxes,
-        cylinders=builder.cylinders,
-        height_fields=(rock.ground, rock.roof),
-    )
+    route = Route(waypoints, 0.4, _FREE_SIDE_M, _FREE_HEIGHT_M, 1.5)
+    return World("tunnel", seed, route, *builder.solids, (rock.ground, rock.roof))
