@@ -13,8 +13,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.yaml_text import YamlError, parse_yaml, settings_as_yaml
-from lidarslam.config.yaml_text import read_yaml as read_yaml_file
+from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run.directory import RUN_SECTION
@@ -111,23 +110,6 @@ def dump_yaml(config: BaseModel, described: dict[str, Any] | None = None, sectio
         return settings_as_yaml(config)
     first = yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)
     return f"{first}\n{settings_as_yaml(config)}"
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The tree in a file.
-
-    Raises:
-        ConfigError: it is not readable YAML, or no keys and values.
-    """
-    try:
-        tree = read_yaml_file(path)
-    except YamlError as error:
-        raise ConfigError(f"{path}: {error}") from error
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: expected keys and values, got a {type(tree).__name__}")
-    return tree
 
 
 def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
