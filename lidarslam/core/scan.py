@@ -102,7 +102,7 @@ class Scan:
         )
 
 
-def _column(name: str, values: ArrayLike | None, count: int, dtype: DTypeLike) -> NDArray[Any] | None:
+def _column(name: str, values: ArrayLike | None, count: int, dtype: DTypeLike | None) -> NDArray[Any] | None:
     """An attribute (N,) of N points; without a dtype, of whatever type it has."""
     if values is None:
         return None
