@@ -1,1 +1,1 @@
-"""The commands, one a file: each parses, imports what it needs, calls one function, and says what came of it."""
+"""The commands, one a file: each parses its options, imports and calls one function, and prints the result."""

@@ -1,6 +1,7 @@
 """Options that several commands share, and the configuration they result in."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,34 +35,29 @@ class _Path(click.Path):
 
 
 class Registered(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
-    """One of the names in a registry, which is imported when needed."""
+    """One of the names in a registry, a dictionary in a module that is imported when needed."""
 
     name = "name"
 
-    def __init__(self, names: Callable[[], Iterable[str]]) -> None:
-        self._names = names
+    def __init__(self, module: str, registry: str) -> None:
+        self._module, self._registry = module, registry
 
     def _choice(self) -> "click.Choice[str]":
-        return click.Choice(list(self._names()))
+        return click.Choice(list(getattr(import_module(self._module), self._registry)))
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         return self._choice().convert(value, param, ctx)
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:  # noqa: ARG002
-        return f"[{'|'.join(self._names())}]"
+        return f"[{'|'.join(self._choice().choices)}]"
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         return self._choice().shell_complete(ctx, param, incomplete)
 
 
-def _readers() -> Iterable[str]:
-    from lidarslam.datasets.registry import READERS
-
-    return READERS
-
-
 PATH = _Path(path_type=Path)
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+_READER = Registered("lidarslam.datasets.registry", "READERS")
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -84,7 +80,7 @@ config_options = _together(
     click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One setting; may be repeated."),
 )
 reader_options = _together(
-    click.option("--reader", type=Registered(_readers), help="Reader of the source.  [default: recognised]"),
+    click.option("--reader", type=_READER, help="Reader of the source.  [default: recognised]"),
     click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag with several."),
     click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
 )

@@ -1,6 +1,5 @@
 """`lidarslam simulate`: a recording with exact truth."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,35 +8,11 @@ import click
 from lidarslam.commands.options import FILE, PATH, CommandWithExample, Registered
 from lidarslam.commands.terminal import say
 
-
-def _worlds() -> Iterable[str]:
-    from lidarslam.simulation.worlds.registry import WORLDS
-
-    return WORLDS
-
-
-def _sensors() -> Iterable[str]:
-    from lidarslam.simulation.sensors.table import SENSORS
-
-    return SENSORS
-
-
-def _motions() -> Iterable[str]:
-    from lidarslam.simulation.motion.carriers import CARRIERS
-
-    return CARRIERS
-
-
-def _mounts() -> Iterable[str]:
-    from lidarslam.simulation.motion.carriers import MOUNTS
-
-    return MOUNTS
-
-
-def _formats() -> Iterable[str]:
-    from lidarslam.simulation.writers.registry import FORMATS
-
-    return FORMATS
+_WORLD = Registered("lidarslam.simulation.worlds.registry", "WORLDS")
+_SENSOR = Registered("lidarslam.simulation.sensors.table", "SENSORS")
+_CARRIER = Registered("lidarslam.simulation.motion.carriers", "CARRIERS")
+_MOUNT = Registered("lidarslam.simulation.motion.carriers", "MOUNTS")
+_FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 
 
 @click.command(
@@ -48,11 +23,11 @@ def _formats() -> Iterable[str]:
     lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000""",
 )
 @click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder of the recording.")
-@click.option("--world", type=Registered(_worlds), default="office", show_default=True, help="Scene.")
-@click.option("--sensor", type=Registered(_sensors), default="vlp-16", show_default=True, help="LiDAR model.")
+@click.option("--world", type=_WORLD, default="office", show_default=True, help="Scene.")
+@click.option("--sensor", type=_SENSOR, default="vlp-16", show_default=True, help="LiDAR model.")
 @click.option(
     "--motion",
-    type=Registered(_motions),
+    type=_CARRIER,
     help="Carrier of the LiDAR.  [default: handheld; car with --trajectory]",
 )
 @click.option(
@@ -69,10 +44,10 @@ def _formats() -> Iterable[str]:
     help="TUM or KITTI file to follow, KITTI's smoothed over 0.25 s. The street is built around it; in other worlds it"
     " must keep clear of obstacles.",
 )
-@click.option("--mount", type=Registered(_mounts), default="upright", show_default=True, help="Mounting of the LiDAR.")
+@click.option("--mount", type=_MOUNT, default="upright", show_default=True, help="Mounting of the LiDAR.")
 @click.option("--scans", type=click.IntRange(min=1), help="Number of scans.  [default: 300, or all of the trajectory]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
-@click.option("--format", type=Registered(_formats), default="mcap", show_default=True, help="Format of the files.")
+@click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Simulate a recording, with the exact trajectory and the exact map."""

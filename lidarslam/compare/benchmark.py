@@ -14,7 +14,7 @@ from evaluation.comparison.table import TableCell, TableRow
 from lidarslam.compare.methods import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
-from lidarslam.config.yaml_text import YamlError, read_yaml
+from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.simulation.recording.folder import README, REFERENCE_MAP
 from lidarslam.simulation.recording.record import record
@@ -111,8 +111,6 @@ def load_benchmark(path: Path) -> Benchmark:
     """
     try:
         return Benchmark.model_validate(read_yaml(path))
-    except YamlError as error:
-        raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
         faults = [
             ": ".join(filter(None, [".".join(map(str, fault["loc"])), fault["msg"].removeprefix("Value error, ")]))

@@ -12,7 +12,7 @@ from lidarslam.compare.method_process import encode
 from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
-from lidarslam.core.errors import InputError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import remove_partial_files
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
@@ -70,7 +70,7 @@ def finished_before(run: RunRequest) -> MethodResult | None:
         was_run = tree.pop(files.RUN_SECTION)
         is_same = Config.model_validate(tree) == run.config
         is_same = is_same and all(was_run.get(key) == value for key, value in describe_run(run).items())
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
     return _collect(run, result) if is_same and result.status in WHOLE else None
 

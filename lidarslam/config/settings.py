@@ -13,8 +13,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from lidarslam.config.yaml_text import YamlError, parse_yaml, settings_as_yaml
-from lidarslam.config.yaml_text import read_yaml as read_yaml_file
+from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.run.directory import RUN_SECTION
@@ -22,7 +21,7 @@ from lidarslam.train.directory import SOURCES_SECTION
 from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
-# The sections of a run's or a training's config.yaml that are no configuration.
+# Sections of config.yaml that are not settings.
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
 
 _MOST_FAULTS = 5
@@ -76,9 +75,9 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
 
 
 def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
-    """Any configuration: its defaults, changed by a YAML file and then by settings; the example shows what those are.
+    """Any configuration: its defaults, changed by a YAML file and then by settings like the example.
 
-    A section of the file that says what was computed, rather than how, is passed over.
+    The section of a run's or training's config.yaml about its source is ignored.
 
     Raises:
         ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
@@ -100,7 +99,7 @@ def reader_settings(**options: str | None) -> list[str]:
 
 
 def setting(key: str, text: str) -> str:
-    """A setting whose value is a text, whatever it looks like to YAML."""
+    """A setting whose value is a text, even if YAML would read it as a number."""
     quoted = text.replace("'", "''")
     return f"{key}='{quoted}'"
 
@@ -111,23 +110,6 @@ def dump_yaml(config: BaseModel, described: dict[str, Any] | None = None, sectio
         return settings_as_yaml(config)
     first = yaml.safe_dump({section: described}, sort_keys=False, allow_unicode=True)
     return f"{first}\n{settings_as_yaml(config)}"
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The tree in a file.
-
-    Raises:
-        ConfigError: it is not readable YAML, or no keys and values.
-    """
-    try:
-        tree = read_yaml_file(path)
-    except YamlError as error:
-        raise ConfigError(f"{path}: {error}") from error
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: expected keys and values, got a {type(tree).__name__}")
-    return tree
 
 
 def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
@@ -158,9 +140,9 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
     faults = error.errors(include_url=False)
-    told = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
-    told += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
-    return f"configuration ({origin}): {'; '.join(told)}"
+    explained = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
+    explained += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    return f"configuration ({origin}): {'; '.join(explained)}"
 
 
 def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:

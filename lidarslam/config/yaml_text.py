@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
+from lidarslam.core.errors import ConfigError
 from lidarslam.core.plain_text import one_line
 
 # A configuration has a few kilobytes.
@@ -18,7 +19,7 @@ _LAST_COLUMN = 48
 _FIRST_CLAUSE = re.compile(r"[.;\n]")
 
 
-class YamlError(ValueError):
+class YamlError(ConfigError):
     """A text that is not valid YAML; the message is one line.
 
     Attributes:
@@ -62,21 +63,25 @@ def parse_yaml(text: str) -> Any:
         raise YamlError(f"a value looks like a date or a number but is none: {error}") from error
 
 
-def read_yaml(path: Path) -> Any:
-    """The values of a file in UTF-8.
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The keys and values of a file in UTF-8.
 
     Raises:
-        YamlError: it cannot be read, is longer than any configuration, or is not YAML.
+        ConfigError: it cannot be read, is too long, is not YAML, or has no keys and values.
     """
     try:
         with path.open("rb") as file:
             content = file.read(_LONGEST_BYTES + 1)
         if len(content) > _LONGEST_BYTES:
-            raise YamlError(f"is longer than {_LONGEST_BYTES >> 20} MB; expected a file of settings")
-        text = content.decode("utf-8")
+            raise ConfigError(f"{path}: is longer than {_LONGEST_BYTES >> 20} MB; expected a file of settings")
+        tree = parse_yaml(content.decode("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise YamlError(f"the file cannot be read ({one_line(str(error))})") from error
-    return parse_yaml(text)
+        raise ConfigError(f"{path}: the file cannot be read ({one_line(str(error))})") from error
+    except YamlError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if not isinstance(tree, dict | None):
+        raise ConfigError(f"{path}: expected keys and values, got a {type(tree).__name__}")
+    return tree or {}
 
 
 def settings_as_yaml(settings: BaseModel) -> str:

@@ -2,7 +2,7 @@
 
 
 def require_range_left(min_range_m: float, max_range_m: float) -> None:
-    """The nearest range that counts must be less than the farthest."""
+    """The minimum range must be below the maximum."""
     if min_range_m >= max_range_m:
         raise ValueError(
             f"min_range_m={min_range_m:g} must be less than max_range_m={max_range_m:g}, or no point is left"
@@ -10,7 +10,7 @@ def require_range_left(min_range_m: float, max_range_m: float) -> None:
 
 
 def require_lost_worse(lost_below: float, degraded_below: float, suffix: str = "") -> None:
-    """What is lost must not lie above what is degraded; a suffix of both names says of what."""
+    """The threshold of lost must not exceed that of degraded; both names have the suffix."""
     if lost_below > degraded_below:
         raise ValueError(
             f"lost_below{suffix}={lost_below:g} must not exceed degraded_below{suffix}={degraded_below:g},"

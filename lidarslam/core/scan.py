@@ -1,11 +1,11 @@
-"""One sweep of a LiDAR, and what a recording of sweeps can do."""
+"""One sweep of a LiDAR, and the protocol of a recording."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 from typing_extensions import Self
 
 from lidarslam.core.geometry import FloatArray
@@ -56,7 +56,7 @@ class Scan:
         time_offsets: ArrayLike | None = None,
         rings: ArrayLike | None = None,
     ) -> Self:
-        """Make a scan of what a driver delivers, leaving out invalid points together with their times and rings.
+        """Make a scan of a driver's raw points, leaving out invalid ones with their times and rings.
 
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
         the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite; where
@@ -67,11 +67,8 @@ class Scan:
         if raw.size and raw.shape[-1] != 3:
             raise ValueError(f"points must be (..., 3), got {raw.shape}")
         xyz = raw.reshape(-1, 3)
-        offsets = None if time_offsets is None else np.asarray(time_offsets, dtype=np.float64).reshape(-1)
-        lasers = None if rings is None else np.asarray(rings).reshape(-1)
-        for name, values in (("time_offsets", offsets), ("rings", lasers)):
-            if values is not None and len(values) != len(xyz):
-                raise ValueError(f"{name} has {len(values)} entries for {len(xyz)} points")
+        offsets = _column("time_offsets", time_offsets, len(xyz), np.float64)
+        lasers = _column("rings", rings, len(xyz), None)
         # NaN and infinity fail the comparisons too, so one pass finds every invalid point.
         size = np.abs(xyz)
         largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])  # ten times as fast as max(axis=1)
@@ -103,6 +100,16 @@ class Scan:
             None if self.rings is None else self.rings[chosen],
             self.dropped,
         )
+
+
+def _column(name: str, values: ArrayLike | None, count: int, dtype: DTypeLike | None) -> NDArray[Any] | None:
+    """An attribute (N,) of N points; without a dtype, of whatever type it has."""
+    if values is None:
+        return None
+    column = np.asarray(values, dtype=dtype).reshape(-1)
+    if len(column) != count:
+        raise ValueError(f"{name} has {len(column)} entries for {count} points")
+    return column
 
 
 class ScanSequence(Protocol):

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.config.settings import Config, load_config
-from lidarslam.config.yaml_text import YamlError, read_yaml
-from lidarslam.core.errors import InputError
+from lidarslam.config.yaml_text import read_yaml
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
@@ -94,7 +94,7 @@ def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
         return Estimate(poses, path, chosen_map, None, Config())
     try:
         source = Path(read_yaml(config_file)[files.RUN_SECTION]["source"])
-    except (YamlError, TypeError, KeyError):
+    except (ConfigError, TypeError, KeyError):
         source = None
     return Estimate(poses, path, chosen_map, source, load_config(config_file))
 

@@ -35,7 +35,7 @@ class PendingScan:
 
 
 class MapBuilder(Stateful):
-    """Adds scans to the global map, and keeps what later tells moving objects and slips of registration.
+    """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration.
 
     Attributes:
         voxel_size_m: of the map; derived from the first scan with points unless it is configured, None until then.

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.config.settings import Config, read_yaml
+from lidarslam.config.settings import Config
+from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved

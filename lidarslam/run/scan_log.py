@@ -1,4 +1,4 @@
-"""The log of a run: what scans.csv and summary.json say of each scan, its poses and timings."""
+"""The log of a run: poses, timings and status of each scan, for scans.csv and summary.json."""
 
 import csv
 import io
@@ -62,7 +62,7 @@ class ScanLog(Stateful):
         self._rows = bytearray()  # of `_ROW`
 
     def __len__(self) -> int:
-        return len(self.messages)
+        return len(self._rows) // _ROW.itemsize
 
     def add(self, result: ScanResult, total_ms: float = 0.0) -> None:
         """Log one scan; `total_ms` is the wall time since the scan before was done."""
@@ -79,9 +79,9 @@ class ScanLog(Stateful):
             result.T_world_lidar,
             result.T_odom_lidar,
         )
-        self._rows += np.array(row, dtype=_ROW).tobytes()
         self._degenerate.append(" ".join(result.degenerate))
         self.messages.append(result.message)
+        self._rows += np.array(row, dtype=_ROW).tobytes()  # last, as Ctrl-C may come between: `len` counts rows
 
     def warn(self, message: str) -> None:
         """Keep a sentence for the summary, once."""
@@ -141,7 +141,7 @@ class ScanLog(Stateful):
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(COLUMNS)
-        rows = zip(self._table(), self._degenerate, self.messages, strict=True)
+        rows = zip(self._table(), self._degenerate, self.messages, strict=False)
         for index, (row, degenerate, message) in enumerate(rows):
             counts = (row["points"], row["points_dropped"], row["points_used"])
             fit = ("" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in ("residual_m", "inlier_ratio"))
@@ -158,8 +158,8 @@ class ScanLog(Stateful):
         """Go on from a state, before the first scan."""
         super().restore(saved)
         rows = saved.value("rows")
-        if getattr(rows, "dtype", None) != _ROW or rows.shape != (len(self),) or len(self._degenerate) != len(self):
-            raise saved.unfit(f"{len(self)} rows of the log", rows)
+        if getattr(rows, "dtype", None) != _ROW or not rows.shape == (len(self.messages),) == (len(self._degenerate),):
+            raise saved.unfit(f"{len(self.messages)} rows of the log", rows)
         if (rows["status"] >= len(_STATUSES)).any():
             raise saved.refuse("unknown status")
         self._rows = bytearray(rows.tobytes())

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lidarslam.config.settings import read_yaml, reader_settings
+from lidarslam.config.settings import reader_settings
+from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.train.directory import CONFIG, SOURCES_SECTION, is_training
 from lidarslam.train.settings import LOSSES, load_train_config

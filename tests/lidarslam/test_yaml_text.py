@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml
+from lidarslam.core.errors import ConfigError
 
 
 def test_plain_values() -> None:
@@ -41,10 +42,10 @@ def test_aliases_cost_no_more_than_they_are_long() -> None:
 
 def test_a_file_that_is_no_text_or_far_too_long(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(YamlError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="cannot be read"):
         read_yaml(tmp_path / "a.yaml")
     (tmp_path / "b.yaml").write_bytes(b"#" * (5 << 20))
-    with pytest.raises(YamlError, match="longer than 4 MB"):
+    with pytest.raises(ConfigError, match="longer than 4 MB"):
         read_yaml(tmp_path / "b.yaml")
-    with pytest.raises(YamlError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="cannot be read"):
         read_yaml(tmp_path / "none.yaml")

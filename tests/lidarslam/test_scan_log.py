@@ -1,0 +1,88 @@
+"""The log of a run: its table, its trajectories, and its state."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp
+from lidarslam.core.state import Saved
+from lidarslam.core.tracking import Status
+from lidarslam.pipeline.estimates import ScanResult, SweepMotion
+from lidarslam.run.scan_log import ScanLog
+
+
+def result(stamp: float, status: Status = Status.OK, **values: Any) -> ScanResult:
+    given = {
+        "T_world_lidar": exp(np.full(6, 0.1 * stamp)),
+        "T_odom_lidar": exp(np.full(6, 0.2 * stamp)),
+        "covariance": None,
+        "motion": SweepMotion(None, None),
+        "status": status,
+        "message": "",
+        "belongs_in_map": True,
+        "points_used": 90,
+        "residual_m": 0.0123456,
+        "inlier_ratio": None,
+        "degenerate": (),
+        "stage_ms": {"read": 1.234, "map": 2.0},
+        "stamp": stamp,
+        "points": np.zeros((3, 3)),
+        "points_read": 100,
+        "points_dropped": 1,
+    }
+    return ScanResult(**given | values)
+
+
+@pytest.fixture
+def log() -> ScanLog:
+    log = ScanLog()
+    log.add(result(1.0), total_ms=10.0)
+    log.add(result(2.5, Status.LOST, message="no points, none", degenerate=("x", "yaw"), residual_m=None), 20.0)
+    log.warn("twice")
+    log.warn("twice")
+    return log
+
+
+def test_the_table_has_a_row_a_scan(log: ScanLog) -> None:
+    assert log.format_csv().splitlines()[1:] == [
+        "0,1.000000000,ok,100,1,90,0.0123,,,1.23,0.00,0.00,0.00,0.00,2.00,",
+        '1,2.500000000,lost,100,1,90,,,x yaw,1.23,0.00,0.00,0.00,0.00,2.00,"no points, none"',
+    ]
+
+
+def test_the_numbers_of_all_scans(log: ScanLog) -> None:
+    assert (len(log), log.points_read, log.points_dropped) == (2, 200, 2)
+    assert log.statuses == [Status.OK, Status.LOST]
+    assert log.warnings == ["twice"]
+    np.testing.assert_array_equal(log.stamps, [1.0, 2.5])
+    np.testing.assert_array_equal(log.total_ms, [10.0, 20.0])
+    np.testing.assert_array_equal(log.odometry.T_world_lidar[1], exp(np.full(6, 0.5)))
+    log.correct(np.tile(np.eye(4), (2, 1, 1)))
+    np.testing.assert_array_equal(log.trajectory.positions, np.zeros((2, 3)))
+
+
+def test_a_restored_log_goes_on_alike(log: ScanLog) -> None:
+    restored = ScanLog()
+    restored.restore(Saved(log.state()))
+    for one in (log, restored):
+        one.add(result(3.0))
+    assert restored.format_csv() == log.format_csv()
+    np.testing.assert_array_equal(restored.trajectory.T_world_lidar, log.trajectory.T_world_lidar)
+
+
+def test_a_state_of_another_length_is_refused(log: ScanLog) -> None:
+    state = log.state()
+    with pytest.raises(InputError, match="rows of the log"):
+        ScanLog().restore(Saved(state | {"rows": state["rows"][:1]}))
+    with pytest.raises(InputError, match="rows of the log"):
+        ScanLog().restore(Saved(state | {"rows": np.zeros((2, 3))}))
+
+
+def test_an_empty_log(log: ScanLog) -> None:
+    empty = ScanLog()
+    assert (len(empty), empty.points_read, len(empty.trajectory)) == (0, 0, 0)
+    restored = ScanLog()
+    restored.restore(Saved(empty.state()))
+    assert restored.format_csv() == empty.format_csv()
