@@ -9,15 +9,18 @@ BIN := $(VENV)/bin
 demo: install
 	$(BIN)/lidarslam demo
 
+# A file's tests stay together, so that their fixtures are made once; single-threaded, as there is a process a core.
+PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
+
 test: install
-	$(BIN)/pytest
+	$(PYTEST)
 
 # Everything that continuous integration asks.
 check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/pytest
+	$(PYTEST)
 
 install: $(VENV)/.installed
 

@@ -51,7 +51,7 @@ def lost_intervals(method: MethodResult) -> list[LostInterval]:
             float(times_s[first]),
             float(times_s[last]),
             int(method.lost[first : last + 1].sum()),
-            said[0] if len(said) == 1 else f"{said[0]}, and {len(said) - 1} more",
+            why[0] if len(why) == 1 else f"{why[0]}, and {len(why) - 1} more",
         )
-        for first, last, said in merged
+        for first, last, why in merged
     ]

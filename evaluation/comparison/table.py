@@ -1,6 +1,7 @@
 """A table as values: methods against quantities; the best figure of each column is found, not stored."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,6 +9,7 @@ Value = float | str | None
 
 NOT_AVAILABLE = "–"
 _LONGEST_FIXED = 1e6
+_UNPRINTABLE = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,11 @@ class Table:
                 for row in self.rows
             ],
         }
+
+
+def printable(text: str) -> str:
+    """The text with U+FFFD for characters that neither HTML nor a file in UTF-8 can hold."""
+    return _UNPRINTABLE.sub("\ufffd", text)
 
 
 def number_text(value: Value, digits: int) -> str:

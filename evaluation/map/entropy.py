@@ -1,4 +1,4 @@
-"""How crisp a map is, without any reference."""
+"""Mean map entropy: crispness of a map, without a reference."""
 
 from dataclasses import dataclass
 from itertools import chain, pairwise
@@ -12,7 +12,7 @@ from lidarslam.core.geometry import FloatArray
 
 DEFAULT_RADIUS_M = 0.3
 DEFAULT_SPACING_M = 0.05
-# Points whose neighbourhoods are looked at; the mean over as many is known to a hundredth.
+# Sampled neighbourhoods; the standard error of their mean is a hundredth.
 MOST_SAMPLES = 50_000
 
 # Of a sampled map: points, the edge of a block, and a hash of its coordinates (Teschner et al., VMV 2003; Knuth).
@@ -22,9 +22,9 @@ _PRIMES = np.array([73_856_093, 19_349_669])
 _GOLDEN, _BITS = 2_654_435_761, 0xFFFF_FFFF
 _QUICK_SAMPLES = 10_000
 
-# Fewer neighbours say nothing about a surface.
+# Fewer neighbours do not determine a covariance.
 _FEWEST_NEIGHBOURS = 5
-# Added to the neighbourhood's spread in every direction: without it a flawless plane would have an entropy of -inf.
+# Standard deviation added in every direction, as the entropy of a flawless plane is -inf.
 _RESOLUTION_M = 1e-3
 # Neighbours held in memory at a time.
 _CHUNK = 4_000_000
@@ -32,13 +32,13 @@ _CHUNK = 4_000_000
 
 @dataclass(frozen=True)
 class MapEntropy:
-    """Mean entropy of the map's points around its points; lower is crisper.
+    """Mean entropy of the neighbourhoods of a map's points; lower is crisper.
 
     Attributes:
-        mean: natural units; of maps of the same place, radius and spacing only.
+        mean: in nats; comparable between maps of the same place, radius and spacing.
         radius_m: of a neighbourhood.
         spacing_m: edge of the cells that the map was thinned to.
-        points: how many neighbourhoods the mean is of.
+        points: number of neighbourhoods.
     """
 
     mean: float
@@ -47,7 +47,7 @@ class MapEntropy:
     points: int
 
     def to_json(self) -> dict[str, float | int]:
-        """The mean, and what it is of."""
+        """The entropy in metrics.json."""
         return {
             "mean_map_entropy": self.mean,
             "radius_m": self.radius_m,
@@ -101,7 +101,7 @@ def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> M
 
 
 def _chunks(counts: NDArray[np.int64]) -> list[slice]:
-    """Stretches of points with no more neighbours together than fit into memory."""
+    """Successive points with no more neighbours together than fit into memory."""
     number = np.cumsum(counts) // _CHUNK
     borders = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(counts)]
     return [slice(first, end) for first, end in pairwise(borders)]

@@ -1,7 +1,7 @@
-"""How far a map is from a reference map, and how much of the reference it holds.
+"""Errors of a map relative to a reference map: accuracy, completeness, F-score, coverage, deviation.
 
-Both clouds are thinned to one point a cell of the same size first, so that nobody gains by many points in one place.
-Distances are from point to nearest point; for a flawless map they are therefore not 0 but about half of the spacing.
+Both clouds are first thinned to one point a cell, so that density has no weight. Distances are from point to nearest
+point; for a flawless map they are therefore about half of the spacing, not 0.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from lidarslam.core.geometry import FloatArray
 F_SCORE_THRESHOLDS_M = (0.1, 0.2, 0.5)
 SUBT_TOLERANCES_M = (1.0,)
 DEFAULT_SPACING_M = 0.05
-# Accuracy looks at the map in the reference's bounding box, grown by this much on every side.
+# Accuracy is that of the map in the reference's bounding box, grown by this much on every side.
 BOX_MARGIN_M = 1.0
 
 _GAP_SAMPLES = 10_000
@@ -48,23 +48,19 @@ class MapMetrics:
     def to_json(self) -> dict[str, object]:
         """The errors, as metrics.json names them."""
         return {
-            "accuracy_mean_m": self.accuracy_mean_m,
-            "completeness_mean_m": self.completeness_mean_m,
-            "chamfer_m": self.chamfer_m,
-            "f_score_percent": {str(float(m)): share for m, share in self.f_score_percent.items()},
-            "coverage_percent": {str(float(m)): share for m, share in self.coverage_percent.items()},
-            "deviation_percent": {str(float(m)): share for m, share in self.deviation_percent.items()},
+            name: {str(float(m)): share for m, share in value.items()} if isinstance(value, Mapping) else value
+            for name, value in vars(self).items()
         }
 
 
 @dataclass(frozen=True, eq=False)
 class CloudErrors:
-    """Points of one cloud and how far each is from the other cloud.
+    """Points of one cloud and their distances from the other.
 
     Attributes:
         points: (N, 3) the thinned cloud, in the reference's frame.
         distances_m: (N,) to the nearest point of the other.
-        considered: (N,) whether the point is where both clouds could have one.
+        considered: (N,) whether the point lies where both clouds can have one.
     """
 
     points: FloatArray
@@ -72,7 +68,7 @@ class CloudErrors:
     considered: NDArray[np.bool_]
 
     def share_within(self, threshold_m: float, considered_only: bool) -> float | None:
-        """Which share of the points, 0 to 1, is at most that far; None without points."""
+        """Share of the points within the threshold, 0 to 1; None without points."""
         distances = self.distances_m[self.considered] if considered_only else self.distances_m
         return float(np.mean(distances <= threshold_m)) if len(distances) else None
 
@@ -85,7 +81,7 @@ class CloudErrors:
 
 @dataclass(frozen=True, eq=False)
 class MapComparison:
-    """A map beside its reference.
+    """Errors of a map and of its reference.
 
     Attributes:
         metrics: the errors in one number each.
@@ -109,18 +105,18 @@ def compare_maps(
     max_range_m: float = np.inf,
     spacing_m: float = DEFAULT_SPACING_M,
 ) -> MapComparison:
-    """Compare a map (N, 3) with a reference (M, 3) that it has been brought to the frame of.
+    """Compare an aligned map (N, 3) with a reference (M, 3).
 
-    Accuracy and the map's part of the F-score are of its points inside the reference's bounding box grown by a metre;
-    completeness and the reference's part of the F-score are of its points within the sensor's range of the path.
-    Coverage and deviation are of all points, as the map analysis of the DARPA SubT Challenge has them, so that a map
-    that left the box shows.
+    Accuracy and the precision of the F-score are of the map's points inside the reference's bounding box grown by a
+    metre; completeness and the recall of the reference's points within the sensor's range of the path. Coverage and
+    deviation are of all points, as in the map analysis of the DARPA SubT Challenge, so that outliers beyond the box
+    count.
 
     Args:
         map_points: in the reference's frame.
-        reference_points: what is true.
-        positions: (K, 3) where the sensor was, in the reference's frame; None when that is unknown.
-        max_range_m: how far the sensor sees.
+        reference_points: the truth.
+        positions: (K, 3) of the sensor, in the reference's frame; None when unknown.
+        max_range_m: range of the sensor.
         spacing_m: edge of the cells that both are thinned to.
     """
     origin = reference_points.mean(axis=0) if len(reference_points) else np.zeros(3)

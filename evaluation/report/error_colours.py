@@ -1,4 +1,4 @@
-"""Colours that tell distances apart, under every colour blindness."""
+"""Colours of distances, distinguishable under every colour blindness."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 
 from evaluation.comparison.comparison import Comparison, SequenceComparison
-from evaluation.comparison.table import Table, number_text
+from evaluation.comparison.table import Table, number_text, printable
 from evaluation.report.figures.drift import length_figure, speed_figure
 from evaluation.report.figures.errors import deviation_figure, error_figure
 from evaluation.report.figures.figure import Figure, Styles, method_styles
@@ -20,7 +20,6 @@ from evaluation.report.figures.maps import entropy_figure, map_figure
 from evaluation.report.figures.resources import resources_figure
 from evaluation.report.figures.tracking import tracking_figure
 from evaluation.report.figures.trajectories import trajectory_figure
-from evaluation.report.plain_text import printable
 from evaluation.report.tables import published_table, sequence_tables
 
 _TEMPLATES = "templates"

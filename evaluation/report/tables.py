@@ -51,7 +51,7 @@ def sequence_tables(sequence: SequenceComparison) -> dict[str, list[Table]]:
 
 
 def published_table(comparison: Comparison) -> Table | None:
-    """Published figures that stand in no other table; None when there are none."""
+    """Published figures that are in no other table; None when there are none."""
     headings = list(dict.fromkeys(heading for row in comparison.published for heading in row.values))
     rows = [
         TableRow(row.method, [TableCell(_as_published(row.values.get(heading))) for heading in headings], row.source)

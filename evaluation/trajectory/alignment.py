@@ -1,4 +1,4 @@
-"""Bringing an estimate into the reference's world, which two trajectories do not share by themselves."""
+"""Alignment of an estimate with a reference, whose worlds differ."""
 
 from typing import Literal
 
@@ -9,12 +9,12 @@ from lidarslam.core.trajectory import Trajectory
 
 AlignmentMethod = Literal["se3", "first_pose", "none"]
 
-# Motion across the main direction below either of these says less about the rotation around it than the orientations
-# do: the noise of a few decimetres in GNSS positions turns a path that bends by less than that by tens of degrees.
-# Of KITTI's eleven sequences only 04, a street without a bend, is under 4 %; the motorway of 01 has 5 %.
+# Below either spread across the main direction, the rotation about it is taken from the orientations: GNSS noise of a
+# few decimetres turns a path that bends by less than that by tens of degrees. Of KITTI's eleven sequences only 04, a
+# street without a bend, is under 4 %; the motorway of 01 has 5 %.
 _LEAST_SPREAD_M = 0.01
 _LEAST_RELATIVE_SPREAD = 0.04
-# Weight of the orientations beside the positions' main direction: decides only what the positions leave open.
+# Weight of the orientations beside the positions' main direction: it affects only the unobservable rotation.
 _TIE_BREAK = 1e-8
 
 
@@ -43,9 +43,9 @@ def align_se3(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     """Least-squares `T_reference_estimate` (4, 4) from poses (N, 4, 4) of the same instants, without scale.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991, eq. 39-41.
-    Positions near a straight line (spread across it under 4 % of that along it) leave the rotation about it open,
-    positions on one spot the whole rotation; what they leave open is chosen so that the orientations agree best in the
-    chordal sense. Positions near a line therefore agree a little less closely than the least squares would have it.
+    The rotation about a straight line of positions (spread across it under 4 % of that along it), or the whole rotation
+    of positions on one spot, is degenerate; it is the chordal mean of the orientations' differences. Positions near a
+    line therefore agree a little less closely than in the least-squares solution.
     """
     centre_estimate, centre_reference = estimate[:, :3, 3].mean(axis=0), reference[:, :3, 3].mean(axis=0)
     p_estimate, p_reference = estimate[:, :3, 3] - centre_estimate, reference[:, :3, 3] - centre_reference

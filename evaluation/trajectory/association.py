@@ -1,4 +1,4 @@
-"""Which poses of an estimate have a reference pose at the same instant."""
+"""Association of an estimate with a reference in time."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,12 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 
-# Bridging half a second at constant body velocity costs at most a * 0.5^2 / 8, 6 cm while braking with 2 m/s^2.
+# Interpolation over half a second at constant velocity errs by a * 0.5^2 / 8 at most, 6 cm when braking at 2 m/s^2.
 DEFAULT_MAX_GAP_S = 0.5
 DEFAULT_TOLERANCE_S = 0.02
 
 _FEWEST_MATCHES = 3
-# Stamps that differ by this factor differ in unit or origin, not by a clock's offset.
+# Stamps that differ by this factor differ in unit or origin, not by a clock offset.
 _OTHER_UNIT = 1e3
 
 
@@ -25,7 +25,7 @@ class Association:
     Attributes:
         estimate: the matched poses of the estimate, `T_world_lidar` in the estimate's world.
         reference: the reference at the same M stamps, `T_world_lidar` in the reference's world.
-        rows: (M,) increasing, where the matched poses stand in the whole estimate.
+        rows: (M,) increasing, of the matched poses in the whole estimate.
         estimate_count: poses of the whole estimate.
         reference_count: poses of the whole reference.
     """
@@ -50,7 +50,7 @@ def associate(
     tolerance_s: float = DEFAULT_TOLERANCE_S,
     max_gap_s: float = DEFAULT_MAX_GAP_S,
 ) -> Association:
-    """Find the reference pose at the instant of each pose of the estimate.
+    """The reference pose at the instant of each pose of the estimate.
 
     The reference is interpolated at constant body velocity. A stamp is matched when the reference poses around it are
     at most `max_gap_s` apart, or when one of them is at most `tolerance_s` away; so a stamp is extrapolated by
@@ -81,7 +81,7 @@ def _is_matched(stamps: FloatArray, reference: FloatArray, tolerance_s: float, m
 
 def _reference_at(reference: Trajectory, stamps: FloatArray) -> FloatArray:
     times = reference.stamps
-    # Two reference poses a microsecond apart say nothing about the velocity: extrapolate by one step at most.
+    # Two reference poses a microsecond apart do not determine the velocity: extrapolate by one step at most.
     reached = np.clip(stamps, 2 * times[0] - times[1], 2 * times[-1] - times[-2])
     T_world_lidar = reference.at(reached, extrapolation_s=np.inf)
     candidates = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
@@ -106,7 +106,7 @@ def _range(trajectory: Trajectory) -> str:
 
 def _likely_cause(estimate: Trajectory, reference: Trajectory, tolerance_s: float, max_gap_s: float) -> str:
     if len(estimate) < _FEWEST_MATCHES or len(reference) < 2:
-        return "one of them is too short to be compared; check that both files are complete"
+        return "one of them is too short; check that both files are complete"
     a, b = estimate.stamps, reference.stamps
     if max(a[0], b[0]) <= min(a[-1], b[-1]) + tolerance_s:
         step_s = float(np.median(np.diff(b)))

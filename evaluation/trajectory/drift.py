@@ -1,7 +1,7 @@
-"""Drift over segments of a given length: KITTI's measure, and the same idea for short recordings.
+"""Drift over segments of a given length: KITTI's, and that of short recordings.
 
-The error of a segment is `inverse(T_first_last of the estimate) @ T_first_last of the reference`: no alignment enters.
-Its translation depends a little on where on the vehicle the poses sit, so both sides must be poses of one sensor.
+The error of a segment is `inverse(T_first_last of the estimate) @ T_first_last of the reference`, without alignment.
+Its translation depends on the lever arm of the poses on the vehicle, so both sides must be poses of one sensor.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,7 +28,7 @@ class Drift:
     Attributes:
         translation_percent: translation error.
         rotation_deg_per_m: rotation error.
-        segments: how many segments the means are of.
+        segments: number of segments.
     """
 
     translation_percent: float
@@ -50,7 +50,7 @@ class KittiDrift:
     Attributes:
         overall: the mean over all segments of all lengths, the figure of the KITTI table.
         by_length: metres -> drift; None where the trajectory is too short.
-        by_speed: m/s -> drift over segments driven within 2 m/s of it; None where nobody drove like that.
+        by_speed: m/s -> drift over segments driven within 2 m/s of it; None where there is no segment.
     """
 
     overall: Drift
@@ -91,7 +91,7 @@ class SegmentErrors:
 def segment_errors(
     association: Association, lengths_m: Iterable[float], step: int, over_travelled: bool = False
 ) -> SegmentErrors:
-    """Errors over segments that start at every `step`-th matched pose, for each of the lengths.
+    """Errors over the segments that start at every `step`-th matched pose, of each of the lengths.
 
     A segment ends at the first pose that lies farther along the reference than the length asked for. The errors are
     divided by the length asked for, or, with `over_travelled`, by the distance travelled to that pose.
@@ -123,8 +123,8 @@ def segment_errors(
 def kitti_drift(association: Association) -> KittiDrift | None:
     """KITTI's drift: segments of 100 to 800 m from every tenth pose; None when the reference is shorter than 100 m.
 
-    Geiger, Lenz, Urtasun, "Are we ready for Autonomous Driving?", CVPR 2012, as its development kit computes it, but
-    for the speed, which is taken from the stamps where the kit supposes ten scans a second.
+    Geiger, Lenz, Urtasun, "Are we ready for Autonomous Driving?", CVPR 2012, as its development kit computes it,
+    except that the speed is taken from the stamps, where the kit assumes ten scans a second.
     """
     errors = segment_errors(association, KITTI_LENGTHS_M, _KITTI_STEP)
     overall = errors.mean()
@@ -138,8 +138,8 @@ def kitti_drift(association: Association) -> KittiDrift | None:
 def short_drift(association: Association) -> dict[int, Drift | None]:
     """Drift over segments of 5 to 100 m: metres -> drift, None where the reference is too short.
 
-    Unlike KITTI's, segments start at every pose, for a short recording has few, and errors are divided by the distance
-    travelled, for a step of a metre is much of five.
+    Unlike KITTI's, segments start at every pose, as a short recording has few, and errors are divided by the distance
+    travelled, as a step of one metre is a large part of five.
     """
     errors = segment_errors(association, SHORT_LENGTHS_M, step=1, over_travelled=True)
     return {m: errors.mean(errors.lengths_m == m) for m in SHORT_LENGTHS_M}

@@ -1,7 +1,7 @@
 """Errors of a trajectory relative to a reference."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -43,14 +43,7 @@ class TrajectoryErrors:
 
     def to_json(self) -> dict[str, float | None]:
         """The errors, as metrics.json names them."""
-        return {
-            "length_m": self.length_m,
-            "ate_rmse_m": self.ate_rmse_m,
-            "ate_rotation_rmse_deg": self.ate_rotation_rmse_deg,
-            "rpe_translation_rmse_m": self.rpe_translation_rmse_m,
-            "rpe_rotation_rmse_deg": self.rpe_rotation_rmse_deg,
-            "end_error_m": self.end_error_m,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)

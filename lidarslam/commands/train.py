@@ -47,7 +47,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> N
 
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
     """
-    from lidarslam.train.command import TrainOptions, run_train
+    from lidarslam.train.command import run_train
 
-    if not run_train(TrainOptions(sources, **options), say):
+    if not run_train(sources, say, **options):
         ctx.exit(EXIT_MENDABLE)

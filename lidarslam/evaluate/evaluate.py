@@ -13,7 +13,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.evaluate.error_cloud import check_error_files, write_errors
 from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
 from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map
-from lidarslam.evaluate.reference_map import ReferenceMap, find_reference_map, load_reference_map
+from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
 from lidarslam.run import directory as files
 from lidarslam.run.directory import RunDirectory
 
@@ -55,7 +55,7 @@ class Evaluation:
     """Errors of an estimate.
 
     Attributes:
-        estimate: what was evaluated.
+        estimate: the trajectory and its map.
         reference: description of the reference trajectory; None without one.
         metrics: errors of the trajectory.
         map: errors of the map; None without a map or a reference for it.
@@ -110,8 +110,8 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         entropy = map_entropy(estimate.map_points())
     out = request.out or (None if estimate.run is None else estimate.run / files.METRICS)
     written = [*([] if out is None else [out]), *request.errors]
-    what = None if reference is None else reference.what
-    evaluation = Evaluation(estimate, what, metrics, compared, entropy, notes, written)
+    label = None if reference is None else reference.label
+    evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
     if out is not None:
         RunDirectory(out.parent).write_json(out.name, evaluation.to_json())
     if compared is not None:
@@ -136,34 +136,25 @@ def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -
 
 
 def _own_truth(estimate: Estimate) -> Poses:
-    source = estimate.source
+    source, advice = estimate.source, "name a trajectory with --reference or a map with --reference-map"
     if source is None:
-        raise InputError(
-            f"{estimate.poses.what}: has no reference; name a trajectory with --reference or a map with --reference-map"
-        )
+        raise InputError(f"{estimate.poses.label}: has no reference; {advice}")
     if not source.exists():
-        raise InputError(
-            f"{source}: the run's recording is not there any more; name it, or its true trajectory, with --reference"
-        )
+        raise InputError(f"{source}: the run's recording is not there any more; {advice}")
     return recording_truth(source, estimate.config.reader)
 
 
 def _evaluate_map(
     request: EvaluateRequest, estimate: Estimate, metrics: TrajectoryMetrics | None, notes: list[str]
 ) -> MapEvaluation | None:
-    reference = _reference_map(request, estimate)
-    if reference is None:
-        return None
-    if estimate.map_file is None and request.reference_map is None:
-        notes += ["the run has no map to compare with that of the simulation"] if estimate.run is not None else []
-        return None
-    return evaluate_map(estimate, metrics, reference, request.map_options)
-
-
-def _reference_map(request: EvaluateRequest, estimate: Estimate) -> ReferenceMap | None:
+    """Errors of the map; None without a reference map, or without a map for that of the simulation."""
+    reference = None
     if request.reference_map is not None:
-        return load_reference_map(request.reference_map)
-    if not request.needs_reference:
-        return None
-    sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
-    return next((found for found in map(find_reference_map, sources) if found is not None), None)
+        reference = load_reference_map(request.reference_map)
+    elif request.needs_reference:
+        sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
+        reference = next((found for found in map(find_reference_map, sources) if found is not None), None)
+        if reference is not None and estimate.map_file is None:
+            notes.append("there is no map to compare with that of the simulation")
+            return None
+    return None if reference is None else evaluate_map(estimate, metrics, reference, request.map_options)

@@ -28,13 +28,13 @@ class Poses:
     """A trajectory with or without stamps.
 
     Attributes:
-        what: its description.
+        label: for messages.
         stamps: (N,), None in KITTI's text format.
         T_world_lidar: (N, 4, 4); of KITTI's camera where the file is in that frame.
         T_cam_lidar: of a KITTI recording, whose pose files are in the camera's frame.
     """
 
-    what: str
+    label: str
     stamps: FloatArray | None
     T_world_lidar: FloatArray
     T_cam_lidar: FloatArray | None = None
@@ -43,7 +43,7 @@ class Poses:
         """The same in the frame of KITTI's camera, if there is one."""
         if self.T_cam_lidar is None:
             return self
-        return Poses(self.what, self.stamps, self.T_cam_lidar @ self.T_world_lidar @ inverse(self.T_cam_lidar))
+        return Poses(self.label, self.stamps, self.T_cam_lidar @ self.T_world_lidar @ inverse(self.T_cam_lidar))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Estimate:
         """
         if self.map_file is None:
             advice = "name it with --map FILE" if self.run is None else "tracking was lost on every scan"
-            raise InputError(f"{self.poses.what}: has no map to compare; {advice}")
+            raise InputError(f"{self.poses.label}: has no map to compare; {advice}")
         return read_cloud(self.map_file)
 
 
@@ -160,7 +160,7 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
     """
     poses = estimate.poses
     if reference.stamps is None and estimate.run is not None and (estimate.run / files.TRAJECTORY_KITTI).is_file():
-        poses = Poses(poses.what, poses.stamps, read_kitti_poses(estimate.run / files.TRAJECTORY_KITTI))
+        poses = Poses(poses.label, poses.stamps, read_kitti_poses(estimate.run / files.TRAJECTORY_KITTI))
     if poses.stamps is None:
         reference = reference.in_camera()
     if poses.stamps is not None and reference.stamps is not None:
@@ -168,8 +168,8 @@ def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:
     count = len(poses.T_world_lidar)
     if count != len(reference.T_world_lidar):
         raise InputError(
-            f"{poses.what} has {count:,} poses, {reference.what} has {len(reference.T_world_lidar):,}, and KITTI's text"
-            " format has no stamps to match them by; give both as TUM files, or the same poses in both"
+            f"{poses.label} has {count:,} poses, {reference.label} has {len(reference.T_world_lidar):,}, and KITTI's"
+            " text format has no stamps to match them by; give both as TUM files, or the same poses in both"
         )
     stamps = poses.stamps if poses.stamps is not None else reference.stamps
     stamps = _KITTI_PERIOD_S * np.arange(count, dtype=np.float64) if stamps is None else stamps

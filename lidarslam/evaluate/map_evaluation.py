@@ -117,7 +117,7 @@ def evaluate_map(
     positions = transform_points(alignment.T_reference_map, positions)
     aligned = transform_points(alignment.T_reference_map, points)
     comparison = compare_maps(aligned, reference.points, positions, max_range_m, options.spacing_m)
-    return MapEvaluation(reference.what, alignment, comparison, map_entropy(points), positions, max_range_m)
+    return MapEvaluation(reference.label, alignment, comparison, map_entropy(points), positions, max_range_m)
 
 
 def _along_trajectory(

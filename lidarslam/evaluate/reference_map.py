@@ -25,8 +25,8 @@ class ReferenceMap:
     truth: Trajectory | None = None
 
     @property
-    def what(self) -> str:
-        """Its description."""
+    def label(self) -> str:
+        """For messages."""
         return f"{self.path}{'' if self.truth is None else ', the exact map of the simulation'}"
 
 

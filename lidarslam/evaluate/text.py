@@ -24,7 +24,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
 
 
 def _lines(evaluation: Evaluation) -> Iterator[str]:
-    yield _row("evaluated", evaluation.estimate.poses.what)
+    yield _row("evaluated", evaluation.estimate.poses.label)
     if evaluation.metrics is not None:
         yield _row("against", str(evaluation.reference))
         yield from _trajectory(evaluation.metrics)
@@ -89,12 +89,12 @@ def _map(compared: MapEvaluation) -> Iterator[str]:
     rmse = "" if alignment.inlier_rmse_m is None else f", RMSE {alignment.inlier_rmse_m:.3f} m"
     yield _row("inliers", f"{100.0 * alignment.fitness:.1f} % of the map within {alignment.inlier_m:.2g} m{rmse}")
     reach = f"mean, reference to map, within {compared.max_range_m:g} m of the path"
-    for label, metres, what in (
+    for label, metres, meaning in (
         ("accuracy", metrics.accuracy_mean_m, "mean, map to reference"),
         ("completeness", metrics.completeness_mean_m, reach),
         ("chamfer", metrics.chamfer_m, "mean of the two"),
     ):
-        yield _row(label, f"{_number(metres, 'm'):>12}    {what}")
+        yield _row(label, f"{_number(metres, 'm'):>12}    {meaning}")
     yield _row("F-score", _percentages(metrics.f_score_percent))
     yield _row("coverage", f"{_percentages(metrics.coverage_percent)}, of the reference")
     yield _row("deviation", f"{_percentages(metrics.deviation_percent)}, of the map, beyond")

@@ -9,8 +9,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
@@ -21,7 +19,6 @@ from lidarslam.train.teacher import MapTeacher
 from odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
 from odometry.training.config import SimulatedConfig, TrainingConfig
 from odometry.training.preparation import PreparedRecording, prepare
-from odometry.training.torch_images import RecordedImages
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
 PIECE = 500
@@ -31,7 +28,6 @@ RECORDED_SHARE = 0.3
 _SIMULATION_SEED = 0
 # To be raised whenever preparation, or the simulation, computes something else than before.
 _KIND = Kind("a recording prepared for training", version=3)
-_IMAGES, _MOTIONS = ("points", "normals", "offsets"), ("interval_s", "T_prev_curr", "valid")
 
 Counter = Callable[[int], None]
 """Called with the number of scans that were prepared since the last call."""
@@ -178,14 +174,10 @@ def _prepared(piece: Stretch, config: TrainingConfig, cache: Path, count: Counte
         key["teacher"] = config.teacher
     path = cache / f"{_digest(key)}.safetensors"
     try:
-        tensors = read_tensor_file(path, _KIND).tensors
-        images = RecordedImages(*(tensors[name] for name in _IMAGES))
-        kept = PreparedRecording(images, *(tensors[name] for name in _MOTIONS))
-    except (InputError, KeyError):  # not there yet, or damaged: made anew
+        kept = PreparedRecording(**read_tensor_file(path, _KIND)[0])
+    except (InputError, TypeError):  # not there yet, or damaged: made anew
         made = _prepare(piece, config, count)
-        tensors = {name: getattr(made.images, name) for name in _IMAGES}
-        tensors |= {name: getattr(made, name) for name in _MOTIONS}
-        write_tensor_file(path, _KIND, tensors, {"name": piece.name, **key})
+        write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **key})
         return made
     count(len(piece))
     return kept
@@ -206,8 +198,7 @@ def _prepare(piece: Stretch, config: TrainingConfig, count: Counter) -> Prepared
     except ValueError as error:
         raise InputError(f"{piece.name}: scans {piece.first} to {piece.stop} cannot be trained on: {error}") from error
     # Half precision is enough for normals and offsets.
-    images = replace(made.images, normals=made.images.normals.half(), offsets=made.images.offsets.half())
-    made = replace(made, images=images)
+    made = replace(made, normals=made.normals.half(), offsets=made.offsets.half())
     return made if teacher is None else teacher.relabelled(made)
 
 
@@ -218,8 +209,3 @@ def digest(stretches: Sequence[Stretch]) -> str:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def valid_share(recordings: Sequence[PreparedRecording]) -> float:
-    """Share of the consecutive scans with a valid pseudo-label."""
-    return float(torch.cat([recording.valid for recording in recordings]).float().mean())

@@ -1,21 +1,13 @@
-"""The log of a training: tables of losses and validations, and curves and pictures for TensorBoard."""
+"""The log of a training: tables of losses and validations, and curves for TensorBoard."""
 
 import csv
 from collections.abc import Mapping
 from pathlib import Path
 
-import torch
-from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lidarslam.train import directory as files
-from odometry.network.correlation import CorrelationNetwork
-from odometry.training.preparation import PreparedRecording
 from odometry.training.training import Validation
-
-# Pairs whose turn scores are shown beneath one another, and how often a row is repeated so that it can be seen.
-_SHOWN_PAIRS = 32
-_TALL = 4
 
 
 class TrainingLog:
@@ -39,28 +31,6 @@ class TrainingLog:
         self._write(files.VALIDATION, "validation", step, values)
         self._curves.flush()
 
-    def inputs(self, step: int, recording: PreparedRecording) -> None:
-        """Ranges and normals of the first two scans, above one another."""
-        points, normals = recording.images.points[:2], recording.images.normals[:2].float()
-        ranges = points.square().sum(1, keepdim=True).sqrt()  # (2, 1, H, W)
-        near = (ranges > 0.0) / (1.0 + 0.1 * ranges)
-        self._curves.add_image("pair/nearness", _stacked(near), step)
-        self._curves.add_image("pair/normals", _stacked(0.5 + 0.5 * normals), step)
-
-    @torch.no_grad()
-    def turn_scores(self, step: int, network: nn.Module, recording: PreparedRecording, device: torch.device) -> None:
-        """Probabilities of turns: a row for each pair, zero turn in the middle."""
-        if not isinstance(network, CorrelationNetwork):
-            return
-        points, normals = (
-            images[: _SHOWN_PAIRS + 1].float().to(device)
-            for images in (recording.images.points, recording.images.normals)
-        )
-        features = network.columns(points, normals)
-        likely = network.turn_scores(features[:-1], features[1:]).softmax(dim=1)
-        likely = (likely / likely.amax(dim=1, keepdim=True)).roll(likely.shape[1] // 2, dims=1)
-        self._curves.add_image("pairs/turn_probability", likely.repeat_interleave(_TALL, dim=0)[None].cpu(), step)
-
     def close(self) -> None:
         """Write what is left."""
         self._curves.close()
@@ -69,11 +39,6 @@ class TrainingLog:
         _append(self._out / table, {"step": step, **row})
         for name, value in row.items():
             self._curves.add_scalar(f"{curves}/{name}", value, step)
-
-
-def _stacked(images: Tensor) -> Tensor:
-    """Images (B, C, H, W) above one another, each row several times: (C, B H _TALL, W)."""
-    return torch.cat(list(images.repeat_interleave(_TALL, dim=2)), dim=1)
 
 
 def _append(path: Path, row: Mapping[str, object]) -> None:

@@ -156,14 +156,10 @@ class TrainingLoop:
         began = time.perf_counter()
         if self._log is not None:
             self._network.eval()
-            network, progress, device = self._network, self._progress, self._devices.device
-            shown = (recordings.held_out or recordings.learned)[0]
-            if not progress.step:
-                self._log.inputs(progress.step, shown)
-            self._log.turn_scores(progress.step, network, shown, device)
+            progress = self._progress
             self._save_weights(files.LAST_WEIGHTS, None)
             if recordings.held_out:
-                result = validate(network, recordings.held_out, device=device)
+                result = validate(self._network, recordings.held_out, device=self._devices.device)
                 self._log.validation(progress.step, result)
                 # Without anything to compare with, the last is as good as any.
                 is_best = not result.pairs or progress.best is None or score(result) < progress.best

@@ -50,9 +50,9 @@ def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer)
     Raises:
         InputError: the file is not usable, or belongs to another network.
     """
-    file = read_tensor_file(path, _KIND)
+    tensors, content = read_tensor_file(path, _KIND)
     weights, moments = {}, dict[int, dict[str, Tensor]]()
-    for name, tensor in file.tensors.items():
+    for name, tensor in tensors.items():
         if name.startswith(_NETWORK):
             weights[name.removeprefix(_NETWORK)] = tensor
         else:
@@ -66,4 +66,4 @@ def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer)
             f"{path}: does not belong to this network; go on with the configuration it was begun with ({reason[:200]})"
         ) from error
     optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-    return Progress(**{name: file.content[name] for name in vars(Progress()) if name in file.content})
+    return Progress(**{name: content[name] for name in vars(Progress()) if name in content})

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 
 from odometry.training.training import Validation
@@ -14,7 +15,7 @@ def format_step(step: int, steps: int, losses: Mapping[str, float], pairs_per_s:
     )
     return (
         f"step {step:,}/{steps:,}  loss {losses['total']:.4g} ({parts})"
-        f"  {pairs_per_s:.1f} pairs/s  {format_time(left_s)} left"
+        f"  {pairs_per_s:.1f} pairs/s  {timedelta(seconds=math.ceil(left_s))} left"
     )
 
 
@@ -40,7 +41,7 @@ def format_errors(result: Validation) -> str:
 
 
 def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None, is_interrupted: bool) -> str:
-    """Where the weights lie, their errors, and how they are used."""
+    """The path of the weights, their errors, and the commands that use them."""
     errors = "" if best is None else f", on held-out scans {format_errors(best)}"
     lines = [
         f"{steps:,} steps done; weights written to {weights}{errors}",
@@ -50,11 +51,3 @@ def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None
     if is_interrupted:
         lines.append(f"go on:      lidarslam train --out {out} --resume")
     return "\n".join(lines)
-
-
-def format_time(seconds: float) -> str:
-    """Hours and minutes, or minutes and seconds."""
-    whole = math.ceil(seconds)
-    if whole >= 3600:
-        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-    return f"{whole // 60} min {whole % 60:02d} s" if whole >= 60 else f"{whole} s"

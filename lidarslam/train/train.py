@@ -17,7 +17,7 @@ from lidarslam.core.files import make_directory, only_writer
 from lidarslam.run.directory import RunDirectory
 from lidarslam.run.progress import show_count
 from lidarslam.train import directory as files
-from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated, valid_share
+from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated
 from lidarslam.train.devices import DeviceName, Devices
 from lidarslam.train.loop import Recordings, TrainingLoop
 from lidarslam.train.settings import TrainConfig, dump_train_yaml
@@ -68,16 +68,16 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
     stretches = [*(recorded(source, config.reader) for source in request.sources), *simulated(config.simulated)]
     if not stretches:
         raise ConfigError("there is nothing to train on; name a SOURCE, or set simulated.recordings=100")
+    about = _about(request, stretches)
     with contextlib.closing(Devices(request.device)) as devices, _interruption() as is_interrupted:
         make_directory(request.out)
         with only_writer(request.out) if devices.is_first else contextlib.nullcontext():
             recordings = _recordings(request, config.training, stretches, devices, is_interrupted)
             if devices.is_first:
                 files.remove_results(request.out, [] if request.resume else earlier)
-                about = _about(request, stretches)
                 RunDirectory(request.out).write_text(files.CONFIG, dump_train_yaml(config, about))
                 say(_summary(recordings, stretches, devices))
-            loop, progress = _loop(request, config.training, start, devices, stretches, say)
+            loop, progress = _loop(request, config.training, start, devices, about, say)
             if progress.step and devices.is_first:
                 say(f"going on after step {progress.step:,}")
             is_complete = loop.run(recordings, is_interrupted)
@@ -136,25 +136,24 @@ def _recordings(
 
 def _loop(
     request: TrainRequest, config: TrainingConfig, start: Checkpoint | None, devices: Devices,
-    stretches: Sequence[Stretch], say: Callable[[str], None],
+    about: dict[str, Any], say: Callable[[str], None],
 ) -> tuple[TrainingLoop, Progress]:  # fmt: skip
     """The training, at its beginning or where it was left."""
     network = _first_network(config, start).to(devices.device)
     optimizer = make_optimizer(network, config)
-    progress = Progress(data=digest(stretches))
+    progress = Progress(data=about["digest"])
     state = request.out / files.STATE
     if request.resume and state.exists():
         progress = load_state(state, network, optimizer)
-        if progress.data != digest(stretches):
+        if progress.data != about["digest"]:
             raise ConfigError(
                 f"{request.out}: the recordings are not those that this training was begun with, or have changed;"
                 f" to train the network on these, begin another with --from {request.out / files.LAST_WEIGHTS}"
             )
-    about = _about(request, stretches)
     # Weights are passed on: with the names of their recordings, not the folders.
-    about["sources"] = [Path(source).name for source in about["sources"]]
-    if "from" in about:
-        about["from"] = Path(about["from"]).name
+    about = {**about, "sources": [source.name for source in request.sources]}
+    if request.start_from is not None:
+        about["from"] = request.start_from.name
     return TrainingLoop(config, network, optimizer, progress, devices, request.out, about, say), progress
 
 
@@ -183,10 +182,11 @@ def _summary(recordings: Recordings, stretches: Sequence[Stretch], devices: Devi
     held = sum(len(recording) for recording in recordings.held_out)
     held_out = f"{held:,} more are held out for validation" if held else "none is held out for validation"
     scans = sum(len(recording) for recording in recordings.learned)
+    valid = torch.cat([recording.valid for recording in recordings.learned])
     processes = f" in {devices.processes} processes" if devices.processes > 1 else ""
     return (
         f"training on {len(stretches):,} recording{'s' if len(stretches) > 1 else ''}{of_them}: {scans:,} scans to"
-        f" learn from, {held_out}; {100.0 * valid_share(recordings.learned):.0f} % of consecutive scans could be"
+        f" learn from, {held_out}; {100.0 * float(valid.float().mean()):.0f} % of consecutive scans could be"
         f" aligned. Computing on {devices.device}{processes}"
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray, make_transform, skew
 from lidarslam.core.thinning import one_per_cell
 
 _YAWS = 72
@@ -103,8 +103,7 @@ class BirdsEyeMap:
 
 def _levelling(up: FloatArray) -> FloatArray:
     """The smallest rotation (3, 3) that takes a unit vector (3,) near z to z."""
-    v = np.array([up[1], -up[0], 0.0])
-    K = np.array([[0.0, 0.0, v[1]], [0.0, 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    K = skew(np.array([up[1], -up[0], 0.0]))
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + up[2]), dtype=np.float64)
 
 

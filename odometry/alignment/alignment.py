@@ -17,6 +17,7 @@ from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
+from odometry.alignment.residuals import Motion
 from odometry.alignment.sweep_motion import SweepPair
 
 # Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
@@ -114,7 +115,7 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
     T_prev_curr, innovation, prior = start.T_prev_curr, np.zeros(6), start
     for done in np.linspace(0.0, 1.0, iterations).tolist():
         scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
-        H, g = cost.normal_equations(T_prev_curr, *_velocities(T_prev_curr, innovation, sweeps), scale_m)
+        H, g = cost.normal_equations(_motion(T_prev_curr, innovation, sweeps)[0], scale_m)
         if done >= _ANNEALED and prior is start and start.information is not None:
             seen = INFORMATION_PER_M2 * _marginal(H)
             prior = replace(start, information=_where_unseen(start.information, seen))
@@ -122,18 +123,18 @@ def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterat
         T_prev_curr, innovation = exp(step) @ T_prev_curr, innovation + change
         if done >= _ANNEALED and float(np.abs(step).max()) < _CONVERGED:
             break
-    velocity, change = _velocities(T_prev_curr, innovation, sweeps)
+    motion, change = _motion(T_prev_curr, innovation, sweeps)
     counted = np.zeros((6, 6)) if prior.information is None else prior.information
-    return _alignment(T_prev_curr, change, cost.fit(T_prev_curr, velocity, change), counted)
+    return _alignment(T_prev_curr, change, cost.fit(motion), counted)
 
 
-def _velocities(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> tuple[FloatArray, FloatArray]:
-    """Mean velocity (6,) and its change (6,), which goes on as before but for the innovation."""
-    velocity, last = log(T_prev_curr) / sweeps.interval_s, sweeps.last
-    if last is None:
-        return velocity, innovation
-    share = sweeps.interval_s / (sweeps.interval_s + last.interval_s)
-    return velocity, innovation + share * (velocity - last.velocity)
+def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> tuple[Motion, FloatArray]:
+    """The motion, and the change (6,) of velocity, which goes on as before but for the innovation."""
+    velocity, change, last = log(T_prev_curr) / sweeps.interval_s, innovation, sweeps.last
+    if last is not None:
+        share = sweeps.interval_s / (sweeps.interval_s + last.interval_s)
+        change = innovation + share * (velocity - last.velocity)
+    return Motion(np.ascontiguousarray(T_prev_curr), velocity - change, velocity + change), change
 
 
 def _solve(
@@ -179,7 +180,7 @@ def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: Flo
         information=_marginal(fit.H),
         prior_information=prior,
         inlier_share=fit.inlier_share,
-        # What leaves the other image's view on the way does not count against it, unless it is most of the scan.
+        # Points that leave the other image's view do not count, unless they are most of the scan.
         explained=explained * min(fit.share_in_view / _MOSTLY_IN_VIEW, 1.0),
         weakest=weakest,
         residual_m=float(np.sqrt(fit.squared_residuals / max(fit.inliers, 1))),

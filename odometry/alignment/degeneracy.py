@@ -1,7 +1,7 @@
 """Degenerate directions of a pair of sweeps, along which the motion goes on as before.
 
-Along an even tunnel the residuals are small wherever one sweep is laid on the other. What remains of them comes from
-the noise of the normals, and pulls towards no motion. A network that sees the same scans knows no better.
+Along an even tunnel the residuals are small for any translation. The remaining gradient is due to the noise of the
+normals, and is biased towards no motion; so is a network's estimate from the same scans.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Point-to-plane normal equations of a pair of sweeps, and how well the two lie on one another."""
+"""Point-to-plane normal equations of a pair of sweeps, and the quality of their alignment."""
 
 from dataclasses import dataclass
 
@@ -53,22 +53,18 @@ class PointToPlane:
         self._points = _points(sweeps.current, column_step)
         self._planes = _planes(sweeps.previous)
 
-    def normal_equations(
-        self, T_prev_curr: FloatArray, velocity: FloatArray, change: FloatArray, scale_m: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def normal_equations(self, motion: Motion, scale_m: float) -> tuple[FloatArray, FloatArray]:
         """H (12, 12) and g (12,) of squared residuals with Geman and McClure's weights of this scale.
 
-        The unknowns are a change of T_prev_curr (4, 4) from the left, rotation first, and the change (6,) of velocity.
+        The unknowns are a change of T_prev_curr from the left, rotation first, and the change (6,) of velocity.
         """
         total, unused = np.zeros((13, 13)), np.zeros((3, 3))
-        motion = _motion(T_prev_curr, velocity, change)
         accumulate(self._points, self._planes, motion, scale_m, True, total, unused, unused)
         return total[:12, :12], total[:12, 12]
 
-    def fit(self, T_prev_curr: FloatArray, velocity: FloatArray, change: FloatArray) -> Fit:
-        """How the sweeps lie on one another."""
+    def fit(self, motion: Motion) -> Fit:
+        """The inliers of a motion."""
         total, in_view, inlier = np.zeros((13, 13)), np.zeros((3, 3)), np.zeros((3, 3))
-        motion = _motion(T_prev_curr, velocity, change)
         seen, count = accumulate(self._points, self._planes, motion, FINE_M, False, total, in_view, inlier)
         points = max(len(self._points), 1)
         return Fit(total[:12, :12], in_view, inlier, seen / points, count / points, count, float(total[12, 12]))
@@ -87,10 +83,6 @@ def _planes(images: SweepImages) -> Planes:
     pixels = np.empty((height * width, 7), dtype=np.float32)
     _fill(images.points, images.normals, images.offsets, min(_FILL_COLUMNS, width - 1), pixels)
     return Planes(pixels, height, width, images.low, images.high, bool(images.offsets.any()))
-
-
-def _motion(T_prev_curr: FloatArray, velocity: FloatArray, change: FloatArray) -> Motion:
-    return Motion(np.ascontiguousarray(T_prev_curr), velocity - change, velocity + change)
 
 
 @compiled

@@ -85,11 +85,10 @@ def accumulate(
     Args:
         points, planes, motion: see above.
         scale_m: of the residuals.
-        is_robust: all inliers, with Geman and McClure's weights of the scale; else those within twice the scale, with
-            a weight of 1, and the other sums as well.
+        is_robust: all inliers, with Geman and McClure's weights; else those within twice the scale, unweighted.
         total: (13, 13), zero, written: H (12, 12) and, in the last column, g (12,) and the sum of squared residuals.
-        in_view, inlier: (3, 3), zero, written: sums of squared normals in the previous frame, of points in view, and of
-            inliers.
+        in_view, inlier: (3, 3), zero, written unless robust: sums of squared normals in the previous frame, of points
+            in view and of inliers.
 
     Returns:
         How many points are in view, and how many are inliers.
@@ -123,10 +122,10 @@ def accumulate(
 def _correspond(points: Floats, planes: Planes, motion: Motion, scale_m: float, block: _Block) -> None:
     """Find the correspondences of a block of points.
 
-    The time is that of the pixel a point would fall into if nothing moved within the previous sweep, which is right but
-    for its seam. A point that lies farther along the surface than pixels are wide is of another surface, seen past an
-    edge. On ground that the beams graze, pixels are metres wide; were they not, rings, which go along with the sensor,
-    would hold it back.
+    The time of a pixel is found by projecting without motion within the previous sweep, which is exact but at its seam.
+    The gate is the width of a pixel on the surface: farther points are of another surface, seen past an edge. On ground
+    at grazing incidence pixels are metres wide; a narrower gate would keep points on their own rings, which move with
+    the sensor, and bias the motion.
     """
     T, size = motion.T, len(points)
     for i in range(size):
@@ -227,7 +226,7 @@ def _add_square(vector: FloatArray, total: FloatArray) -> None:
 
 @compiled
 def _room() -> _Block:
-    # Arrays of their own: of views of one, the compiler cannot tell that they do not overlap.
+    # Arrays of their own: views of one might overlap, and the compiler would not vectorise.
     x, y, z, residuals = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     u, v, w, offsets_s = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     in_view, inlier = np.empty(_BLOCK, dtype=np.bool_), np.empty(_BLOCK, dtype=np.bool_)

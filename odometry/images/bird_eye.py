@@ -1,7 +1,7 @@
-"""Scans seen from above: grids of cells in the sensor's xy plane, in which a translation is a shift.
+"""Bird's-eye grids of scans: cells in the sensor's xy plane, in which a translation is a shift.
 
-A cell holds what tells surfaces that stand from the ground, whose rings go along with the sensor: how many points, how
-upright their surfaces are and which way those face, and heights.
+The channels of a cell separate upright surfaces from the ground, whose rings move with the sensor: number of points,
+uprightness and azimuth of their normals, and heights.
 """
 
 import math

@@ -118,7 +118,6 @@ def _least_ratio(inlier: NDArray[np.bool_], facing: NDArray[np.intp]) -> float:
 
 def _thinned(points: FloatArray) -> FloatArray:
     """One point a cell, the cells sized by the scene."""
-    if not len(points):
+    if len(points) < _MIN_PLANES:
         return points
-    cell = _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1)))
-    return np.asarray(points[one_per_cell(points, cell)], dtype=np.float64)
+    return points[one_per_cell(points, _CELL_PER_RANGE * float(np.median(np.linalg.norm(points, axis=1))))]

@@ -5,7 +5,6 @@ which belongs to the end of the sweep, is expressed at the scan's stamp.
 """
 
 import contextlib
-import fcntl
 import logging
 import pickle
 import subprocess
@@ -28,8 +27,6 @@ _log = logging.getLogger(__name__)
 
 # Fewer points do not fix six degrees of freedom, and one alone makes the library abort.
 _MIN_POINTS = 10
-# A scan in three pieces instead of fifty saves the switching.
-_PIPE_BYTES = 1 << 20
 
 
 class OdometryError(LidarSlamError):
@@ -51,23 +48,13 @@ class _Worker:
             cwd=Path(__file__).resolve().parents[2],  # a folder called odometry where the user stands must not win
         )
         self._requests, self._replies = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
-        with contextlib.suppress(AttributeError, OSError):  # Linux alone can, and may have a lower limit
-            fcntl.fcntl(self._requests, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         try:
-            self._exchange(settings)
+            self.exchange(settings)
         except (EOFError, OSError) as error:
             raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?") from error
 
-    def register(self, points: FloatArray, offsets: FloatArray) -> tuple[FloatArray, int]:
-        """The pose (4, 4) after one scan, and how many points were registered.
-
-        Raises:
-            EOFError, OSError: the child died.
-        """
-        pose, count = self._exchange((points, offsets))
-        return pose, count
-
-    def _exchange(self, message: object) -> Any:
+    def exchange(self, message: object) -> Any:
+        """Send a message and wait for the reply; EOFError or OSError if the child died."""
         send(cast(Any, self._requests), message)
         return pickle.load(self._replies)
 
@@ -103,14 +90,14 @@ class KissOdometry:
         self._velocity = np.zeros(6)
 
     def estimate(self, scan: Scan) -> Motion:
-        """Register one scan. One that KISS-ICP cannot take gives the last velocity again, and says why."""
+        """Register one scan; one that KISS-ICP cannot take gives a prediction by the last velocity, and the reason."""
         if len(scan) < _MIN_POINTS:
             return self._predict(scan.stamp, f"{len(scan)} points are too few to register")
         offsets = self._usable_offsets(scan)
         try:
             if self._worker is None:
                 self._worker = _Worker(_library_settings(self._config))
-            T_map_lidar, points_used = self._worker.register(scan.points, offsets)
+            T_map_lidar, points_used = self._worker.exchange((scan.points, offsets))
         except (EOFError, OSError):
             return self._predict(scan.stamp, self._bury_worker())
         last, self._last = self._last, _TimedPose(self._pose_time(scan.stamp, offsets), T_map_lidar)
@@ -176,14 +163,14 @@ class KissOdometry:
         return Motion(T_prev_curr, 0, "first scan in KISS-ICP's new map: the motion is a prediction")
 
     def _predict(self, stamp: float, failure: str) -> Motion:
-        """The motion at the last velocity; the next scan registered is measured from where it leads."""
+        """The motion at the last velocity, from which the next scan registered is measured."""
         if self._previous is None:
             return Motion(np.eye(4), 0, failure)
         previous, self._previous = self._previous, self._at(stamp, self._previous)
         return Motion(inverse(previous.T_map_lidar) @ self._previous.T_map_lidar, 0, failure)
 
     def _bury_worker(self) -> str:
-        """After the child died: say so; the next scan begins an empty map."""
+        """After the child died; the next scan begins an empty map. Returns the message."""
         status = self._worker.close() if self._worker is not None else 0
         self._worker, self._last, self._registered = None, None, 0
         message = f"KISS-ICP's process ended (status {status}); it starts again with an empty map"

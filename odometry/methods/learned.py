@@ -11,11 +11,10 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, orthonormalize
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
-from odometry.alignment.alignment import INFORMATION_PER_M2, Alignment, InitialEstimate, align
+from odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
 from odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
 from odometry.alignment.search import align_best
 from odometry.alignment.sweep_motion import StampInterpolator, SweepPair
@@ -28,8 +27,8 @@ from odometry.network.candidates import Candidate, Described, Search
 _LEAST_EXPLAINED, _LEAST_INLIERS = 0.3, 60
 # Where neither the images nor the network constrain the motion its information still has an inverse.
 _LEAST_INFORMATION = 1e-6
-# What comes on top of the covariance by the residuals, radians and metres, and as a part of the way, by which rings of
-# points on the ground, which go along with the sensor, bias alignment. Chosen on the drive with an independent truth,
+# Added to the covariance by the residuals: radians and metres; and a part of the translation, by which rings of points
+# on the ground, which move with the sensor, bias alignment. Chosen on the drive with an independent truth,
 # KITTI odometry's 04: 74, 96 and 98 % of its errors lie within one, two and three standard deviations.
 _LEAST_SIGMA = np.array([np.deg2rad(0.02)] * 3 + [0.002] * 3)
 _HELD_BACK = 0.004
@@ -119,13 +118,16 @@ class LearnedOdometry(Stateful):
             expected = exp(previous.velocity * interval_s)
             scale = (interval_s / previous.interval_s) ** 2
             covariance = scale * self._last_covariance + np.diag((_ACCELERATION * interval_s**2) ** 2)
-            best = _go_on(best, expected, degeneracy, sweeps)
+            held = _HELD * degeneracy.projector()
+            start = replaced_along(best.T_prev_curr, expected, degeneracy)
+            best = align(InitialEstimate(start, held, held), sweeps)
             information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
         else:
             information = INFORMATION_PER_M2 * best.information + best.prior_information
         if best.explained < _LEAST_EXPLAINED or best.inliers < _LEAST_INLIERS:
             self._forget()
-            return Motion(np.eye(4), 0, f"the scan does not fit the last one: {_misfit(best)}")
+            misfit = f"{best.inliers} inliers, {100.0 * best.explained:.0f} % of the information about one direction"
+            return Motion(np.eye(4), 0, f"the scan does not fit the last one: {misfit}")
         covariance = np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)), dtype=np.float64)
         T_prev_curr = orthonormalize(best.T_prev_curr)
         motion = self._motion(T_prev_curr, covariance, best.velocity_change, last, sweep)
@@ -152,16 +154,6 @@ def _initial_estimate(candidate: Candidate, best: Candidate) -> InitialEstimate:
     sigmas = float(np.sqrt(max(0.0, 2.0 * (best.log_probability - candidate.log_probability))))
     information = np.asarray(np.linalg.inv(candidate.covariance), dtype=np.float64)
     return InitialEstimate(candidate.T_prev_curr, information, sigmas=sigmas)
-
-
-def _go_on(best: Alignment, expected: FloatArray, degeneracy: Degeneracy, sweeps: SweepPair) -> Alignment:
-    """As expected along the degenerate directions, and as aligned across them."""
-    held = _HELD * degeneracy.projector()
-    return align(InitialEstimate(replaced_along(best.T_prev_curr, expected, degeneracy), held, held), sweeps)
-
-
-def _misfit(best: Alignment) -> str:
-    return f"{best.inliers} points do, with {100.0 * best.explained:.0f} % of the information about one direction"
 
 
 def _right_covariance(T_prev_curr: FloatArray, left: FloatArray, change: FloatArray) -> FloatArray:

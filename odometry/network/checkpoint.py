@@ -58,14 +58,13 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         InputError: there is no such file, it is none of ours, or its weights do not fit or are not finite.
     """
-    file = read_tensor_file(path, WEIGHTS)
+    weights, content = read_tensor_file(path, WEIGHTS)
     try:
-        network, images = read_description(file.content)
-        checkpoint = Checkpoint(network, images, file.tensors, file.content.get("about") or {})
-        network_of(checkpoint)
-        for name, value in file.tensors.items():
-            if not bool(value.isfinite().all()):
-                raise ValueError(f"{name} is not finite")
+        checkpoint = Checkpoint(*read_description(content), weights, content.get("about") or {})
+        expected = network_of(checkpoint).state_dict()
+        for name, value in weights.items():
+            if value.dtype != expected[name].dtype or not bool(value.isfinite().all()):
+                raise ValueError(f"{name} is {value.dtype}, or not finite")
     except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: does not fit this program ({reason}); use other weights") from error

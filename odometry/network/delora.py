@@ -4,7 +4,6 @@ from functools import partial
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from odometry.network.pair_network import Estimate, PairImages
 from odometry.network.torch_geometry import make_transform, rotation_from_quaternion
@@ -31,9 +30,9 @@ class DeloraNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.stem = nn.Sequential(
-            _CircularConv(8, _STEM_CHANNELS, stride=(1, 2)),
+            _convolution(8, _STEM_CHANNELS, (1, 2)),
             nn.Tanh(),
-            _CircularMaxPool(stride=(1, 2)),
+            _around(nn.MaxPool2d(3, (1, 2), padding=(1, 0))),
         )
         stages, channels_in = list[nn.Module](), _STEM_CHANNELS
         for channels, stride in _STAGES:
@@ -58,34 +57,13 @@ class DeloraNetwork(nn.Module):
         return Estimate(T_prev_curr, log_sigma, log_sigma.new_zeros(size, 0), log_sigma.new_zeros(size, 0, 0))
 
 
-class _CircularConv(nn.Conv2d):
-    """A 3x3 convolution without bias, padded around the circle in azimuth and with zeros in elevation."""
-
-    def __init__(self, channels_in: int, channels_out: int, stride: tuple[int, int] = (1, 1)) -> None:
-        super().__init__(channels_in, channels_out, kernel_size=3, stride=stride, padding=(1, 0), bias=False)
-
-    def forward(self, images: Tensor) -> Tensor:
-        return super().forward(_wrap_azimuth(images))
-
-
-class _CircularMaxPool(nn.MaxPool2d):
-    """The maximum over 3x3, around the circle in azimuth; nothing is added in elevation."""
-
-    def __init__(self, stride: tuple[int, int]) -> None:
-        super().__init__(kernel_size=3, stride=stride, padding=(1, 0))
-
-    def forward(self, images: Tensor) -> Tensor:
-        result: Tensor = super().forward(_wrap_azimuth(images))
-        return result
-
-
 class _Block(nn.Module):
     """Two convolutions and a shortcut, which a 1x1 convolution takes to another shape."""
 
     def __init__(self, channels_in: int, channels_out: int, stride: tuple[int, int]) -> None:
         super().__init__()
         self.residual = nn.Sequential(
-            _CircularConv(channels_in, channels_out, stride), nn.Tanh(), _CircularConv(channels_out, channels_out)
+            _convolution(channels_in, channels_out, stride), nn.Tanh(), _convolution(channels_out, channels_out)
         )
         same = channels_in == channels_out and stride == (1, 1)
         self.shortcut = nn.Identity() if same else nn.Conv2d(channels_in, channels_out, 1, stride, bias=False)
@@ -100,9 +78,13 @@ def _with_ranges(images: Tensor) -> Tensor:
     return torch.cat([points, points.square().sum(1, keepdim=True).sqrt()], dim=1)
 
 
-def _wrap_azimuth(images: Tensor) -> Tensor:
-    """(B, C, H, W) -> (B, C, H, W + 2): the last column before the first, the first after the last."""
-    return functional.pad(images, (1, 1, 0, 0), mode="circular")
+def _around(layer: nn.Module) -> nn.Module:
+    """A layer of 3 x 3 pixels that goes round in azimuth: (B, C, H, W + 2) -> (B, C', H, W)."""
+    return nn.Sequential(nn.CircularPad2d((1, 1, 0, 0)), layer)
+
+
+def _convolution(channels_in: int, channels_out: int, stride: tuple[int, int] = (1, 1)) -> nn.Module:
+    return _around(nn.Conv2d(channels_in, channels_out, 3, stride, padding=(1, 0), bias=False))
 
 
 def _head(outputs: int) -> nn.Sequential:

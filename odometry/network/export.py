@@ -8,10 +8,9 @@ import json
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,40 +27,26 @@ from odometry.network.pair_network import PairImages
 _EXAMPLE_BATCH = 2
 
 
-@dataclass(frozen=True, eq=False)
-class _Graph:
-    """One file: a module, examples of its inputs, and the names of inputs and outputs."""
+class _Graph(NamedTuple):
+    """One file: a function of a network, examples of its inputs, and the names of inputs and outputs."""
 
     name: str
-    module: nn.Module
+    function: Callable[..., Any]
     inputs: tuple[Tensor, ...]
-    takes: Sequence[str]
-    gives: Sequence[str]
+    takes: list[str]
+    gives: list[str]
 
 
-class _Turns(nn.Module):
-    """(B, C, H', W') features of two scans -> (B, W') scores of turns."""
+class _Function(nn.Module):
+    """A function of a network as a module, with the network's weights."""
 
-    def __init__(self, network: CorrelationNetwork) -> None:
+    def __init__(self, network: nn.Module, function: Callable[..., Any]) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.function = network, function
 
-    def forward(self, previous: Tensor, current: Tensor) -> Tensor:
-        """Correlate."""
-        return self.network.turn_scores(previous, current)
-
-
-class _Pairs(nn.Module):
-    """(B, 6, H, W) points and normals of two scans -> motion (B, 4, 4), log sigma (B, 6)."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, previous: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
-        """Compare."""
-        estimate = self.network(PairImages(previous, current))
-        return estimate.T_prev_curr, estimate.log_sigma
+    def forward(self, *inputs: Tensor) -> Any:
+        """Call it."""
+        return self.function(*inputs)
 
 
 def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
@@ -73,14 +58,21 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
         ConfigError: the packages for it are not installed.
         OutputError: the folder cannot be written.
     """
-    _require_packages()
-    graphs = _graphs(checkpoint)
+    try:
+        import onnx  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            f"{error.name} is not installed, which writing ONNX needs; pip install 'lidarslam[export]'"
+        ) from error
+    network = network_of(checkpoint)
+    graphs = _graphs(network, checkpoint.images.rows, checkpoint.images.columns)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=out) as workplace:
             folder = Path(workplace)
             for graph in graphs:
-                _write(graph, folder / graph.name)
+                _write(_Function(network, graph.function).eval(), graph, folder / graph.name)
             description = describe(checkpoint.network, checkpoint.images)
             (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
             names = [*(graph.name for graph in graphs), DESCRIPTION]
@@ -91,38 +83,40 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
     return [out / name for name in names]
 
 
-def _graphs(checkpoint: Checkpoint) -> list[_Graph]:
-    network = network_of(checkpoint)
-    rows, columns = checkpoint.images.rows, checkpoint.images.columns
+def _graphs(network: nn.Module, rows: int, columns: int) -> list[_Graph]:
     points, normals = torch.rand(2, _EXAMPLE_BATCH, 3, rows, columns)
     if not isinstance(network, CorrelationNetwork):
         images = torch.cat([points, normals], dim=1)
-        gives = ["T_prev_curr", "log_sigma"]
-        return [_Graph(PAIR, _Pairs(network).eval(), (images, images + 1.0), ["previous", "current"], gives)]
+
+        def pair(previous: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
+            estimate = network(PairImages(previous, current))
+            return estimate.T_prev_curr, estimate.log_sigma
+
+        return [_Graph(PAIR, pair, (images, images + 1.0), ["previous", "current"], ["T_prev_curr", "log_sigma"])]
     with torch.no_grad():
         features = network.columns(points, normals)
     grids = torch.rand(_EXAMPLE_BATCH, bird_eye.CHANNELS, bird_eye.CELLS, bird_eye.CELLS)
     scores = torch.rand(_EXAMPLE_BATCH, features.shape[-1]), torch.rand(_EXAMPLE_BATCH, SHIFTS, SHIFTS)
     return [
         _Graph(COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
-        _Graph(TURNS, _Turns(network).eval(), (features, features.flip(0)), ["previous", "current"], ["scores"]),
+        _Graph(TURNS, network.turn_scores, (features, features.flip(0)), ["previous", "current"], ["scores"]),
         _Graph(BIRD, network.bird, (grids,), ["grids"], ["features"]),
         _Graph(PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),
     ]
 
 
-def _write(graph: _Graph, path: Path) -> None:
+def _write(module: nn.Module, graph: _Graph, path: Path) -> None:
     batch = torch.export.Dim("batch", min=1)
-    with _quiet_exporter():
-        program = torch.export.export(
-            graph.module, graph.inputs, dynamic_shapes=tuple({0: batch} for _ in graph.inputs)
-        )
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns about itself
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.export.export(module, graph.inputs, dynamic_shapes=(tuple({0: batch} for _ in graph.inputs),))
         torch.onnx.export(
             program,
             (),
             str(path),
-            input_names=list(graph.takes),
-            output_names=list(graph.gives),
+            input_names=graph.takes,
+            output_names=graph.gives,
             dynamic_shapes=tuple({0: "batch"} for _ in graph.inputs),
             dynamo=True,
             external_data=False,
@@ -132,7 +126,7 @@ def _write(graph: _Graph, path: Path) -> None:
 
 
 def _forget_origin(path: Path) -> None:
-    """Take out which lines of which files the graph came from: no business of those it is passed on to."""
+    """Remove which lines of which files the graph came from."""
     import onnx
 
     model = onnx.load(str(path))
@@ -143,27 +137,3 @@ def _forget_origin(path: Path) -> None:
     for value in (*model.graph.value_info, *model.graph.initializer, *model.graph.input, *model.graph.output):
         value.ClearField("metadata_props")
     onnx.save(model, str(path))
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Without the exporter's warnings about itself and what else could be installed."""
-    exporter = logging.getLogger("torch.onnx")
-    level = exporter.level
-    exporter.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        exporter.setLevel(level)
-
-
-def _require_packages() -> None:
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(
-            f"{error.name} is not installed, which writing ONNX needs; pip install 'lidarslam[export]'"
-        ) from error

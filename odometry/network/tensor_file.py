@@ -24,14 +24,6 @@ class Kind:
     version: int
 
 
-@dataclass(frozen=True, eq=False)
-class TensorFile:
-    """Named tensors, and values that JSON can hold."""
-
-    tensors: dict[str, Tensor]
-    content: dict[str, Any]
-
-
 def write_tensor_file(path: Path, kind: Kind, tensors: Mapping[str, Tensor], content: Mapping[str, Any]) -> None:
     """Write the file, whole or not at all.
 
@@ -49,8 +41,8 @@ def write_tensor_file(path: Path, kind: Kind, tensors: Mapping[str, Tensor], con
         raise OutputError(f"{path}: cannot be written ({reason})") from error
 
 
-def read_tensor_file(path: Path, kind: Kind) -> TensorFile:
-    """Read what `write_tensor_file` wrote.
+def read_tensor_file(path: Path, kind: Kind) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The named tensors and the description that `write_tensor_file` wrote.
 
     Raises:
         InputError: there is no such file, or it is none of this kind, or of a newer version.
@@ -62,7 +54,9 @@ def read_tensor_file(path: Path, kind: Kind) -> TensorFile:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected {kind.name} that {_PROGRAM} wrote") from None
     except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path}: is not {kind.name} that {_PROGRAM} wrote, or damaged ({error})") from error
+        raise InputError(
+            f"{path}: is no safetensors file; expected {kind.name} that {_PROGRAM} wrote, it may be damaged ({error})"
+        ) from error
     if header.get("program") != _PROGRAM or header.get("kind") != kind.name:
         found = header.get("kind") if header.get("program") == _PROGRAM else "tensors of another program"
         raise InputError(f"{path}: holds {found}, not {kind.name} that {_PROGRAM} wrote; name another file")
@@ -75,4 +69,4 @@ def read_tensor_file(path: Path, kind: Kind) -> TensorFile:
             f"{path}: has {kind.name} of version {version}, this program reads {kind.version} at most;"
             f" use a newer {_PROGRAM}"
         )
-    return TensorFile(tensors, content)
+    return tensors, content

@@ -1,7 +1,6 @@
 """The networks in torch for inference, with one's own weights and on accelerators."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,12 @@ def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads
     def graph(part: Callable[..., Any]) -> Graph:
         @torch.inference_mode()
         def run(*inputs: Floats) -> list[Floats]:
-            with using_threads(threads):
+            before = torch.get_num_threads()
+            torch.set_num_threads(threads)
+            try:
                 outputs = part(*(torch.from_numpy(values).to(device) for values in inputs))
+            finally:
+                torch.set_num_threads(before)
             outputs = outputs if isinstance(outputs, tuple) else (outputs,)
             return [np.ascontiguousarray(values.float().numpy(force=True)) for values in outputs]
 
@@ -40,14 +43,3 @@ def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads
         return estimate.T_prev_curr, estimate.log_sigma
 
     return WholePairs(graph(pair))
-
-
-@contextmanager
-def using_threads(count: int) -> Iterator[None]:
-    """So many threads for torch."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

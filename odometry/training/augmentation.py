@@ -19,42 +19,23 @@ _PANES = 6
 
 
 class Augmentation(NamedTuple):
-    """How pairs are changed; probabilities unless said otherwise.
+    """How pairs are changed; probabilities unless said otherwise."""
 
-    Attributes:
-        max_gap: steps from one scan of a pair to the other, 1 to this many, small ones more often.
-        reverse: the later scan comes first.
-        heading: both scans are turned about z by the same angle, any.
-        roll: the current scan is turned about z by whole columns.
-        roll_deg: standard deviation of most of these turns.
-        any_roll: the others, by any angle; a part of those that are turned.
-        mirror: y is negated.
-        scale: both scans grow or shrink by up to this part.
-        drop_beams: up to half of the rows are emptied.
-        drop_points: up to this part of the points, of each scan anew.
-        hide_sector: up to a quarter of the turn is emptied in one scan.
-        range_noise_m: greatest standard deviation of noise on the ranges.
-        wet_ground: level ground beyond 5 to 30 m does not return.
-        glass: several rectangles of one scan do not return.
-        bird_turn_deg: standard deviation of the turn by which scans are aligned before they are seen from above, as it
-            is known to within an error in use.
-    """
-
-    max_gap: int = 10
-    reverse: float = 0.5
-    heading: float = 1.0
-    roll: float = 0.8
-    roll_deg: float = 12.0
-    any_roll: float = 0.2
-    mirror: float = 0.5
-    scale: float = 0.3
-    drop_beams: float = 0.3
-    drop_points: float = 0.2
-    hide_sector: float = 0.2
-    range_noise_m: float = 0.02
-    wet_ground: float = 0.15
-    glass: float = 0.15
-    bird_turn_deg: float = 0.7
+    max_gap: int = 10  # steps from one scan of a pair to the other, 1 to this many, small ones more often
+    reverse: float = 0.5  # the later scan comes first
+    heading: float = 1.0  # both scans are turned about z by the same angle, any
+    roll: float = 0.8  # the current scan is turned about z by whole columns
+    roll_deg: float = 12.0  # standard deviation of most of these turns
+    any_roll: float = 0.2  # the others, by any angle; a part of those that are turned
+    mirror: float = 0.5  # y is negated
+    scale: float = 0.3  # both scans grow or shrink by up to this part
+    drop_beams: float = 0.3  # up to half of the rows are emptied
+    drop_points: float = 0.2  # up to this part of the points, of each scan anew
+    hide_sector: float = 0.2  # up to a quarter of the turn is emptied in one scan
+    range_noise_m: float = 0.02  # greatest standard deviation of noise on the ranges
+    wet_ground: float = 0.15  # level ground beyond 5 to 30 m does not return
+    glass: float = 0.15  # several rectangles of one scan do not return
+    bird_turn_deg: float = 0.7  # standard deviation of the error of the turn with which scans are seen from above
 
 
 AUGMENTATION = Augmentation()

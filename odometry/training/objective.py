@@ -48,8 +48,9 @@ def objective(estimate: Estimate, batch: PairBatch, config: TrainingConfig, gene
         if estimate.turn_scores.shape[1]:
             turn = _mean(_turn_loss(estimate.turn_scores, batch.T_prev_curr), batch.valid)
         if estimate.shift_scores.shape[1]:
-            in_reach = _cells(batch.T_prev_curr).abs().amax(1) < bird_eye.MOST_CELLS - 1
-            shift = _mean(_shift_loss(estimate.shift_scores, batch.T_prev_curr), batch.valid & in_reach)
+            cells = batch.T_prev_curr[:, :2, 3] / bird_eye.CELL_M  # (B, 2) along x, along y
+            in_reach = cells.abs().amax(1) < bird_eye.MOST_CELLS - 1
+            shift = _mean(_shift_loss(estimate.shift_scores, cells), batch.valid & in_reach)
         total = total + config.alignment_weight * (0.3 * alignment + 0.1 * confidence + turn + shift)
     if config.geometric is not None and batch.previous_surfaces is not None and batch.current_surfaces is not None:
         current = _surfaces(batch.current_surfaces, _GEOMETRIC_POINTS, generator)
@@ -101,17 +102,11 @@ def _turn_loss(scores: Tensor, target: Tensor) -> Tensor:
     return -(likelihood.gather(1, both) * weights).sum(dim=1)
 
 
-def _cells(T_prev_curr: Tensor) -> Tensor:
-    """(B, 2) translation along x and y of motions (B, 4, 4), in cells of the bird's-eye grid."""
-    cells: Tensor = T_prev_curr[:, :2, 3] / bird_eye.CELL_M
-    return cells
-
-
-def _shift_loss(scores: Tensor, target: Tensor) -> Tensor:
-    """(B,) cross entropy of the scores of shifts (B, S, S) with the translation, shared by the four cells around it."""
+def _shift_loss(scores: Tensor, cells: Tensor) -> Tensor:
+    """(B,) cross entropy of the scores of shifts (B, S, S) with a shift (B, 2), shared by the four cells around it."""
     count = scores.shape[-1]
     most = count // 2
-    cell = _cells(target).clamp(-most, most - 1e-3) + most
+    cell = cells.clamp(-most, most - 1e-3) + most
     low = cell.floor()
     share = cell - low  # (B, 2) along x, along y
     column, row = low.long().unbind(1)

@@ -97,9 +97,8 @@ def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces:
     T = torch.eye(4)
     for motion in recording.T_prev_curr[previous:current]:
         T = T @ motion
-    images = recording.images
     raw = [
-        torch.cat([images.points[i], images.normals[i].float()])[None]  # (1, 6, H, W)
+        torch.cat([recording.points[i], recording.normals[i].float()])[None]  # (1, 6, H, W)
         for i in (previous, current)
     ]
     still = [_compensated(recording, i) if surfaces else None for i in (previous, current)]
@@ -109,9 +108,9 @@ def pair_of(recording: PreparedRecording, previous: int, current: int, surfaces:
 
 def _compensated(recording: PreparedRecording, scan: int) -> Tensor:
     """(1, 6, H, W) a scan as seen from the middle of its sweep."""
-    images, one = recording.images, slice(scan, scan + 1)
-    points, normals, offsets = images.points[one], images.normals[one].float(), images.offsets[one].float()
-    return torch.cat(compensated(points, normals, offsets, _velocity(recording, scan)[None]), dim=1)
+    normals, offsets = recording.normals[scan, None].float(), recording.offsets[scan, None].float()
+    velocity = _velocity(recording, scan)[None]
+    return torch.cat(compensated(recording.points[scan, None], normals, offsets, velocity), dim=1)
 
 
 def _velocity(recording: PreparedRecording, scan: int) -> Tensor:

@@ -19,7 +19,6 @@ from odometry.alignment.search import DOUBTFUL, align_best, try_instead
 from odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from odometry.config import ImageConfig
 from odometry.images.sweep_images import Imager, SweepImages, middle_offset_s
-from odometry.training.torch_images import RecordedImages
 
 # Initial estimates of the turn from one scan to the next, degrees. Alignment converges over half a step.
 _TURNS_DEG = (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0)
@@ -33,42 +32,56 @@ _SHORTEST_S = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PreparedRecording:
-    """N consecutive scans of one sensor.
+    """N consecutive scans of one sensor, as images of the network's size.
 
     Attributes:
-        images: of the raw sweeps, as the network sees them.
+        points: (N, 3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
+        normals: (N, 3, H, W) unit, zero where there is none; they may be of half precision.
+        offsets: (N, H, W) seconds from the middle of the sweep, likewise; all zero where unknown.
         interval_s: (N - 1,) from the middle of each sweep to the next.
         T_prev_curr: (N - 1, 4, 4) pseudo-labels of the motions between the middles of sweeps.
         valid: (N - 1,) whether they are reliable.
     """
 
-    images: RecordedImages
+    points: Tensor
+    normals: Tensor
+    offsets: Tensor
     interval_s: Tensor
     T_prev_curr: Tensor
     valid: Tensor
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self.points)
 
 
 def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:
-    """Images of all scans, and the motions between them.
+    """Images of all scans, and each aligned with the one before.
 
     Raises:
         ValueError: there are fewer than two scans.
     """
-    imager, labeller = Imager(config), _Labeller()
-    images, middles, found = [], [], []
+    imager, T_last, last = Imager(config), np.eye(4), None
+    images, middles, found = list[SweepImages](), list[float](), list[Alignment]()
+    previous: SweepImages | None = None
     for scan in scans:
-        made, middle = imager.images(scan), scan.stamp + middle_offset_s(scan)
-        aligned = labeller.label(made.alignment, middle)
+        made = imager.images(scan)
         images.append(made.network)
-        middles.append(middle)
-        found += [aligned] if aligned is not None else []
+        middles.append(scan.stamp + middle_offset_s(scan))
+        if previous is not None:
+            interval_s = max(middles[-1] - middles[-2], _SHORTEST_S)
+            best = _aligned(T_last, SweepPair(made.alignment, previous, interval_s, last))
+            found.append(best)
+            T_last, last = np.eye(4), None
+            if _is_valid(best):
+                T_last = best.T_prev_curr
+                last = SweepMotion(log(T_last) / interval_s, best.velocity_change, interval_s)
+        previous = made.alignment
     if len(images) < 2:
         raise ValueError(f"training needs pairs of scans, this recording has {len(images)}")
     return PreparedRecording(
-        images=RecordedImages.stacked(images),
+        points=torch.from_numpy(np.stack([one.points for one in images])),
+        normals=torch.from_numpy(np.stack([one.normals for one in images])),
+        offsets=torch.from_numpy(np.stack([one.offsets for one in images])),
         interval_s=torch.from_numpy(np.diff(middles)).float().clamp(min=_SHORTEST_S),
         T_prev_curr=torch.from_numpy(np.stack([one.T_prev_curr for one in found])).float(),
         valid=torch.tensor([_is_valid(one) for one in found]),
@@ -77,28 +90,6 @@ def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:
 
 def _is_valid(alignment: Alignment) -> bool:
     return alignment.explained > _LEAST_EXPLAINED and alignment.inliers >= _LEAST_INLIERS
-
-
-class _Labeller:
-    """Aligns every scan with the one before it."""
-
-    def __init__(self) -> None:
-        self._previous: tuple[SweepImages, float] | None = None
-        self._last: SweepMotion | None = None
-        self._T_last = np.eye(4)
-
-    def label(self, images: SweepImages, middle: float) -> Alignment | None:
-        """The scan aligned with the one before; None for the first."""
-        previous, self._previous = self._previous, (images, middle)
-        if previous is None:
-            return None
-        interval_s = max(middle - previous[1], _SHORTEST_S)
-        best = _aligned(self._T_last, SweepPair(images, previous[0], interval_s, self._last))
-        self._T_last, self._last = np.eye(4), None
-        if _is_valid(best):
-            self._T_last = best.T_prev_curr
-            self._last = SweepMotion(log(best.T_prev_curr) / interval_s, best.velocity_change, interval_s)
-        return best
 
 
 def _aligned(T_last: FloatArray, sweeps: SweepPair) -> Alignment:

@@ -1,39 +1,11 @@
 """Images of sweeps in torch: rotated, mirrored and motion compensated."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from odometry.images.sweep_images import SweepImages
 from odometry.network.torch_geometry import skew
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedImages:
-    """The sweeps of a recording as images of one size.
-
-    Attributes:
-        points: (B, 3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
-        normals: (B, 3, H, W) unit, zero where there is none.
-        offsets: (B, H, W) seconds from the middle of the sweep; all zero where unknown.
-    """
-
-    points: Tensor
-    normals: Tensor
-    offsets: Tensor
-
-    @classmethod
-    def stacked(cls, sweeps: Sequence[SweepImages]) -> "RecordedImages":
-        """Sweeps one after the other, which have images of one size."""
-        parts = (np.stack([getattr(sweep, name) for sweep in sweeps]) for name in ("points", "normals", "offsets"))
-        return cls(*(torch.from_numpy(part) for part in parts))
-
-    def __len__(self) -> int:
-        return len(self.points)
 
 
 def rotate_columns(images: Tensor, shift: Tensor) -> Tensor:

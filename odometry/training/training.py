@@ -86,7 +86,8 @@ def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
     translation = errors[:, 3:].norm(dim=1)
     covered = [100.0 * float((errors.abs() <= k * sigmas).float().mean()) for k in (1, 2, 3)]
     return Validation(
-        _rms(rotation), _rms(translation), float(rotation.median()), float(translation.median()),
+        float(rotation.square().mean().sqrt()), float(translation.square().mean().sqrt()),
+        float(rotation.median()), float(translation.median()),
         (covered[0], covered[1], covered[2]), len(errors),
     )  # fmt: skip
 
@@ -94,7 +95,7 @@ def summarise(errors: Tensor, sigmas: Tensor) -> Validation:
 def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tuple[Tensor, Tensor]:
     """Errors (N, 6) and standard deviations (N, 6) from one of the chosen scans to the next, where labels are valid."""
     errors, sigmas = [torch.zeros(0, 6)], [torch.zeros(0, 6)]
-    points, normals = recording.images.points.numpy(), recording.images.normals.float().numpy()
+    points, normals = recording.points.numpy(), recording.normals.float().numpy()
     before = None
     for number in chosen:
         if before is None:
@@ -107,7 +108,3 @@ def _errors(search: Search, recording: PreparedRecording, chosen: range) -> tupl
             errors.append(motion_error(T_prev_curr[None], pair.T_prev_curr))
             sigmas.append(torch.from_numpy(np.sqrt(np.diag(candidates[0].covariance))).float()[None])
     return torch.cat(errors), torch.cat(sigmas)
-
-
-def _rms(values: Tensor) -> float:
-    return float(values.square().mean().sqrt())

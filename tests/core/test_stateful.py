@@ -100,7 +100,7 @@ def test_what_was_saved_comes_back(full, tmp_path):
         (lambda tree: tree.update(pair=[1]), "expected 2 values"),
         (lambda tree: tree.update(names=[1]), "expected str"),
         (lambda tree: tree.update(names="a"), "expected a list"),
-        (lambda tree: tree.update(grid=[]), "should be a tree"),
+        (lambda tree: tree.update(grid=[]), "expected a tree"),
         (lambda tree: tree.update(times={"keys": ["a"], "values": np.zeros(2)}), "zip"),
     ],
 )

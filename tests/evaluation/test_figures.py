@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from evaluation.comparison.comparison import MapErrors
-from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
+from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text, printable
 from evaluation.report.figures.figure import Panel, line_trace, method_styles, plot_text, thin_curve
 from evaluation.report.figures.maps import raster
-from evaluation.report.plain_text import printable
 
 
 def test_a_thinned_curve_keeps_its_peaks_and_ends(rng):

@@ -113,7 +113,7 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, small_recording: Path, name: s
     else:
         (tmp_path / name).write_bytes(pickle.dumps(Bomb(opened), protocol=form))  # type: ignore[arg-type]
     said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / name))
-    assert "is a pickle" in said or "is no safetensors file" in said
+    assert "is no safetensors file" in said
     assert not opened.exists()
     assert not (tmp_path / "run").exists()
     pickle.loads(pickle.dumps(Bomb(opened)))
@@ -134,18 +134,17 @@ def _first(tensors: dict[str, torch.Tensor]) -> str:
 
 
 TENSORS: dict[str, tuple[Callable[[dict[str, torch.Tensor]], object], str]] = {
-    "missing": (lambda t: t.pop(_first(t)), "is missing"),
-    "extra": (lambda t: t.update({"m\x1bore": torch.zeros(1)}), "has no m\\x1bore"),
-    "shape": (lambda t: t.update({_first(t): torch.zeros(1, 2, 3)}), "is (1, 2, 3), network correlation has"),
+    "missing": (lambda t: t.pop(_first(t)), "Missing key"),
+    "extra": (lambda t: t.update({"m\x1bore": torch.zeros(1)}), 'Unexpected key(s) in state_dict: "m\\x1bore"'),
+    "shape": (lambda t: t.update({_first(t): torch.zeros(1, 2, 3)}), "size mismatch for"),
     "nan": (lambda t: t.update({_first(t): t[_first(t)] * np.nan}), "not finite"),
-    "integers": (lambda t: t.update({_first(t): t[_first(t)].to(torch.int32)}), "holds torch.int32"),
-    "complex": (lambda t: t.update({_first(t): t[_first(t)].to(torch.complex64)}), "holds torch.complex64"),
+    "integers": (lambda t: t.update({_first(t): t[_first(t)].to(torch.int32)}), "is torch.int32"),
+    "complex": (lambda t: t.update({_first(t): t[_first(t)].to(torch.complex64)}), "is torch.complex64"),
 }
 CONTENTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "another network": (lambda c: c["network"].update(name="delora"), "of network delora is missing"),
+    "another network": (lambda c: c["network"].update(name="delora"), "Missing key"),
     "no such network": (lambda c: c["network"].update(name="gpt"), "does not fit this program"),
-    "endless": (lambda c: c["network"]["correlation"].update(widths=[10**9] * 3), "cannot be made"),
-    "images": (lambda c: c["images"].update(rows=10**9), "does not fit this program (rows"),
+    "images": (lambda c: c["images"].update(rows=10**9), "does not fit this program"),
 }
 
 

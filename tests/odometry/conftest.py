@@ -11,9 +11,14 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from odometry.images.sweep_images import SweepImages
 from odometry.training.preparation import PreparedRecording
-from odometry.training.torch_images import RecordedImages
 
 _LOW, _HIGH = np.deg2rad(-18.0), np.deg2rad(18.0)
+
+
+def stacked(sweeps: Sequence[SweepImages]) -> list[torch.Tensor]:
+    """Points and normals (N, 3, H, W), and offsets (N, H, W)."""
+    names = ("points", "normals", "offsets")
+    return [torch.from_numpy(np.stack([getattr(sweep, name) for sweep in sweeps])) for name in names]
 
 
 @dataclass(frozen=True)
@@ -87,11 +92,15 @@ class Scene:
             scans.append(Scan.from_raw(points[seen], stamp, times[seen], rings[seen]))
         return scans
 
+    def images(self, count: int, twist: Sequence[float]) -> list[torch.Tensor]:
+        """Points, normals and offsets of the sweeps."""
+        return stacked(self.sweeps(count, twist))
+
     def recording(self, count: int, twist: Sequence[float], rolling: bool = True) -> PreparedRecording:
         """The sweeps with their true motions, all valid."""
         T = torch.from_numpy(exp(self.period_s * np.asarray(twist))).float().expand(count - 1, 4, 4)
         return PreparedRecording(
-            RecordedImages.stacked(self.sweeps(count, twist, rolling=rolling)),
+            *stacked(self.sweeps(count, twist, rolling=rolling)),
             torch.full((count - 1,), self.period_s),
             T.clone(),
             torch.ones(count - 1, dtype=torch.bool),

@@ -95,7 +95,7 @@ def test_a_pickle_is_refused_unopened(how: str, tmp_path: Path) -> None:
         path.write_bytes(pickle.dumps(_Malicious(trace)))
     else:
         torch.save({"weight": _Malicious(trace)}, path)
-    with pytest.raises(InputError, match="is not weights that lidarslam wrote"):
+    with pytest.raises(InputError, match="is no safetensors file"):
         load_checkpoint(path)
     assert not trace.exists()
 
@@ -106,13 +106,13 @@ def test_what_is_no_weights_file_is_told(tmp_path: Path, trained: Checkpoint) ->
         load_checkpoint(missing)
     text = tmp_path / "notes.txt"
     text.write_text("some notes that are long enough")
-    with pytest.raises(InputError, match="is not weights that lidarslam wrote"):
+    with pytest.raises(InputError, match="is no safetensors file"):
         load_checkpoint(text)
     other = tmp_path / "other.safetensors"
     save_file(trained.weights, other)
     with pytest.raises(InputError, match="holds tensors of another program, not weights"):
         load_checkpoint(other)
-    with pytest.raises(InputError, match="is not weights"):
+    with pytest.raises(InputError, match="is no safetensors file"):
         load_checkpoint(tmp_path)
 
 
@@ -128,7 +128,7 @@ def test_other_kinds_and_newer_versions_are_told(tmp_path: Path, trained: Checkp
 
 def test_a_cut_file_is_told(file: Path) -> None:
     file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(InputError, match="or damaged"):
+    with pytest.raises(InputError, match="may be damaged"):
         load_checkpoint(file)
 
 
@@ -143,7 +143,7 @@ def test_weights_that_do_not_fit_are_told(trained: Checkpoint, file: Path) -> No
         load_checkpoint(saved(lambda w: w.pop("columns.layers.8.bias")))
     with pytest.raises(InputError, match=r"size mismatch for columns\.layers\.8\.bias"):
         load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.zeros(5)})))
-    with pytest.raises(InputError, match=r"columns\.layers\.8\.bias is not finite"):
+    with pytest.raises(InputError, match=r"columns\.layers\.8\.bias is torch.float32, or not finite"):
         load_checkpoint(saved(lambda w: w.update({"columns.layers.8.bias": torch.full((32,), torch.nan)})))
     with pytest.raises(InputError, match=r"Unexpected key.*surplus"):
         load_checkpoint(saved(lambda w: w.update({"surplus": torch.zeros(1)})))
@@ -164,6 +164,6 @@ def test_missing_default_weights_say_what_to_do(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_the_shipped_weights_load_with_keys_that_were_settings_once() -> None:
-    content = module.read_tensor_file(default_weights(), module.WEIGHTS).content
+    _, content = module.read_tensor_file(default_weights(), module.WEIGHTS)
     assert "normals" in content["images"]
     assert load_checkpoint(default_weights()).images == ImageConfig()

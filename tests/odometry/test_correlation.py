@@ -18,7 +18,7 @@ from odometry.training.augmentation import PairBatch
 from odometry.training.config import TrainingConfig
 from odometry.training.objective import objective
 from odometry.training.pairs import birds, pair_of
-from odometry.training.torch_images import RecordedImages, rotate_columns
+from odometry.training.torch_images import rotate_columns
 from odometry.training.training import loss_of
 
 COLUMNS = 96
@@ -39,8 +39,8 @@ def network() -> CorrelationNetwork:
 @pytest.fixture(scope="module")
 def scans(small_room) -> tuple[Tensor, Tensor]:
     """Points and normals (3, 3, H, W) each."""
-    images = RecordedImages.stacked(small_room.sweeps(3, TWIST))
-    return images.points, images.normals
+    points, normals, _ = small_room.images(3, TWIST)
+    return points, normals
 
 
 def turned(scans: tuple[Tensor, Tensor], columns: int) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,6 @@ from odometry.network.torch_geometry import inverse, log, rotate, skew, transfor
 from odometry.training.augmentation import Augmentation, PairBatch, augmented
 from odometry.training.pairs import Pairs, pair_of
 from odometry.training.preparation import PreparedRecording
-from odometry.training.torch_images import RecordedImages
 
 TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
 NONE = Augmentation(
@@ -71,8 +70,8 @@ def test_a_pair_as_it_is(recording):
     pair = pair_of(recording, 1, 2)
     torch.testing.assert_close(pair.T_prev_curr[0], motion())
     for images, number in ((pair.previous, 1), (pair.current, 2)):
-        assert torch.equal(images[0, :3], recording.images.points[number])
-        assert torch.equal(images[0, 3:], recording.images.normals[number])
+        assert torch.equal(images[0, :3], recording.points[number])
+        assert torch.equal(images[0, 3:], recording.normals[number])
     assert pair.valid.tolist() == [True]
     plain = pair_of(recording, 1, 2, surfaces=False)
     assert plain.previous_surfaces is None
@@ -138,9 +137,7 @@ def _surfaces(pair: PairBatch) -> tuple[Tensor | None, Tensor | None]:
 
 
 def test_a_pair_is_valid_if_all_motions_between_are(recording):
-    doubtful = PreparedRecording(
-        recording.images, recording.interval_s, recording.T_prev_curr, torch.tensor([True, False, True]),
-    )  # fmt: skip
+    doubtful = replace(recording, valid=torch.tensor([True, False, True]))
     pairs = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
     assert [bool(pair_of(doubtful, *pair).valid) for pair in pairs] == [True, False, True, False, False]
 
@@ -225,18 +222,13 @@ def test_the_motion_follows_what_is_done_to_the_scans(recording, name, gap):
 
 
 def _first_two(recording: PreparedRecording) -> PreparedRecording:
-    return PreparedRecording(
-        RecordedImages(*(part[:2] for part in vars(recording.images).values())), recording.interval_s[:1],
-        recording.T_prev_curr[:1],
-        recording.valid[:1],
-    )  # fmt: skip
+    motions = ("interval_s", "T_prev_curr", "valid")
+    return PreparedRecording(**{name: part[: 1 if name in motions else 2] for name, part in vars(recording).items()})
 
 
 def test_what_the_network_sees_is_changed_like_the_surfaces(recording):
     """Raw sweeps and compensated ones go the same way; seen here where they are the same."""
-    still = PreparedRecording(
-        recording.images, recording.interval_s, recording.T_prev_curr, torch.zeros(3, dtype=torch.bool),
-    )  # fmt: skip
+    still = replace(recording, valid=torch.zeros(3, dtype=torch.bool))
     batch = Pairs([still], 0, augmentation=only(**AUGMENTATIONS["all"], reverse=0.5)).batch(0, 8)
     assert torch.equal(batch.previous, batch.previous_surfaces)
     assert torch.equal(batch.current, batch.current_surfaces)

@@ -7,19 +7,20 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from odometry.alignment.point_to_plane import FINE_M, PointToPlane
+from odometry.alignment.residuals import Motion
 from odometry.alignment.sweep_motion import SweepPair
 from odometry.images.projection import ImageGrid
 
 STEP, FILL, GATE_M, GATE_PER_M, LEAST_COSINE = 2, 4, 0.2, 0.04, 0.8
-Motion = tuple[FloatArray, FloatArray, FloatArray]  # T_prev_curr, velocity and its change
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)
 
 
-def movement(seed: int) -> Motion:
+def motion(seed: int) -> Motion:
     """Not quite the sweeps' own, and bent."""
     rng = np.random.default_rng(seed)
     velocity = np.array(TWIST) + rng.normal(0.0, 0.1, 6)
-    return exp(0.1 * velocity), velocity, rng.normal(0.0, 0.2, 6)
+    change = rng.normal(0.0, 0.2, 6)
+    return Motion(exp(0.1 * velocity), velocity - change, velocity + change)
 
 
 def noisy_pair(scene, rolling: bool) -> SweepPair:
@@ -68,8 +69,7 @@ class SlowSums:
 
     def pairs(self, motion: Motion, scale_m: float):
         """Jacobian (12,), residual, turned normal, and whether the point is in view and kept, of each point."""
-        T, velocity, change = motion
-        late, early = velocity + change, velocity - change
+        T, early, late = motion
         for p, n, t in self.points:
             moved = T[:3, :3] @ seen_at(p, t, late) + T[:3, 3]
             pixel, _ = self.pixel(moved)
@@ -98,9 +98,9 @@ def seen_at(point: FloatArray, seconds: float, velocity: FloatArray) -> FloatArr
 @pytest.mark.parametrize("scale_m", [0.5, 0.05])
 def test_normal_equations_are_those_of_the_slow_sums(box_room, rolling, scale_m):
     sweeps = noisy_pair(box_room, rolling)
-    H, g = PointToPlane(sweeps, STEP).normal_equations(*movement(1), scale_m)
+    H, g = PointToPlane(sweeps, STEP).normal_equations(motion(1), scale_m)
     expected_H, expected_g = np.zeros((12, 12)), np.zeros(12)
-    for J, residual, _, _, kept in SlowSums(sweeps).pairs(movement(1), scale_m):
+    for J, residual, _, _, kept in SlowSums(sweeps).pairs(motion(1), scale_m):
         weight = kept / (1.0 + (residual / scale_m) ** 2) ** 2
         expected_H += weight * np.outer(J, J)
         expected_g += weight * residual * J
@@ -114,8 +114,8 @@ def test_normal_equations_are_those_of_the_slow_sums(box_room, rolling, scale_m)
 @pytest.mark.parametrize("rolling", [False, True])
 def test_fits_are_those_of_the_slow_sums(box_room, rolling):
     sweeps = noisy_pair(box_room, rolling)
-    found = PointToPlane(sweeps, STEP).fit(*movement(2))
-    slow = list(SlowSums(sweeps).pairs(movement(2), FINE_M))
+    found = PointToPlane(sweeps, STEP).fit(motion(2))
+    slow = list(SlowSums(sweeps).pairs(motion(2), FINE_M))
     seen = [turned for _, _, turned, inside, _ in slow if inside]
     good = [(J, residual, turned) for J, residual, turned, _, kept in slow if kept and abs(residual) < 2.0 * FINE_M]
     assert found.inliers > 50
@@ -137,14 +137,14 @@ def test_an_image_without_points_says_nothing(box_room):
     sweeps = noisy_pair(box_room, True)
     parts = {name: 0.0 * getattr(sweeps.current, name) for name in ("points", "normals", "offsets")}
     sums = PointToPlane(replace(sweeps, current=replace(sweeps.current, **parts)), STEP)
-    H, g = sums.normal_equations(*movement(1), 0.5)
+    H, g = sums.normal_equations(motion(1), 0.5)
     assert not H.any()
     assert not g.any()
-    assert sums.fit(*movement(1)).inliers == 0
+    assert sums.fit(motion(1)).inliers == 0
 
 
 def test_a_motion_that_is_none_holds_nothing(box_room):
     """NaN, as of equations without a solution, must not lead out of the image."""
     sums = PointToPlane(noisy_pair(box_room, True), STEP)
-    H, _ = sums.normal_equations(np.full((4, 4), np.nan), np.zeros(6), np.zeros(6), 0.5)
+    H, _ = sums.normal_equations(Motion(np.full((4, 4), np.nan), np.zeros(6), np.zeros(6)), 0.5)
     assert not H.any()

@@ -28,7 +28,7 @@ def errors(recording, twist):
 def test_motions_are_found_from_scratch(box_room, twist):
     recording = prepare(box_room.scans(10, twist), CONFIG)  # more than are made into images at a time
     assert len(recording) == 10
-    assert recording.images.points.shape == (10, 3, 16, 360)
+    assert recording.points.shape == (10, 3, 16, 360)
     rotation_deg, translation_m = errors(recording, twist)
     # The rest is that of normals near edges.
     assert rotation_deg.max() < 0.15

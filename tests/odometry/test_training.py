@@ -104,11 +104,9 @@ class Stub(nn.Module):
 def numbered(count: int, small_room) -> PreparedRecording:
     recording = small_room.recording(2, TWIST)
     points = torch.arange(count, dtype=torch.float32)[:, None, None, None].expand(count, 3, 4, 8)
-    images = replace(
-        recording.images, points=points, normals=points.half(), offsets=torch.zeros(count, 4, 8),
-    )  # fmt: skip
     T = recording.T_prev_curr.expand(count - 1, 4, 4)
-    return PreparedRecording(images, torch.ones(count - 1), T, torch.ones(count - 1) > 0)
+    images = points, points.half(), torch.zeros(count, 4, 8)
+    return PreparedRecording(*images, torch.ones(count - 1), T, torch.ones(count - 1) > 0)
 
 
 def known_errors(count: int) -> Tensor:

@@ -50,9 +50,8 @@ def _panels(parts: Parts, places: Sequence[int], x_label: str, per_m: int, style
         drifts = [by_place.get(place) for place in reached]
         translation[name] = np.array([drift.translation_percent if drift else np.nan for drift in drifts])
         rotation[name] = np.array([drift.rotation_deg_per_m * per_m if drift else np.nan for drift in drifts])
-    ticks = {"tickvals": [*range(len(reached))], "ticktext": [*map(str, reached)]}
     layout = {
-        "xaxis": {"title": {"text": x_label}, **ticks},
+        "xaxis": {"title": {"text": x_label}, "type": "category"},
         "yaxis": {"rangemode": "tozero"},
         "hovermode": "x unified",
     }
@@ -61,7 +60,7 @@ def _panels(parts: Parts, places: Sequence[int], x_label: str, per_m: int, style
     for title, curves in zip(titles, (translation, rotation), strict=True):
         traces = [
             line_trace(
-                name, styles[name], np.arange(len(reached)), curve,
+                name, styles[name], [*map(str, reached)], curve,
                 mode="lines+markers", marker=styles[name].marker, hovertemplate="%{y:.3f}",
             )
             for name, curve in curves.items()

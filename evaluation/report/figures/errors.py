@@ -87,7 +87,11 @@ def _panel(title: str, measured: Measured, curves: Sequence[FloatArray], styles:
             cross = {"symbol": "x", "size": 5, "color": style.colour}
             more = {"mode": "markers", "marker": cross, "hoverinfo": "skip"}
             traces.append(line_trace(method.name, style, travelled[lost], curve[lost], **more))
-    layout = {"xaxis": {"title": {"text": "distance travelled [m]"}}, "yaxis": {}, "hovermode": "x unified"}
+    layout = {
+        "xaxis": {"title": {"text": "distance travelled [m]"}, "hoverformat": ".1f"},
+        "yaxis": {},
+        "hovermode": "x unified",
+    }
     if not signed:
         layout["yaxis"] = {"rangemode": "tozero"}
     return Panel(title, traces, layout, 190 if signed else 270, None if signed else needs_log(curves))

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 from plotly.io.json import to_json_plotly
 
-from evaluation.report.plain_text import printable
+from evaluation.comparison.table import printable
 from lidarslam.core.geometry import FloatArray
 
 # After Okabe and Ito (blue, vermilion, green, purple), then four more; contrast of 3 or more on white and on dark.
@@ -72,7 +72,7 @@ class Panel:
     Attributes:
         title: quantity and unit.
         traces: plotly's.
-        layout: what differs from the page's.
+        layout: differences from the page's layout.
         height: in pixels; the width is the page's.
         log: whether the vertical axis starts logarithmic; None where it cannot be.
     """
@@ -98,7 +98,7 @@ class Figure:
 
     Attributes:
         title: a few words, the beginning of the caption.
-        caption: what is shown, in which units and frames.
+        caption: content, units and frames.
         panels: of the same methods.
         methods: entries of the legend.
         reference: name of the reference in the legend; empty where it is not drawn.
@@ -128,10 +128,10 @@ def plot_text(text: str) -> str:
 
 
 def line_trace(name: str, style: Style, x: ArrayLike, y: ArrayLike, **more: Any) -> Any:
-    """A method's curve, or markers; NaN interrupts it."""
+    """A method's curve or markers; NaN interrupts it, a list holds categories."""
     given = {"mode": "lines", "line": style.line, "legendgroup": style.key, **more}
-    y = y if isinstance(y, list) else np.asarray(y, np.float32)
-    return go.Scatter(x=np.asarray(x, np.float32), y=y, name=plot_text(name), **given)
+    x, y = (values if isinstance(values, list) else np.asarray(values, np.float32) for values in (x, y))
+    return go.Scatter(x=x, y=y, name=plot_text(name), **given)
 
 
 def bar_panel(title: str, unit: str, values: Mapping[str, float], styles: Styles, **more: Any) -> Panel:

@@ -19,7 +19,7 @@
       zerolinecolor: colour("--zero"), zerolinewidth: 1, nticks: 6, exponentformat: "none",
     };
     const ends = ["#fde725", "#5ec962", "#21918c", "#3b528b", "#440154"]; // viridis: pale is small on white paper
-    if (dark.matches) ends.reverse();
+    if (dark.matches && !matchMedia("print").matches) ends.reverse();
     return {
       layout: {
         font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: colour("--ink") },
@@ -86,7 +86,9 @@
     showMethods();
   });
 
-  dark.addEventListener("change", () => drawn().forEach((plot) => Plotly.relayout(plot, { template: template() })));
+  const recolour = () => drawn().forEach((plot) => Plotly.relayout(plot, { template: template() }));
+  dark.addEventListener("change", recolour);
+  matchMedia("print").addEventListener("change", recolour); // paper is light whatever the screen is
   addEventListener("beforeprint", drawAll);
   const observer = new IntersectionObserver((entries) => {
     for (const entry of entries) if (entry.isIntersecting) draw(entry.target);

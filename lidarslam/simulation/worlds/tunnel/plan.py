@@ -61,7 +61,7 @@ def _draw_loop(rng: np.random.Generator) -> Gallery:
     along = lengths_along(closed)
     length = rng.uniform(155.0, 260.0)
     n = round(length / SPACING_M)
-    line = points_along(closed * (length / along[-1]), along * length / along[-1], length / n * np.arange(n))
+    line = points_along(closed * (length / along[-1]), along * length / along[-1], length / n * np.arange(n, dtype=np.float64))
     z = _waves(rng, n, 3)
     steepest = float(np.abs(np.roll(z, -1) - z).max()) * n / length
     z *= rng.uniform(0.6, 1.0) * _STEEPEST / steepest

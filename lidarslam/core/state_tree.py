@@ -1,0 +1,248 @@
+"""Values as trees of arrays, numbers and texts, driven by type hints; never code.
+
+Known are bool, int, float, str, enumerations, `T | None`, `NDArray[dtype]` (with `Annotated[..., Shape(None, 3)]` the
+shape too), `list[T]`, `tuple[T, ...]`, `tuple[A, B]`, `dict[K, V]`, dataclasses and `Stateful` classes, nested at will.
+Lists are stored by columns: a list of a thousand (4, 4) arrays is one array (1000, 4, 4), a list of dataclasses a list
+for each field.
+"""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+
+State = dict[str, Any]  # arrays, numbers, texts, None, lists of these, and further trees
+
+
+class Saved:
+    """A tree read back from a file.
+
+    Args:
+        values: the tree.
+        place: the file, and where in it, for errors.
+    """
+
+    def __init__(self, values: Mapping[str, Any], place: str = "the state") -> None:
+        self._values = values
+        self.place = place
+
+    def value(self, name: str) -> Any:
+        """The tree under a name; InputError where there is none."""
+        if name not in self._values:
+            raise self.refuse(f"{name} is missing")
+        return self._values[name]
+
+    def has(self, name: str) -> bool:
+        """Whether the value under a name is not None."""
+        return self.value(name) is not None
+
+    def part(self, name: str) -> "Saved":
+        """The branch under a name."""
+        return Saved(_tree(self.value(name), self.at(name)), self.place)
+
+    def at(self, name: str) -> "Saved":
+        """The same tree, for errors about the value under a name."""
+        return Saved(self._values, f"{self.place}, {name}")
+
+    def refuse(self, reason: str) -> InputError:
+        """The error for a tree that contradicts itself."""
+        return InputError(f"{self.place}: is not what this program saves ({reason}); begin again with --overwrite")
+
+    def unfit(self, wanted: str, found: Any) -> InputError:
+        """The error for a value of another type or shape."""
+        what = f"{found.dtype} {found.shape}" if isinstance(found, np.ndarray) else type(found).__name__
+        return self.refuse(f"expected {wanted}, got {what}")
+
+
+class Shape:
+    """Expected shape of an array in an `Annotated` hint; None stands for any length."""
+
+    def __init__(self, *lengths: int | None) -> None:
+        self.lengths = lengths
+
+    def fits(self, shape: tuple[int, ...]) -> bool:
+        """Whether an array of that shape is one of these."""
+        same = (wanted in (None, found) for wanted, found in zip(self.lengths, shape, strict=False))
+        return len(shape) == len(self.lengths) and all(same)
+
+
+def encode(kind: Any, value: Any) -> Any:
+    """The tree of a value of that type."""
+    kind, _ = _bare(kind)
+    if (inner := _optional(kind)) is not None:
+        return None if value is None else encode(inner, value)
+    origin, items = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if origin is tuple and Ellipsis not in items:
+        return [encode(item, one) for item, one in zip(items, value, strict=True)]
+    if origin in (list, tuple):
+        return _encode_list(items[0], list(value))
+    if origin is dict:
+        return dict(
+            zip(_DICT, (_encode_list(items[0], [*value]), _encode_list(items[1], [*value.values()])), strict=True)
+        )
+    return _encode_plain(origin, value)
+
+
+def _encode_plain(kind: Any, value: Any) -> Any:
+    if hasattr(value, "state"):
+        return value.state()
+    if _is_dataclass(kind):
+        return {name: encode(hint, getattr(value, name)) for name, hint in hints_of(kind).items()}
+    if isinstance(value, Enum):
+        return value.name
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def decode(kind: Any, tree: Any, saved: Saved) -> Any:
+    """The value of that type that a tree stands for.
+
+    Args:
+        kind: the type hint.
+        tree: made by `encode` with the same hint.
+        saved: where it stands, for errors.
+
+    Raises:
+        InputError: the tree is another one.
+    """
+    kind, shape = _bare(kind)
+    if (inner := _optional(kind)) is not None:
+        return None if tree is None else decode(inner, tree, saved)
+    origin, items = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if origin is np.ndarray:
+        return _decode_array(items[1], shape, tree, saved)
+    if origin is dict:
+        parts = _tree(tree, saved)
+        keys, values = (_decode_list(one, parts.get(name), saved) for one, name in zip(items, _DICT, strict=True))
+        return checked(saved, lambda: dict(zip(keys, values, strict=True)))
+    if origin is list or Ellipsis in items:
+        return origin(_decode_list(items[0], tree, saved))
+    if origin is tuple:
+        if not isinstance(tree, list) or len(tree) != len(items):
+            raise saved.unfit(f"{len(items)} values", tree)
+        return tuple(decode(item, one, saved) for item, one in zip(items, tree, strict=True))
+    return _decode_plain(origin, tree, saved)
+
+
+def _decode_plain(kind: Any, tree: Any, saved: Saved) -> Any:
+    if hasattr(kind, "restore"):
+        made = kind.__new__(kind)
+        made.restore(Saved(_tree(tree, saved), saved.place))
+        return made
+    if _is_dataclass(kind):
+        part = Saved(_tree(tree, saved), saved.place)
+        values = {name: decode(hint, part.value(name), part.at(name)) for name, hint in hints_of(kind).items()}
+        return checked(saved, lambda: kind(**values))
+    if issubclass(kind, Enum):
+        if not isinstance(tree, str) or tree not in kind.__members__:
+            raise saved.unfit(f"one of {', '.join(kind.__members__)}", tree)
+        return kind[tree]
+    if kind is float and type(tree) is int:
+        return float(tree)
+    if type(tree) is not kind:  # a bool is an int otherwise
+        raise saved.unfit(kind.__name__, tree)
+    return tree
+
+
+def _decode_array(dtype: Any, shape: Shape | None, tree: Any, saved: Saved) -> Any:
+    (wanted,) = typing.get_args(dtype)
+    if not isinstance(tree, np.ndarray) or not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted):
+        raise saved.unfit(f"an array of {getattr(wanted, '__name__', wanted)}", tree)
+    if shape is not None and not shape.fits(tree.shape):
+        raise saved.unfit(f"an array of shape {shape.lengths}", tree)
+    return tree if tree.flags.writeable else tree.copy()
+
+
+_DICT = ("keys", "values")
+_BOOLS = np.ndarray[Any, np.dtype[np.bool_]]
+# Plain values of a list become one array of this type.
+_COLUMNS: dict[Any, type] = {float: np.float64, int: np.int64, bool: np.bool_}
+
+
+def _encode_list(kind: Any, values: list[Any]) -> Any:
+    """A column: one array where the values allow it, columns of columns for dataclasses, else a list of trees."""
+    bare, _ = _bare(kind)
+    if (inner := _optional(bare)) is not None:
+        known = np.array([value is not None for value in values], dtype=np.bool_)
+        return {"known": known, "values": _encode_list(inner, [value for value in values if value is not None])}
+    if bare in _COLUMNS:
+        return np.array(values, dtype=_COLUMNS[bare])
+    if typing.get_origin(bare) is np.ndarray and len({(one.shape, one.dtype) for one in values}) == 1:
+        return np.stack(values)
+    if _is_columnar(bare):
+        columns = {name: (hint, [getattr(one, name) for one in values]) for name, hint in hints_of(bare).items()}
+        return {"count": len(values)} | {name: _encode_list(*column) for name, column in columns.items()}
+    return [encode(kind, value) for value in values]
+
+
+def _decode_list(kind: Any, tree: Any, saved: Saved) -> Any:
+    bare, _ = _bare(kind)
+    if (inner := _optional(bare)) is not None:
+        part = Saved(_tree(tree, saved), saved.place)
+        known = decode(_BOOLS, part.value("known"), part.at("known"))
+        present = iter(_decode_list(inner, part.value("values"), part.at("values")))
+        return checked(saved, lambda: [next(present) if one else None for one in known])
+    if bare in _COLUMNS:
+        if not isinstance(tree, np.ndarray) or tree.ndim != 1 or tree.dtype != _COLUMNS[bare]:
+            raise saved.unfit(f"an array of {bare.__name__}", tree)
+        return tree.tolist()
+    if isinstance(tree, np.ndarray):
+        return [decode(kind, one, saved) for one in tree]
+    if _is_columnar(bare):
+        part = Saved(_tree(tree, saved), saved.place)
+        columns = [_decode_list(hint, part.value(name), part.at(name)) for name, hint in hints_of(bare).items()]
+        if any(len(column) != part.value("count") for column in columns):
+            raise saved.refuse(f"columns of {bare.__name__} differ in length")
+        return checked(saved, lambda: [bare(*row) for row in zip(*columns, strict=True)])
+    if not isinstance(tree, list):
+        raise saved.unfit("a list", tree)
+    return [decode(kind, one, saved) for one in tree]
+
+
+def _is_dataclass(kind: Any) -> bool:
+    return dataclasses.is_dataclass(kind)
+
+
+def _is_columnar(kind: Any) -> bool:
+    return isinstance(kind, type) and _is_dataclass(kind) and not hasattr(kind, "restore")
+
+
+def hints_of(kind: Any) -> dict[str, Any]:
+    """Names and types of the saved attributes of a class, in the order of their declaration."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    if _is_dataclass(kind):
+        return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+    return {name: hint for name, hint in hints.items() if typing.get_origin(hint) is not typing.ClassVar}
+
+
+def _bare(kind: Any) -> tuple[Any, Shape | None]:
+    """A type without its annotations, and the shape among them."""
+    notes = getattr(kind, "__metadata__", ())
+    return (typing.get_args(kind)[0] if notes else kind), next(
+        (note for note in notes if isinstance(note, Shape)), None
+    )
+
+
+def _optional(kind: Any) -> Any:
+    """T of `T | None`; None for another type."""
+    is_union = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    return next(one for one in typing.get_args(kind) if one is not types.NoneType) if is_union else None
+
+
+def _tree(tree: Any, saved: Saved) -> dict[str, Any]:
+    if not isinstance(tree, dict):
+        raise saved.unfit("a tree", tree)
+    return tree
+
+
+def checked(saved: Saved, make: Any) -> Any:
+    """The result of a function that may find the values contradictory."""
+    try:
+        return make()
+    except (ValueError, TypeError, IndexError, RuntimeError, StopIteration) as error:
+        raise saved.refuse(str(error) or type(error).__name__) from error
