@@ -184,7 +184,7 @@ def test_a_header_that_is_nested_without_end(tmp_path: Path, small_recording: Pa
     said = one_line_of(
         lidarslam("run", small_recording, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
     )
-    assert "its description is not JSON" in said
+    assert "its description is damaged" in said
 
 
 def test_weights_whose_answers_are_no_numbers_lose_the_way_but_end_well(
