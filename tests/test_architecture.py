@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -56,6 +57,7 @@ CONFINED = {
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
+MOST_LINES, MOST_ENTRIES = 250, 15
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "common", "base", "helpers", "helper", "misc", "tools"}
 
 
@@ -73,6 +75,7 @@ class Module:
     name: str
     tree: ast.Module
     is_package: bool = False
+    lines: int = 0
 
 
 Modules = Mapping[str, Module]
@@ -85,7 +88,8 @@ def parse_sources(root: Path) -> dict[str, Module]:
         parts = path.relative_to(root).with_suffix("").parts
         is_package = parts[-1] == "__init__"
         name = ".".join(parts[:-1] if is_package else parts)
-        modules[name] = Module(name, ast.parse(path.read_text(encoding="utf-8"), str(path)), is_package)
+        text = path.read_text(encoding="utf-8")
+        modules[name] = Module(name, ast.parse(text, str(path)), is_package, text.count("\n"))
     return modules
 
 
@@ -93,7 +97,7 @@ def parse_planted(**sources: str) -> dict[str, Module]:
     """Modules from texts, for planted breaches; a double underscore in a keyword stands for the dot."""
     names = {keyword.replace("__", "."): text for keyword, text in sources.items()}
     packages = {name for name in names if any(other.startswith(f"{name}.") for other in names)}
-    return {name: Module(name, ast.parse(text), name in packages) for name, text in names.items()}
+    return {name: Module(name, ast.parse(text), name in packages, text.count("\n")) for name, text in names.items()}
 
 
 def below(name: str, prefix: str) -> bool:
@@ -222,7 +226,46 @@ def name_breaches(modules: Modules) -> list[str]:
     return [name for name in modules if name.rpartition(".")[2] in NAMES_THAT_SAY_NOTHING]
 
 
-RULES = [layer_breaches, foreign_breaches, cycle_breaches, weight_breaches, root_breaches, name_breaches]
+def size_breaches(modules: Modules) -> list[str]:
+    """Files too long to be read at once, and folders with too many entries to be overlooked."""
+    long = [f"{module.name} has {module.lines} lines" for module in modules.values() if module.lines > MOST_LINES]
+    entries = Counter(name.rpartition(".")[0] for name in modules if "." in name)
+    packages = [module.name for module in modules.values() if module.is_package]
+    counts = {name: entries[name] + 1 for name in packages}  # with its __init__
+    return long + [f"{name} has {count} entries" for name, count in counts.items() if count > MOST_ENTRIES]
+
+
+def folder_breaches(modules: Modules) -> list[str]:
+    """Parts of one package, files or folders, that import one another in a circle."""
+    breaches = []
+    for package in (module.name for module in modules.values() if module.is_package):
+        inside = {
+            name: f"{package}.{_part(name, package)}" for name in modules if name != package and below(name, package)
+        }
+        graph: dict[str, set[str]] = {part: set() for part in inside.values()}
+        for name, part in inside.items():
+            graph[part] |= {inside[t] for t, _ in imports_of(modules[name], modules) if t in inside} - {part}
+        sorted_graph = {part: sorted(targets) for part, targets in graph.items()}
+        found = {c for part in graph if (c := _shortest_way_back(part, sorted_graph)) and min(c) == c[0]}
+        breaches += [" -> ".join([*circle, circle[0]]) for circle in found]
+    return sorted(breaches)
+
+
+def _part(name: str, package: str) -> str:
+    """The file or folder of a package that a module below it lies in."""
+    return name.removeprefix(f"{package}.").partition(".")[0]
+
+
+RULES = [
+    layer_breaches,
+    foreign_breaches,
+    cycle_breaches,
+    folder_breaches,
+    weight_breaches,
+    root_breaches,
+    name_breaches,
+    size_breaches,
+]
 
 
 @pytest.fixture(scope="module")
@@ -339,6 +382,24 @@ def test_light_modules_load_nothing_heavy(sources):
         (root_breaches, {"mapping": '"""Maps."""\nfrom mapping import a', "mapping__a": ""}, "mapping"),
         (root_breaches, {"mapping": "", "mapping__a": ""}, "mapping"),
         (name_breaches, {"odometry__utils": ""}, "odometry.utils"),
+        (
+            folder_breaches,
+            {
+                "mapping": "",
+                "mapping__loops": "",
+                "mapping__loops__a": "import mapping.graph.a",
+                "mapping__loops__b": "",
+                "mapping__graph__a": "",
+                "mapping__graph__b": "import mapping.loops.b",
+            },
+            "mapping.graph -> mapping.loops -> mapping.graph",
+        ),
+        (size_breaches, {"mapping__a": "\n" * 251}, "mapping.a has 251 lines"),
+        (
+            size_breaches,
+            {"mapping": "", **{f"mapping__{letter}": "" for letter in "abcdefghijklmno"}},
+            "mapping has 16 entries",
+        ),
     ],
 )
 def test_a_planted_breach_is_told(rule, planted, told):
