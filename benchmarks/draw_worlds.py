@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.reference_map import reference_map
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world

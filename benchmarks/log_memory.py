@@ -25,13 +25,13 @@ from lidarslam.config.settings import CheckpointConfig, Config, load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.loop_closing import begin_graph
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
-from lidarslam.resume.checkpoints import Checkpoints
-from lidarslam.resume.unfinished import Unfinished
-from lidarslam.run.directory import RunDirectory
+from lidarslam.run.checkpoints import Checkpoints
+from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.unfinished import Unfinished
 from mapping.global_map import global_map
 from odometry.methods.external import ExternalOdometry
 

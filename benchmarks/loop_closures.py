@@ -32,7 +32,7 @@ from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.simulation.motion.carriers import CARRIERS, MOUNTS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world

@@ -37,7 +37,7 @@ from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
 from mapping.config import MappingConfig

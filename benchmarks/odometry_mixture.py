@@ -22,8 +22,8 @@ from odometry_accuracy import EXPECTED_SHARES, SIGMAS, network_alone, rms, share
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.mixture import Excerpt, mixture
-from lidarslam.simulation.recording.recorder import Simulation
 from odometry.config import LearnedConfig, OdometryConfig
 from odometry.registry import make_odometry
 

@@ -27,9 +27,9 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.localisation import make_localiser
-from lidarslam.pipeline.loop_closing import FinishedGraph, begin_graph
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.run.loop_closing import FinishedGraph, begin_graph
 from odometry.registry import make_odometry
 
 _KISS = "KISS-ICP's own loop"

@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion.motions import CHANNELS, Motion, Sway
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.world import Boxes, Cylinders, HeightField, Mover, Route, World
 
 Cover = Literal["empty", "near", "stray"]

@@ -12,7 +12,7 @@ from statistics import median
 
 from lidarslam.simulation.motion.carriers import CARRIERS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world

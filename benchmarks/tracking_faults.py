@@ -47,7 +47,7 @@ from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import GlobalMapConfig

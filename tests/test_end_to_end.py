@@ -21,10 +21,10 @@ from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum, write_tum
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.scan_stream import in_order
-from lidarslam.run.directory import FILES
-from lidarslam.run.finished_run import load_run
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
+from lidarslam.storage.directory import FILES
+from lidarslam.storage.finished_run import load_run
 
 KISS_ICP = [
     "odometry.method=kiss-icp",

@@ -32,9 +32,9 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
     recording a run directory with its poses in the common frame. A recording without a loop closure to the others is
     left out of the common map, and the exit status is 1.
     """
-    from lidarslam.merge.merge import merge as execute
-    from lidarslam.merge.parts import MergeRequest
-    from lidarslam.merge.text import format_merge
+    from lidarslam.run.merge.merge import merge as execute
+    from lidarslam.run.merge.parts import MergeRequest
+    from lidarslam.run.merge.text import format_merge
     from lidarslam.run.progress import show_progress
 
     config = take_config(options, *sources)

@@ -48,9 +48,9 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 @click.pass_context
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
-    from lidarslam.resume.resuming import lost_when_finished
     from lidarslam.run.progress import show_progress
     from lidarslam.run.request import RunRequest
+    from lidarslam.run.resuming import lost_when_finished
     from lidarslam.run.run import execute
     from lidarslam.run.summary_text import format_outcome
 

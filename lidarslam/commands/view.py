@@ -31,7 +31,7 @@ def view(
 ) -> None:
     """Show finished runs in Rerun: trajectories, maps, and where tracking was lost."""
     from lidarslam.config.settings import load_config
-    from lidarslam.run.finished_run import load_run
+    from lidarslam.storage.finished_run import load_run
 
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
@@ -55,7 +55,7 @@ def view(
 
 
 def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
-    from lidarslam.run.finished_run import load_map
+    from lidarslam.storage.finished_run import load_map
     from lidarslam.viewer.picture import draw, height_colours, save_picture
 
     if len(runs) != 1:

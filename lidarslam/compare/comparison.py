@@ -13,9 +13,9 @@ from lidarslam.compare.request import CompareRequest
 from lidarslam.compare.text import format_result
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
-from lidarslam.run.directory import RunDirectory
 from lidarslam.run.machine import machine, versions
 from lidarslam.run.request import RunRequest
+from lidarslam.storage.directory import RunDirectory
 
 _INTERRUPTED = "the comparison was interrupted before its turn"
 

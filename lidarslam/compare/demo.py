@@ -15,10 +15,10 @@ from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.run.finished_run import load_map, load_run
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.storage.finished_run import load_map, load_run
 from lidarslam.viewer.picture import draw, height_colours, save_picture
 
 RECORDING, REPLAY = "recording", "demo.rrd"

@@ -8,7 +8,7 @@ from typing import Any, cast
 from evaluation.comparison.comparison import MethodStatus
 from lidarslam.compare.method_process import LOST
 from lidarslam.compare.supervised import Ending, Limits
-from lidarslam.run.directory import SUMMARY
+from lidarslam.storage.directory import SUMMARY
 
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")

@@ -10,8 +10,8 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.run import directory as files
 from lidarslam.run.request import RunRequest
+from lidarslam.storage import directory as files
 
 # In the comparison's folder; each recording's folder holds its own comparison.json.
 COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"

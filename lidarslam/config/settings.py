@@ -16,12 +16,12 @@ from pydantic_core import ErrorDetails
 from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.run.directory import RUN_SECTION
-from lidarslam.train.directory import SOURCES_SECTION
+from lidarslam.storage.directory import RUN_SECTION
 from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
-# Sections of config.yaml that are not settings.
+# Sections of config.yaml that are not settings: what was run, and what was trained on.
+SOURCES_SECTION = "trained_on"
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
 
 _MOST_FAULTS = 5

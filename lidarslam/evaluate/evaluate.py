@@ -14,8 +14,8 @@ from lidarslam.evaluate.error_cloud import check_error_files, write_errors
 from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
 from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map
 from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
-from lidarslam.run import directory as files
-from lidarslam.run.directory import RunDirectory
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
 from lidarslam.evaluate.reference_cloud import read_cloud
-from lidarslam.resume.unfinished import require_whole
-from lidarslam.run import directory as files
-from lidarslam.run.finished_run import read_trajectory
+from lidarslam.storage import directory as files
+from lidarslam.storage.finished_run import read_trajectory
+from lidarslam.storage.unfinished import require_whole
 
 # KITTI's LiDAR turns ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1

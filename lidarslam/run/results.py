@@ -7,12 +7,12 @@ from evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory_io import format_kitti, format_tum
-from lidarslam.pipeline.loop_closing import GraphOutcome
-from lidarslam.run import directory as files
-from lidarslam.run.directory import RunDirectory
+from lidarslam.run.loop_closing import GraphOutcome
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
 from mapping.config import GlobalMapConfig
 from mapping.global_map.global_map import GlobalMap, PointCloud
 from mapping.global_map.map_io import write_cloud

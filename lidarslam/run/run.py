@@ -9,14 +9,14 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.registry import open_recording
-from lidarslam.pipeline.loop_closing import begin_graph, close_loops, restore_graph
-from lidarslam.resume.resuming import describe_computed
-from lidarslam.resume.unfinished import Unfinished
-from lidarslam.run.directory import RERUN, RunDirectory
+from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, final_map, write_results
+from lidarslam.run.resuming import describe_computed
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Progress, track
+from lidarslam.storage.directory import RERUN, RunDirectory
+from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
 from odometry.interface import Odometry
 from odometry.registry import make_odometry

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.core.plain_text import count
-from lidarslam.run.directory import SCANS_CSV, SUMMARY
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
+from lidarslam.storage.directory import SCANS_CSV, SUMMARY
 
 # Stretches of lost scans that are listed; summary.json has them all.
 _LISTED = 3

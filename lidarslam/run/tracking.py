@@ -19,10 +19,10 @@ from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
-from lidarslam.resume.checkpoints import Checkpoints
-from lidarslam.resume.unfinished import Unfinished
+from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.global_map import GlobalMap
 from mapping.global_map.moved_points import Views

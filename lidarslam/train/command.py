@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lidarslam.config.settings import reader_settings
+from lidarslam.config.settings import SOURCES_SECTION, reader_settings
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
-from lidarslam.train.directory import CONFIG, SOURCES_SECTION, is_training
+from lidarslam.train.directory import CONFIG, is_training
 from lidarslam.train.settings import LOSSES, load_train_config
 from lidarslam.train.train import TrainRequest, execute
 from odometry.network.shipped import default_weights

@@ -4,10 +4,8 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
+from lidarslam.config.settings import SOURCES_SECTION
 from lidarslam.core.errors import OutputError
-
-# The section of config.yaml that names the recordings; its first.
-SOURCES_SECTION = "trained_on"
 
 CONFIG = "config.yaml"
 WEIGHTS = "weights.safetensors"

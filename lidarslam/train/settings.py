@@ -6,9 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from lidarslam.config.settings import dump_yaml, load_model
+from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, load_model
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.train.directory import SOURCES_SECTION
 from odometry.training.config import SimulatedConfig, TrainingConfig
 
 # What `--losses` stands for, as settings.

@@ -14,8 +14,8 @@ from torch import nn
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer
-from lidarslam.run.directory import RunDirectory
 from lidarslam.run.progress import show_count
+from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import directory as files
 from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepared, recorded, simulated
 from lidarslam.train.devices import DeviceName, Devices

@@ -19,7 +19,7 @@ from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
-from lidarslam.run.finished_run import FinishedRun
+from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.rerun_program import GRPC_PORT, LOCAL, WEB_PORT, is_taken, open_window, page_served
 from lidarslam.viewer.rerun_recording import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Saved, Shape, Stateful
-from lidarslam.resume.state_file import read_state, write_state
+from lidarslam.storage.state_file import read_state, write_state
 
 
 class Colour(Enum):

@@ -17,13 +17,13 @@ from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.resume import checkpoints
-from lidarslam.resume.checkpoints import Checkpoints
-from lidarslam.resume.resuming import scans_left
-from lidarslam.resume.state_file import read_state
-from lidarslam.resume.unfinished import About, Unfinished, require_whole
-from lidarslam.run.directory import RunDirectory
+from lidarslam.run import checkpoints
+from lidarslam.run.checkpoints import Checkpoints
+from lidarslam.run.resuming import scans_left
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.state_file import read_state
+from lidarslam.storage.unfinished import About, Unfinished, require_whole
 from mapping.config import GlobalMapConfig
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.constant_velocity import ConstantVelocity

@@ -20,19 +20,19 @@ from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
-from lidarslam.merge.merge import MergeOutcome, merge
-from lidarslam.merge.parts import MergeRequest
-from lidarslam.merge.text import format_merge
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.run.directory import FILES
-from lidarslam.run.finished_run import load_map, load_run
+from lidarslam.run.merge.merge import MergeOutcome, merge
+from lidarslam.run.merge.parts import MergeRequest
+from lidarslam.run.merge.text import format_merge
 from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
+from lidarslam.storage.directory import FILES
+from lidarslam.storage.finished_run import load_map, load_run
 
 SETTINGS = ["global_map.voxel_size_m=0.1"]
 
@@ -262,7 +262,7 @@ def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path
 
 KILLED_MERGE = """
 import os, signal, sys
-import lidarslam.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph, odometry.methods.kiss
+import lidarslam.run.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph, odometry.methods.kiss
 from lidarslam.cli import main
 
 count = 0

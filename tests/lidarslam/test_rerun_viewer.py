@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.run.finished_run import FinishedRun
+from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.rerun_program import is_taken
 from lidarslam.viewer.rerun_recording import IncompleteRecordingError

@@ -23,7 +23,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
-from lidarslam.run.finished_run import load_run
+from lidarslam.storage.finished_run import load_run
 
 ROOT = Path(__file__).parents[2]
 KILL = signal.SIGKILL

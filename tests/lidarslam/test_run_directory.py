@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lidarslam.core.errors import OutputError
-from lidarslam.run.directory import ABOUT, CONFIG, MAP_PLY, METRICS, SUMMARY, RunDirectory
+from lidarslam.storage.directory import ABOUT, CONFIG, MAP_PLY, METRICS, SUMMARY, RunDirectory
 
 
 def names(path: Path) -> list[str]:

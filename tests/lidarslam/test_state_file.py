@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.state import State
-from lidarslam.resume.state_file import read_state, write_state
+from lidarslam.storage.state_file import read_state, write_state
 
 STATE: State = {
     "poses": np.linspace(0.0, 1.0, 32).reshape(2, 4, 4),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.pipeline.loop_closing import LoopReport
+from lidarslam.run.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.run.summary_text import format_outcome

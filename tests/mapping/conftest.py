@@ -11,7 +11,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion, Sway
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.sensor import RangeModel
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import Boxes, Route, World

@@ -29,7 +29,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.scan_patterns import Spinning
 from lidarslam.simulation.sensors.sensor import Sensor
 from lidarslam.simulation.sensors.table import find_sensor

@@ -8,7 +8,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig

@@ -7,7 +7,7 @@ import pytest
 
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.reference_map import reference_map
 from lidarslam.simulation.sensors.noise import ranges_in_grass
 from lidarslam.simulation.sensors.sensor import RangeModel

@@ -10,8 +10,8 @@ import pytest
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, Excerpt, ingredients_of, mixture
-from lidarslam.simulation.recording.recorder import Simulation
 from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
 

@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.geometry import inverse, transform_points
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.noise import bloom, measure, range_sigma, reflectivity, return_probability
 from lidarslam.simulation.sensors.sensor import RangeModel
 from lidarslam.simulation.sensors.table import find_sensor

@@ -11,7 +11,7 @@ from lidarslam.simulation.casting.mesh import Mesh, box_mesh
 from lidarslam.simulation.casting.mesh_pieces import pieces_near
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.reference_map import SeenSurfaces, reference_map, sample_seen
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import Boxes

@@ -11,9 +11,9 @@ from lidarslam.simulation.casting.mesh import box_mesh, cylinder_mesh, merge
 from lidarslam.simulation.motion.carriers import find_carrier
 from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.motion.motions import rotations
-from lidarslam.simulation.motion.path_clearance import check_clearance, is_inside
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.motion import given_path, read_trajectory
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recording.path_clearance import check_clearance, is_inside
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.street.along import FREE_SIDE_M, build_along
 

@@ -13,7 +13,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.recording.recorder import SimulatedScan
+from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.driver_clouds import DRIVERS, find_driver
 from lidarslam.simulation.writers.interface import CLOCK_START_NS, Rig, clock_ns
 from lidarslam.simulation.writers.kitti import T_CAM_LIDAR, compensate

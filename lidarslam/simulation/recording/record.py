@@ -9,10 +9,10 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.simulation.casting.mesh import world_mesh
 from lidarslam.simulation.motion.carriers import find_carrier, mount_pose
-from lidarslam.simulation.motion.path_clearance import check_clearance
+from lidarslam.simulation.recorder import SimulatedScan, Simulation
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, README, REFERENCE_MAP, new_folder
 from lidarslam.simulation.recording.motion import given_path, plan_motion
-from lidarslam.simulation.recording.recorder import SimulatedScan, Simulation
+from lidarslam.simulation.recording.path_clearance import check_clearance
 from lidarslam.simulation.recording.reference_map import ReferenceMap, SeenSurfaces, sample_seen
 from lidarslam.simulation.recording.request import RecordingSummary, RecordRequest
 from lidarslam.simulation.recording.text import format_readme

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.casting.mesh import Mesh, world_mesh
 from lidarslam.simulation.casting.mesh_pieces import Pieces, pieces_near
-from lidarslam.simulation.recording.recorder import Echoes, Simulation
+from lidarslam.simulation.recorder import Echoes, Simulation
 
 KeyArray = NDArray[np.int64]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lidarslam.simulation.choices import choose
-from lidarslam.simulation.recording.recorder import SimulatedScan
+from lidarslam.simulation.recorder import SimulatedScan
 
 Records = NDArray[np.void]
 _FIRST_RETURN = 0x10

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.simulation.recording.recorder import SimulatedScan
+from lidarslam.simulation.recorder import SimulatedScan
 
 # Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives
 # the same bytes; far from zero, so that readers can tell offsets from a stamp from readings of the clock.

@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory_io import format_kitti
 from lidarslam.datasets.kitti.correction import ELEVATION_DEG, correct_elevation
-from lidarslam.simulation.recording.recorder import SimulatedScan
+from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig
 
 SEQUENCE = "00"

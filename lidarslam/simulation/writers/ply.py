@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidarslam.simulation.recording.recorder import SimulatedScan
+from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig, clock_s
 
 _PROPERTY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<u2": "ushort", "<u4": "uint"}

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
-from lidarslam.simulation.recording.recorder import SimulatedScan
+from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.driver_clouds import DriverCloud, Records, find_driver
 from lidarslam.simulation.writers.interface import Rig, clock_ns
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
 from lidarslam.core.state import Saved
-from lidarslam.resume.state_file import read_state
-from lidarslam.run.directory import ABOUT, FILES, UNFINISHED, RunDirectory
+from lidarslam.storage.directory import ABOUT, FILES, UNFINISHED, RunDirectory
+from lidarslam.storage.state_file import read_state
 
 _STATE, _SUBMAPS = "state.npz", "submaps.bin"
 # Differences to another run that an error lists.

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.motion.carriers import Carrier
-from lidarslam.simulation.recording.recorder import Simulation
+from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.world import World
 
 _TIME_STEP_S = 0.02

@@ -13,11 +13,11 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import remove_partial_files
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.resume.unfinished import About, remove_unfinished
-from lidarslam.run import directory as files
-from lidarslam.run.directory import remove_run
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import require_apart
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import remove_run
+from lidarslam.storage.unfinished import About, remove_unfinished
 
 # The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.
 _PART = re.compile(r"\d{2,}_[\w.-]+")

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from lidarslam.merge.merge import MergeOutcome
-from lidarslam.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.merge.merge import MergeOutcome
+from lidarslam.run.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary_text import format_map
 

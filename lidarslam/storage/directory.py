@@ -42,7 +42,7 @@ FILES = (
     RERUN,
 )
 
-# The checkpoint of a run that is at work or was stopped, see `lidarslam.resume.unfinished`.
+# The checkpoint of a run that is at work or was stopped, see `lidarslam.storage.unfinished`.
 UNFINISHED = "unfinished"
 ABOUT = f"{UNFINISHED}/run.json"
 

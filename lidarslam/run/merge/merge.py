@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import Recording
-from lidarslam.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
-from lidarslam.merge.summary import MergedRecording, MergeSummary
-from lidarslam.pipeline.loop_closing import FinishedGraph, begin_graph
-from lidarslam.resume.unfinished import Unfinished
-from lidarslam.run import directory as files
-from lidarslam.run.directory import RunDirectory
+from lidarslam.run.loop_closing import FinishedGraph, begin_graph
+from lidarslam.run.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
+from lidarslam.run.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary import GraphSummary, WrittenMap, peak_rss_mb
 from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
 from mapping.global_map.moved_points import PlacedViews
 from mapping.pose_graph.g2o import format_g2o

@@ -15,9 +15,9 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.datasets.recording import Recording
-from lidarslam.resume.unfinished import About
-from lidarslam.run import directory as files
 from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.storage import directory as files
+from lidarslam.storage.unfinished import About
 from odometry.interface import Odometry
 
 logger = logging.getLogger(__name__)

@@ -9,11 +9,11 @@ from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.resume.resuming import scans_left
-from lidarslam.resume.state_file import write_state
-from lidarslam.resume.unfinished import Unfinished
-from lidarslam.run.directory import RERUN
+from lidarslam.run.resuming import scans_left
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.storage.directory import RERUN
+from lidarslam.storage.state_file import write_state
+from lidarslam.storage.unfinished import Unfinished
 from odometry.interface import Odometry
 
 if TYPE_CHECKING:

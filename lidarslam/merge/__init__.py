@@ -1,1 +1,0 @@
-"""Merging several recordings of one place."""

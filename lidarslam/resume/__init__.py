@@ -1,1 +1,0 @@
-"""Checkpoints: saving the state of a run, and going on from it."""

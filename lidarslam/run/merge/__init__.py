@@ -1,0 +1,1 @@
+"""Multi-session mapping: several recordings merged into one map."""
