@@ -123,7 +123,7 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
         (
             ["run", "{recording}", "--out", "{out}", "--weights", "{recording}/timestamps.txt"],
             1,
-            "timestamps.txt: is not weights that lidarslam wrote",
+            "timestamps.txt: is no safetensors file; expected weights",
         ),
         (["run", "{recording}", "--out", "{out}", "--start", "9"], 1, "none of its 5 scans is left"),
         (["run", "{recording}", "--out", "{out}", "--set", "odometry.kiss=1"], 1, "did you mean kiss_icp?"),
