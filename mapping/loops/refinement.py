@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, inverse, log, orthonormalize, transform_points
 from lidarslam.core.thinning import central_per_cell
+from mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
 from mapping.loops.closure import CHI_SQUARED_99, LoopClosure
-from mapping.loops.gauss_newton import NormalEquations, gauss_newton, geman_mcclure
 from mapping.loops.registration import CORRELATION
 from mapping.loops.sparse_submap import principal_components
 
@@ -106,9 +106,9 @@ def _linearise(
     ])  # fmt: skip
     if len(residuals) < _LEAST_RESIDUALS:
         return None
-    forward = np.concatenate([np.cross(points, normals), normals], axis=1)
-    backward = -np.concatenate([np.cross(there, own_normals), own_normals], axis=1)
-    weights = geman_mcclure(residuals, scale_m)
+    forward = point_to_plane_jacobian(points, normals)
+    backward = -point_to_plane_jacobian(there, own_normals)
+    weights = geman_mcclure(residuals, scale_m**2)
     variance = float(weights @ residuals**2 / weights.sum())
     return NormalEquations.of(
         np.concatenate([forward, backward]), residuals, weights / (_CORRELATION * max(variance, 1e-8))

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
-from mapping.loops.gauss_newton import NormalEquations, gauss_newton, geman_mcclure
+from mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
 from mapping.loops.sparse_submap import LINE, SparseSubmap
 
 # Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.
@@ -113,7 +113,7 @@ class Correspondences:
     @property
     def jacobian(self) -> FloatArray:
         """(M, 6) for a motion of the source from the right, rotation first."""
-        return np.concatenate([np.cross(self.points, self.normals), self.normals], axis=1)
+        return point_to_plane_jacobian(self.points, self.normals)
 
 
 def register(target: SubmapCloud, source: SubmapCloud, guess: FloatArray) -> FloatArray | None:
@@ -142,7 +142,7 @@ def _linearise(
     found = correspondences(target, source, T_target_source, chosen, reach_m)
     if len(found.points) < MIN_POINTS:
         return None
-    information = found.weights * geman_mcclure(found.residuals, scale_m)
+    information = found.weights * geman_mcclure(found.residuals, scale_m**2)
     information /= CORRELATION * (found.noise_m**2 + (0.5 * scale_m) ** 2)
     return NormalEquations.of(found.jacobian, found.residuals, information)
 

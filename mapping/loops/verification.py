@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from mapping.degeneracy import find_degeneracy
-from mapping.loops.gauss_newton import NormalEquations
+from mapping.gauss_newton import NormalEquations
 from mapping.loops.registration import (
     CORRELATION,
     GUESS_SIGMAS,
