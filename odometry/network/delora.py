@@ -52,7 +52,7 @@ class DeloraNetwork(nn.Module):
         shared = self.trunk(self.pool(features).flatten(1))  # (B, 512, 1, 1) -> (B, 1000)
         quaternions = self.rotation(shared)  # (B, 4), w first, of any length
         T_prev_curr = make_transform(rotation_from_quaternion(quaternions), self.translation(shared))
-        size = len(T_prev_curr)
+        size = T_prev_curr.shape[0]  # len() would fix the size of exported batches
         log_sigma = T_prev_curr.new_full((size, 6), _UNKNOWN_SIGMA).log()
         return Estimate(T_prev_curr, log_sigma, log_sigma.new_zeros(size, 0), log_sigma.new_zeros(size, 0, 0))
 
