@@ -32,9 +32,9 @@ class BirdEyeView:
     R_level_lidar: FloatArray
 
     @classmethod
-    def of(cls, submap: SparseSubmap) -> "BirdEyeView":
-        """View a submap."""
-        R = submap.R_level_lidar
+    def of(cls, submap: SparseSubmap, upside_down: bool = False) -> "BirdEyeView":
+        """View a submap; upside down where its sensor is mounted the other way up than that of the others."""
+        R = np.diag([1.0, -1.0, -1.0]) @ submap.R_level_lidar if upside_down else submap.R_level_lidar
         level = submap.points.astype(np.float64) @ R.T
         upright = np.abs(submap.axes.astype(np.float64) @ R[2])
         structure = np.where(submap.kinds == PLANE, upright < _UPRIGHT, True)

@@ -157,21 +157,29 @@ class KeyframeDatabase(Stateful):
             yield Candidate(int(others[k]), False, guess)
 
     def _alike(self, index: int, others: NDArray[np.intp]) -> list[Candidate]:
-        """Earlier keyframes with similar descriptors."""
-        source = BirdEyeView.of(self.submaps[index])
-        similarity, turn = self._compare(source, others)
-        found: list[tuple[float, Candidate]] = []
-        for k in _spread(others, -similarity, 2 * _APPEARANCE_CANDIDATES):
-            if similarity[k] < _MIN_SIMILARITY:
-                break
-            target = BirdEyeView.of(self.submaps[others[k]])
-            guess, score = align(target, source, turn[k] + np.array([0.0, np.pi]), self.radius_m)
-            found.append((score, Candidate(int(others[k]), True, guess)))
+        """Earlier keyframes with similar descriptors; sensors of other segments may be mounted upside down."""
+        elsewhere = others[self.track.segment[others] != self.track.segment[index]]
+        found = [*self._similar(index, others), *self._similar(index, elsewhere, upside_down=True)]
         found.sort(key=lambda pair: -pair[0])
         plausible = [(score, candidate) for score, candidate in found if self._explained_by_drift(candidate, index)]
         if self._is_ambiguous(plausible, index):
             return []
         return [candidate for _, candidate in plausible[:_APPEARANCE_CANDIDATES]]
+
+    def _similar(
+        self, index: int, others: NDArray[np.intp], upside_down: bool = False
+    ) -> Iterator[tuple[float, Candidate]]:
+        """The most similar keyframes, aligned by their views, with the scores of these alignments."""
+        if not len(others):
+            return
+        source = BirdEyeView.of(self.submaps[index], upside_down)
+        similarity, turn = self._compare(source, others)
+        for k in _spread(others, -similarity, 2 * _APPEARANCE_CANDIDATES):
+            if similarity[k] < _MIN_SIMILARITY:
+                break
+            target = BirdEyeView.of(self.submaps[others[k]])
+            guess, score = align(target, source, turn[k] + np.array([0.0, np.pi]), self.radius_m)
+            yield score, Candidate(int(others[k]), True, guess)
 
     def _is_ambiguous(self, found: list[tuple[float, Candidate]], index: int) -> bool:
         """Whether a second place in the segment of the best candidate has nearly its score."""

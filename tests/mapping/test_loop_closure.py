@@ -153,7 +153,8 @@ def test_closures_keep_their_distance(twice, monkeypatch):
     "mount",
     [
         pytest.param(np.eye(4), id="upright", marks=pytest.mark.slow),
-        pytest.param(exp([0.1, 0.35, 0, 0, 0, 0]), id="tilted"),
+        pytest.param(UPSIDE_DOWN, id="upside down"),
+        pytest.param(exp([0.1, 0.35, 0, 0, 0, 0]), id="tilted", marks=pytest.mark.slow),
     ],
 )
 def test_segments_are_joined_whatever_their_worlds_and_mounts(hall, mount):
