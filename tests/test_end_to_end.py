@@ -193,7 +193,7 @@ def test_a_covered_sensor_is_reported_as_lost(recording: Path, tmp_path: Path) -
     assert seen[11] in (Status.OK, Status.DEGRADED)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["lost_scans"] == 2
-    assert any("18000 invalid points" in warning for warning in summary["warnings"])
+    assert any("18,000 invalid points" in warning for warning in summary["warnings"])
 
 
 def test_scans_that_go_back_in_time_are_left_out() -> None:

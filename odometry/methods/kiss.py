@@ -5,8 +5,8 @@ which belongs to the end of the sweep, is expressed at the scan's stamp.
 """
 
 import contextlib
+import json
 import logging
-import pickle
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from odometry.config import KissConfig
 from odometry.interface import Motion
-from odometry.methods.kiss_worker import send
+from odometry.methods.kiss_worker import receive, send
 
 _log = logging.getLogger(__name__)
 
@@ -49,14 +49,15 @@ class _Worker:
         )
         self._requests, self._replies = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
         try:
-            self.exchange(settings)
+            send(self._requests, np.array(json.dumps(settings)))
+            receive(self._replies)
         except (EOFError, OSError) as error:
             raise OdometryError(f"KISS-ICP did not start (status {self.close()}); is kiss-icp installed?") from error
 
-    def exchange(self, message: object) -> Any:
-        """Send a message and wait for the reply; EOFError or OSError if the child died."""
-        send(cast(Any, self._requests), message)
-        return pickle.load(self._replies)
+    def register(self, points: FloatArray, stamps: FloatArray) -> tuple[FloatArray, int]:
+        """The pose (4, 4) of a scan and the number of points registered; EOFError or OSError if the child died."""
+        send(self._requests, points, stamps)
+        return receive(self._replies), int(receive(self._replies))
 
     def close(self) -> int:
         """End the child; its exit status, negative for the signal that ended it."""
@@ -97,7 +98,7 @@ class KissOdometry:
         try:
             if self._worker is None:
                 self._worker = _Worker(_library_settings(self._config))
-            T_map_lidar, points_used = self._worker.exchange((scan.points, offsets))
+            T_map_lidar, points_used = self._worker.register(scan.points, offsets)
         except (EOFError, OSError):
             return self._predict(scan.stamp, self._bury_worker())
         last, self._last = self._last, _TimedPose(self._pose_time(scan.stamp, offsets), T_map_lidar)

@@ -1,15 +1,22 @@
 """KISS-ICP in a process of its own; the only file that imports kiss_icp.
 
 The library aborts the process on some inputs (an assertion in its C++ part, not an exception). Run as a module, this
-file is the child process. Messages are pickles: settings; then points (N, 3) and time stamps (M,), answered by the pose
-(4, 4) and the number of points registered, until the input ends.
+file is the child process. Messages are arrays: the settings as JSON, answered by an empty array; then points (N, 3) and
+time stamps (M,), answered by the pose (4, 4) and the number of points registered, until the input ends.
 """
 
+import json
 import os
-import pickle
 import signal
+import struct
 import sys
-from typing import Any, BinaryIO
+from io import BytesIO
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LENGTH = struct.Struct("<q")
 
 
 def build(settings: dict[str, Any]) -> Any:
@@ -20,10 +27,28 @@ def build(settings: dict[str, Any]) -> Any:
     return KissICP(KISSConfig.model_validate(settings))
 
 
-def send(stream: BinaryIO, message: object) -> None:
-    """Write one message."""
-    pickle.dump(message, stream, protocol=pickle.HIGHEST_PROTOCOL)
+def send(stream: IO[bytes], *arrays: NDArray[Any]) -> None:
+    """Write arrays in NumPy's format, each after its length."""
+    for array in arrays:
+        content = BytesIO()
+        np.save(content, array, allow_pickle=False)
+        stream.write(_LENGTH.pack(content.tell()))
+        stream.write(content.getbuffer())
     stream.flush()
+
+
+def receive(stream: IO[bytes]) -> NDArray[Any]:
+    """Read one array.
+
+    Raises:
+        EOFError: the stream ended.
+    """
+    header = stream.read(_LENGTH.size)
+    (length,) = _LENGTH.unpack(header) if len(header) == _LENGTH.size else (1,)
+    content = stream.read(length)
+    if len(content) < length:
+        raise EOFError
+    return np.asarray(np.load(BytesIO(content), allow_pickle=False))
 
 
 def main() -> None:
@@ -31,15 +56,15 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever is interrupted is the parent, and ends this one
     requests, replies = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    odometry = build(pickle.load(requests))
-    send(replies, "ready")
+    odometry = build(json.loads(str(receive(requests))))
+    send(replies, np.empty(0))
     while True:
         try:
-            points, stamps = pickle.load(requests)
+            points, stamps = receive(requests), receive(requests)
         except EOFError:
             return
         _, source = odometry.register_frame(points, stamps)
-        send(replies, (odometry.last_pose, len(source)))
+        send(replies, np.asarray(odometry.last_pose), np.array(len(source)))
 
 
 if __name__ == "__main__":

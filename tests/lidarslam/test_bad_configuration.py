@@ -221,8 +221,8 @@ BAD_TRAJECTORIES = {
     "no rotation": "holds numbers that are no poses",
     "seven columns": "expected 8 numbers, got 7",
     "light years": "expected metres",
-    "one pose": "two poses or more|too short to be compared",
-    "one stamp": "two poses or more|too short to be compared",
+    "one pose": "two poses or more|one of them is too short",
+    "one stamp": "two poses or more|one of them is too short",
 }
 
 

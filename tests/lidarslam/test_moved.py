@@ -133,7 +133,7 @@ def test_views_have_the_numbers_of_their_scans(scans: list[FloatArray]) -> None:
     pipeline = Pipeline(ExternalOdometry(truth()), localiser, GlobalMapConfig(voxel_size_m=0.1))
     results = list(pipeline.run(given))
     poses = np.array([result.T_world_lidar for result in results])
-    numbers = pipeline.map.views.state()["numbers"]
+    numbers = pipeline.map.views.state()["_numbers"]
     assert numbers[:2].tolist() == [0, 2]
     assert not set(numbers) & set(range(20, 25))
     placed = pipeline.map.views.placed(poses)

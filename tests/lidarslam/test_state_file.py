@@ -97,7 +97,7 @@ def test_a_failed_write_leaves_the_earlier_state(tmp_path: Path, monkeypatch: py
     with pytest.raises(OutputError, match="No space left"):
         write_state(path, {"number": 2})
     monkeypatch.undo()
-    assert read_state(path).integer("number") == 1
+    assert read_state(path).value("number") == 1
     assert [entry.name for entry in tmp_path.iterdir()] == ["state.npz"]
 
 
