@@ -20,14 +20,10 @@ _CUBIC = tuple((-1) ** k / math.factorial(2 * k + 3) for k in range(8))
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Points of a scan as measured, each in the LiDAR frame of its own instant.
+    """Points of a scan as measured, each in the LiDAR frame of its own instant."""
 
-    Attributes:
-        points: (N, 3).
-        times: (N,) seconds from the stamp; None when the points are motion compensated already.
-    """
-
-    points: Annotated[FloatArray, Shape(None, 3)]
+    points: Annotated[FloatArray, Shape(None, 3)]  # (N, 3)
+    # (N,) seconds from the stamp; None when the points are motion compensated already
     times: Annotated[FloatArray, Shape(None)] | None = None
 
     def __post_init__(self) -> None:

@@ -31,17 +31,12 @@ _PROVEN_AFTER = 10
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Odometry's measurements of a scan; None where it has none.
+    """Odometry's measurements of a scan; None where it has none."""
 
-    Attributes:
-        T_prev_curr: (4, 4) motion since the previous scan.
-        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        covariance: (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None for the
-            configured standard deviations.
-    """
-
-    T_prev_curr: FloatArray | None = None
-    velocity: FloatArray | None = None
+    T_prev_curr: FloatArray | None = None  # (4, 4) motion since the previous scan
+    velocity: FloatArray | None = None  # (6,) during the sweep, in the LiDAR frame, rotation first
+    # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None for the configured standard
+    # deviations
     covariance: FloatArray | None = None
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
@@ -54,35 +49,22 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class MotionState:
-    """Pose and velocity of a scan with 12 degrees of freedom.
+    """Pose and velocity of a scan with 12 degrees of freedom."""
 
-    Attributes:
-        stamp: seconds.
-        T_world_lidar: (4, 4) at the stamp.
-        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        covariance: (12, 12) of the errors of pose and velocity; the pose's is `xi` in
-            `T_true = T_world_lidar @ exp(xi)`.
-        seen_until_s: time from the stamp to the sweep's last point, over which the velocity was observed.
-    """
-
-    stamp: float
-    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]
-    velocity: Annotated[FloatArray, Shape(6)]
+    stamp: float  # seconds
+    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]  # (4, 4) at the stamp
+    velocity: Annotated[FloatArray, Shape(6)]  # (6,) during the sweep, in the LiDAR frame, rotation first
+    # (12, 12) of the errors of pose and velocity; the pose's is `xi` in `T_true = T_world_lidar @ exp(xi)`
     covariance: Annotated[FloatArray, Shape(12, 12)]
-    seen_until_s: float = 0.0
+    seen_until_s: float = 0.0  # time from the stamp to the sweep's last point, over which the velocity was observed
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """White noise of the sensor's acceleration: standard deviations, adapted to the observed motion.
+    """White noise of the sensor's acceleration: standard deviations, adapted to the observed motion."""
 
-    Attributes:
-        rotation: about each axis, rad/s^2.
-        translation: along each axis, m/s^2.
-    """
-
-    rotation: float = float(np.deg2rad(1000.0))
-    translation: float = 15.0
+    rotation: float = float(np.deg2rad(1000.0))  # about each axis, rad/s^2
+    translation: float = 15.0  # along each axis, m/s^2
 
     @property
     def acceleration(self) -> FloatArray:
@@ -106,15 +88,10 @@ LARGEST_PROCESS_NOISE = ProcessNoise(*_LARGEST_ACCELERATION)
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Scale of an odometry's errors against its stated covariance.
+    """Scale of an odometry's errors against its stated covariance."""
 
-    Attributes:
-        variance: factor on the covariance, at least one.
-        agreed: consistent motions in a row.
-    """
-
-    variance: float = 1.0
-    agreed: int = 0
+    variance: float = 1.0  # factor on the covariance, at least one
+    agreed: int = 0  # consistent motions in a row
 
     def updated(self, prior: Prior, T_prev_curr: FloatArray, config: MappingConfig) -> "OdometryNoise":
         """The noise after a registered motion (4, 4), by the odometry's normalised squared error."""
@@ -140,21 +117,13 @@ def _squared_error(prior: Prior, T_prev_curr: FloatArray, config: MappingConfig)
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predicted state of a scan before its registration.
+    """Predicted state of a scan before its registration."""
 
-    Attributes:
-        stamp: seconds.
-        T_world_lidar: (4, 4) at the stamp.
-        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        covariance: (12, 12) of the errors of pose and velocity, as in `MotionState`.
-        contradicted: whether the odometry's motion fails the innovation test against the last velocity.
-    """
-
-    stamp: float
-    T_world_lidar: FloatArray
-    velocity: FloatArray
-    covariance: FloatArray
-    contradicted: bool = False
+    stamp: float  # seconds
+    T_world_lidar: FloatArray  # (4, 4) at the stamp
+    velocity: FloatArray  # (6,) during the sweep, in the LiDAR frame, rotation first
+    covariance: FloatArray  # (12, 12) of the errors of pose and velocity, as in `MotionState`
+    contradicted: bool = False  # whether the odometry's motion fails the innovation test against the last velocity
 
 
 def predict(

@@ -39,22 +39,15 @@ _SAME_ROTATION, _SAME_TRANSLATION_M = np.deg2rad(0.1), 0.01
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A registered scan.
+    """A registered scan."""
 
-    Attributes:
-        T_world_lidar: (4, 4) at the stamp.
-        velocity: (6,) during the sweep, in the LiDAR frame, rotation first.
-        covariance: (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`:
-            rotation first, in the LiDAR frame, as GTSAM has it.
-        degeneracy: the directions along which the prediction was kept.
-        iterations: of Gauss-Newton.
-    """
-
-    T_world_lidar: FloatArray
-    velocity: FloatArray
+    T_world_lidar: FloatArray  # (4, 4) at the stamp
+    velocity: FloatArray  # (6,) during the sweep, in the LiDAR frame, rotation first
+    # (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`: rotation first, in
+    # the LiDAR frame, as GTSAM has it.
     covariance: FloatArray
-    degeneracy: Degeneracy
-    iterations: int
+    degeneracy: Degeneracy  # the directions along which the prediction was kept
+    iterations: int  # of Gauss-Newton
 
 
 def register(

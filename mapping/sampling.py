@@ -27,23 +27,14 @@ _RANGE_SMOOTHING = 0.05
 
 @dataclass(frozen=True, eq=False)
 class SampledScan:
-    """A thinned scan, as measured.
+    """A thinned scan, as measured."""
 
-    Attributes:
-        stamp: of the scan, seconds.
-        cell_m: size of the map's cells for the scene.
-        range_m: smoothed median range of the scene.
-        sweep: N points for the map.
-        elevations: (N,) their angles above the sensor's equator, radians.
-        keypoints: the subset that is registered.
-    """
-
-    stamp: float
-    cell_m: float
-    range_m: float
-    sweep: Sweep
-    elevations: Annotated[FloatArray, Shape(None)]
-    keypoints: Sweep
+    stamp: float  # of the scan, seconds
+    cell_m: float  # size of the map's cells for the scene
+    range_m: float  # smoothed median range of the scene
+    sweep: Sweep  # N points for the map
+    elevations: Annotated[FloatArray, Shape(None)]  # (N,) their angles above the sensor's equator, radians
+    keypoints: Sweep  # the subset that is registered
 
     def __post_init__(self) -> None:
         if len(self.elevations) != len(self.sweep):

@@ -10,23 +10,15 @@ from lidarslam.core.state import Saved, Shape, State
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The motion since the previous scan.
+    """The motion since the previous scan."""
 
-    Attributes:
-        T_prev_curr: (4, 4), from this scan's LiDAR frame to the previous one's, each at its stamp; identity for the
-            first scan.
-        points_used: how many points of the scan the estimate rests on; 0 for a prediction.
-        failure: why the motion is only a prediction, None when it was measured.
-        covariance: (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the method
-            has none.
-        degenerate: names of the degenerate directions, where the method finds them.
-    """
-
+    # (4, 4), from this scan's LiDAR frame to the previous one's, each at its stamp; identity for the first scan
     T_prev_curr: Annotated[FloatArray, Shape(4, 4)]
-    points_used: int
-    failure: str | None = None
+    points_used: int  # how many points of the scan the estimate rests on; 0 for a prediction
+    failure: str | None = None  # why the motion is only a prediction, None when it was measured
+    # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the method has none
     covariance: Annotated[FloatArray, Shape(6, 6)] | None = None
-    degenerate: tuple[str, ...] = ()
+    degenerate: tuple[str, ...] = ()  # names of the degenerate directions, where the method finds them
 
 
 class Odometry(Protocol):

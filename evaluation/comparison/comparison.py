@@ -22,57 +22,37 @@ WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 
 @dataclass(frozen=True, eq=False)
 class MapErrors:
-    """Distances of a method's map points from the reference map, thinned for drawing.
+    """Distances of a method's map points from the reference map, thinned for drawing."""
 
-    Attributes:
-        points: (K, 3) points of the method's map, in the reference map's frame.
-        distances_m: (K,) to the nearest point of the reference map.
-    """
-
-    points: FloatArray
-    distances_m: FloatArray
+    points: FloatArray  # (K, 3) points of the method's map, in the reference map's frame
+    distances_m: FloatArray  # (K,) to the nearest point of the reference map
 
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """One method on one recording; values that are not available are None.
+    """One method on one recording; values that are not available are None."""
 
-    Attributes:
-        name: as the user named it, such as `kiss-icp@0.5` or `learned+map`.
-        status, message: how it ended, and the reason when it did not end well.
-        trajectory: its poses, in its own world.
-        lost: (N,) whether tracking was lost.
-        lost_reasons: one for each run of successive lost scans; empty when unknown.
-        metrics: its errors, with their association and alignment.
-        map_metrics: the content of metrics.json's "map".
-        map_errors: for the figure.
-        map_entropy: mean map entropy of its map, which needs no reference.
-        ms_per_scan_median, ms_per_scan_p95: wall time from one finished scan to the next.
-        stage_ms: median wall time of each stage; stages run beside one another.
-        peak_rss_mb: of its process and its children.
-        wall_s: of the whole process, from start to end.
-        settings: the method's resolved configuration as YAML.
-        run: its run directory, relative to the report's folder; empty when there is none.
-    """
-
-    name: str
+    name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`
+    # status, message: how it ended, and the reason when it did not end well
     status: MethodStatus
     message: str = ""
     scans: int = 0
-    trajectory: Trajectory | None = None
-    lost: NDArray[np.bool_] | None = None
-    lost_reasons: Sequence[str] = ()
-    metrics: TrajectoryMetrics | None = None
-    map_metrics: Mapping[str, object] | None = None
-    map_errors: MapErrors | None = None
-    map_entropy: float | None = None
+    trajectory: Trajectory | None = None  # its poses, in its own world
+    lost: NDArray[np.bool_] | None = None  # (N,) whether tracking was lost
+    lost_reasons: Sequence[str] = ()  # one for each run of successive lost scans; empty when unknown
+    metrics: TrajectoryMetrics | None = None  # its errors, with their association and alignment
+    map_metrics: Mapping[str, object] | None = None  # the content of metrics.json's "map"
+    map_errors: MapErrors | None = None  # for the figure
+    map_entropy: float | None = None  # mean map entropy of its map, which needs no reference
+    # ms_per_scan_median, ms_per_scan_p95: wall time from one finished scan to the next
     ms_per_scan_median: float | None = None
     ms_per_scan_p95: float | None = None
+    # median wall time of each stage; stages run beside one another
     stage_ms: Mapping[str, float] = field(default_factory=dict)
-    peak_rss_mb: float | None = None
-    wall_s: float | None = None
-    settings: str = ""
-    run: str = ""
+    peak_rss_mb: float | None = None  # of its process and its children
+    wall_s: float | None = None  # of the whole process, from start to end
+    settings: str = ""  # the method's resolved configuration as YAML
+    run: str = ""  # its run directory, relative to the report's folder; empty when there is none
 
     @property
     def lost_scans(self) -> int | None:
@@ -104,23 +84,14 @@ class MethodResult:
 
 @dataclass(frozen=True, eq=False)
 class SequenceComparison:
-    """All methods on one recording.
+    """All methods on one recording."""
 
-    Attributes:
-        sequence: the recording's name.
-        source: its path, as the user named it.
-        reference: the trajectory that errors are relative to; None when there is none.
-        reference_name: "ground truth", or the method or file that serves as the reference.
-        methods: in the order asked for.
-        notes: remarks on this recording, such as why there is no reference.
-    """
-
-    sequence: str
-    source: str
-    reference: Trajectory | None
-    reference_name: str
-    methods: Sequence[MethodResult]
-    notes: Sequence[str] = ()
+    sequence: str  # the recording's name
+    source: str  # its path, as the user named it
+    reference: Trajectory | None  # the trajectory that errors are relative to; None when there is none
+    reference_name: str  # "ground truth", or the method or file that serves as the reference
+    methods: Sequence[MethodResult]  # in the order asked for
+    notes: Sequence[str] = ()  # remarks on this recording, such as why there is no reference
 
     def to_json(self) -> dict[str, object]:
         """The content of comparison.json for one recording."""
@@ -135,58 +106,36 @@ class SequenceComparison:
 
 @dataclass(frozen=True)
 class MissingRecording:
-    """A recording that was asked for and is not part of the comparison.
+    """A recording that was asked for and is not part of the comparison."""
 
-    Attributes:
-        sequence, source: as in `SequenceComparison`.
-        reason: in a sentence.
-    """
-
+    # sequence, source: as in `SequenceComparison`
     sequence: str
     source: str
-    reason: str
+    reason: str  # in a sentence
 
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A row of somebody's published table, quoted beside ours.
+    """A row of somebody's published table, quoted beside ours."""
 
-    Attributes:
-        method: as published.
-        values: column -> value, for instance {"09 translation_percent": 6.05}.
-        source: where it was published.
-    """
-
-    method: str
-    values: Mapping[str, float | str]
-    source: str
+    method: str  # as published
+    values: Mapping[str, float | str]  # column -> value, for instance {"09 translation_percent": 6.05}
+    source: str  # where it was published
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Everything a report is made of.
+    """Everything a report is made of."""
 
-    Attributes:
-        title: of the report.
-        command: that reproduces it.
-        sequences: one or more recordings.
-        versions: program -> version; "commit" when it is known.
-        machine: name -> text, such as processor, cores, memory, system.
-        published: rows quoted beside ours that are in none of the `tables`.
-        tables: over several recordings, published rows included; a report shows them first.
-        missing: recordings that were asked for and are not there.
-        notes: remarks on the whole, such as that it was interrupted.
-    """
-
-    title: str
-    command: str
-    sequences: Sequence[SequenceComparison]
-    versions: Mapping[str, str] = field(default_factory=dict)
-    machine: Mapping[str, str] = field(default_factory=dict)
-    published: Sequence[PublishedRow] = ()
-    tables: Sequence[Table] = ()
-    missing: Sequence[MissingRecording] = ()
-    notes: Sequence[str] = ()
+    title: str  # of the report
+    command: str  # that reproduces it
+    sequences: Sequence[SequenceComparison]  # one or more recordings
+    versions: Mapping[str, str] = field(default_factory=dict)  # program -> version; "commit" when it is known
+    machine: Mapping[str, str] = field(default_factory=dict)  # name -> text, such as processor, cores, memory, system
+    published: Sequence[PublishedRow] = ()  # rows quoted beside ours that are in none of the `tables`
+    tables: Sequence[Table] = ()  # over several recordings, published rows included; a report shows them first
+    missing: Sequence[MissingRecording] = ()  # recordings that were asked for and are not there
+    notes: Sequence[str] = ()  # remarks on the whole, such as that it was interrupted
 
     def to_json(self) -> dict[str, object]:
         """The content of comparison.json: of one recording its own keys, of several a list of them."""

@@ -12,21 +12,16 @@ _MERGED_GAP_S = 1.0
 
 @dataclass(frozen=True)
 class LostInterval:
-    """Lost scans with no tracked gap of a second or more between them.
+    """Lost scans with no tracked gap of a second or more between them."""
 
-    Attributes:
-        first, last: rows of the method's trajectory, both inclusive.
-        begin_s, end_s: their times since the method's first scan.
-        scans: number of lost scans among them.
-        reason: of the first loss, and the number of others.
-    """
-
+    # first, last: rows of the method's trajectory, both inclusive
     first: int
     last: int
+    # begin_s, end_s: their times since the method's first scan
     begin_s: float
     end_s: float
-    scans: int
-    reason: str
+    scans: int  # number of lost scans among them
+    reason: str  # of the first loss, and the number of others
 
 
 def lost_intervals(method: MethodResult) -> list[LostInterval]:

@@ -10,19 +10,13 @@ from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 
 @dataclass(frozen=True)
 class TablePlan:
-    """Content of a table of means.
+    """Content of a table of means."""
 
-    Attributes:
-        title, note: as in `Table`.
-        groups: heading -> the recordings averaged under it.
-        quantities: the columns under each heading.
-        published: others' rows, a cell for each column.
-    """
-
+    # title, note: as in `Table`
     title: str
-    groups: Mapping[str, Sequence[str]]
-    quantities: Sequence[Quantity]
-    published: Sequence[TableRow] = ()
+    groups: Mapping[str, Sequence[str]]  # heading -> the recordings averaged under it
+    quantities: Sequence[Quantity]  # the columns under each heading
+    published: Sequence[TableRow] = ()  # others' rows, a cell for each column
     note: str = ""
 
 

@@ -10,22 +10,14 @@ from lidarslam.core.errors import ConfigError
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of a method on a recording.
+    """One number of a method on a recording."""
 
-    Attributes:
-        path: of the keys in `MethodResult.to_json()`, separated by slashes.
-        label: short, for the head of a column.
-        unit: empty for counts.
-        digits: after the decimal point.
-        lower_is_better: None for a quantity that is not ranked.
-        percent_of: path of the value that the number is given in percent of; None: it is given as it is.
-    """
-
-    path: str
-    label: str
-    unit: str
-    digits: int
-    lower_is_better: bool | None = True
+    path: str  # of the keys in `MethodResult.to_json()`, separated by slashes
+    label: str  # short, for the head of a column
+    unit: str  # empty for counts
+    digits: int  # after the decimal point
+    lower_is_better: bool | None = True  # None for a quantity that is not ranked
+    # path of the value that the number is given in percent of; None: it is given as it is
     percent_of: str | None = None
 
     def of(self, result: MethodResult) -> float | None:

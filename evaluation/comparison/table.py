@@ -14,74 +14,48 @@ _UNPRINTABLE = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ff
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A column.
+    """A column."""
 
-    Attributes:
-        heading: common to successive columns, such as "09" or "00-08"; empty for none.
-        label, unit: of the quantity, such as "t_rel" and "%".
-        digits: after the decimal point.
-        lower_is_better: None for a column that is not ranked.
-        sequences: names of the recordings that the mean is taken over.
-        numeric: whether it holds numbers, which are set flush right.
-    """
-
-    heading: str
+    heading: str  # common to successive columns, such as "09" or "00-08"; empty for none
+    # label, unit: of the quantity, such as "t_rel" and "%"
     label: str
     unit: str = ""
-    digits: int = 0
-    lower_is_better: bool | None = None
-    sequences: Sequence[str] = ()
-    numeric: bool = True
+    digits: int = 0  # after the decimal point
+    lower_is_better: bool | None = None  # None for a column that is not ranked
+    sequences: Sequence[str] = ()  # names of the recordings that the mean is taken over
+    numeric: bool = True  # whether it holds numbers, which are set flush right
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A cell.
+    """A cell."""
 
-    Attributes:
-        value: None where it is not available; text as published, such as "NA".
-        averaged: number of recordings that a mean is taken over; of a published figure, as many as the column names.
-        note: beside the value, such as "over 7 of 9".
-        ranked: whether the value is comparable with the others of its column.
-    """
-
-    value: Value
+    value: Value  # None where it is not available; text as published, such as "NA"
+    # number of recordings that a mean is taken over; of a published figure, as many as the column names
     averaged: int = 1
-    note: str = ""
-    ranked: bool = True
+    note: str = ""  # beside the value, such as "over 7 of 9"
+    ranked: bool = True  # whether the value is comparable with the others of its column
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """A method's row.
+    """A method's row."""
 
-    Attributes:
-        method: ours as the user named it, others' as published.
-        cells: one a column.
-        source: where it was published; empty for ours.
-    """
-
-    method: str
-    cells: Sequence[TableCell]
-    source: str = ""
+    method: str  # ours as the user named it, others' as published
+    cells: Sequence[TableCell]  # one a column
+    source: str = ""  # where it was published; empty for ours
 
 
 @dataclass(frozen=True)
 class Table:
-    """Methods against columns.
+    """Methods against columns."""
 
-    Attributes:
-        title: a few words.
-        columns, rows: our rows first, then the published ones.
-        note: a sentence below the table; may be empty.
-        folded: whether the page shows it on request only.
-    """
-
-    title: str
+    title: str  # a few words
+    # columns, rows: our rows first, then the published ones
     columns: Sequence[TableColumn]
     rows: Sequence[TableRow]
-    note: str = ""
-    folded: bool = False
+    note: str = ""  # a sentence below the table; may be empty
+    folded: bool = False  # whether the page shows it on request only
 
     def best(self) -> set[tuple[int, int]]:
         """(row, column) of the best value of each ranked column, and of all that look equal to it.

@@ -36,29 +36,19 @@ _SEARCH_POINTS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class MapAlignment:
-    """Pose of a map in the frame of its reference, and its quality.
+    """Pose of a map in the frame of its reference, and its quality."""
 
-    Attributes:
-        T_reference_map: (4, 4).
-        method: its initial guess: "trajectory", "file", "none" or "global".
-        refined: whether ICP followed.
-        fitness: share of inliers, the map's points with a point of the reference within `inlier_m`, 0 to 1.
-        inlier_rmse_m: root mean square distance of the inliers; None without any.
-        inlier_m: largest distance of an inlier.
-        moved_m, moved_deg: translation of the map's median and rotation by ICP; so much misplacement does not show in
-            the map's errors.
-        runner_up: fitness of the next best, different pose of a global search.
-    """
-
-    T_reference_map: FloatArray
-    method: str
-    refined: bool
-    fitness: float
-    inlier_rmse_m: float | None
-    inlier_m: float
+    T_reference_map: FloatArray  # (4, 4)
+    method: str  # its initial guess: "trajectory", "file", "none" or "global"
+    refined: bool  # whether ICP followed
+    fitness: float  # share of inliers, the map's points with a point of the reference within `inlier_m`, 0 to 1
+    inlier_rmse_m: float | None  # root mean square distance of the inliers; None without any
+    inlier_m: float  # largest distance of an inlier
+    # moved_m, moved_deg: translation of the map's median and rotation by ICP; so much misplacement does not show in the
+    # map's errors
     moved_m: float = 0.0
     moved_deg: float = 0.0
-    runner_up: float | None = None
+    runner_up: float | None = None  # fitness of the next best, different pose of a global search
 
     @property
     def is_trustworthy(self) -> bool:

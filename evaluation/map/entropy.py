@@ -32,19 +32,12 @@ _CHUNK = 4_000_000
 
 @dataclass(frozen=True)
 class MapEntropy:
-    """Mean entropy of the neighbourhoods of a map's points; lower is crisper.
+    """Mean entropy of the neighbourhoods of a map's points; lower is crisper."""
 
-    Attributes:
-        mean: in nats; comparable between maps of the same place, radius and spacing.
-        radius_m: of a neighbourhood.
-        spacing_m: edge of the cells that the map was thinned to.
-        points: number of neighbourhoods.
-    """
-
-    mean: float
-    radius_m: float
-    spacing_m: float
-    points: int
+    mean: float  # in nats; comparable between maps of the same place, radius and spacing
+    radius_m: float  # of a neighbourhood
+    spacing_m: float  # edge of the cells that the map was thinned to
+    points: int  # number of neighbourhoods
 
     def to_json(self) -> dict[str, float | int]:
         """The entropy in metrics.json."""

@@ -25,24 +25,17 @@ _GAP_SAMPLES = 10_000
 
 @dataclass(frozen=True)
 class MapMetrics:
-    """Errors of a map; None where one cannot be computed.
+    """Errors of a map; None where one cannot be computed."""
 
-    Attributes:
-        accuracy_mean_m: mean distance of the map's points to the reference.
-        completeness_mean_m: mean distance of the reference's points to the map.
-        chamfer_m: the mean of the two.
-        f_score_percent: threshold in metres -> harmonic mean of the share of the map's points that are that close to
-            the reference, and of the reference's points that close to the map. Knapitsch et al., "Tanks and Temples",
-            TOG 2017.
-        coverage_percent: tolerance in metres -> share of the reference's points that close to the map.
-        deviation_percent: tolerance in metres -> share of the map's points farther from the reference.
-    """
-
-    accuracy_mean_m: float | None
-    completeness_mean_m: float | None
-    chamfer_m: float | None
+    accuracy_mean_m: float | None  # mean distance of the map's points to the reference
+    completeness_mean_m: float | None  # mean distance of the reference's points to the map
+    chamfer_m: float | None  # the mean of the two
+    # threshold in metres -> harmonic mean of the share of the map's points that are that close to the reference, and of
+    # the reference's points that close to the map. Knapitsch et al., "Tanks and Temples", TOG 2017.
     f_score_percent: Mapping[float, float | None]
+    # tolerance in metres -> share of the reference's points that close to the map
     coverage_percent: Mapping[float, float | None]
+    # tolerance in metres -> share of the map's points farther from the reference
     deviation_percent: Mapping[float, float | None]
 
     def to_json(self) -> dict[str, object]:
@@ -55,17 +48,11 @@ class MapMetrics:
 
 @dataclass(frozen=True, eq=False)
 class CloudErrors:
-    """Points of one cloud and their distances from the other.
+    """Points of one cloud and their distances from the other."""
 
-    Attributes:
-        points: (N, 3) the thinned cloud, in the reference's frame.
-        distances_m: (N,) to the nearest point of the other.
-        considered: (N,) whether the point lies where both clouds can have one.
-    """
-
-    points: FloatArray
-    distances_m: FloatArray
-    considered: NDArray[np.bool_]
+    points: FloatArray  # (N, 3) the thinned cloud, in the reference's frame
+    distances_m: FloatArray  # (N,) to the nearest point of the other
+    considered: NDArray[np.bool_]  # (N,) whether the point lies where both clouds can have one
 
     def share_within(self, threshold_m: float, considered_only: bool) -> float | None:
         """Share of the points within the threshold, 0 to 1; None without points."""
@@ -81,20 +68,13 @@ class CloudErrors:
 
 @dataclass(frozen=True, eq=False)
 class MapComparison:
-    """Errors of a map and of its reference.
+    """Errors of a map and of its reference."""
 
-    Attributes:
-        metrics: the errors in one number each.
-        map_errors: the map's points and their distances to the reference.
-        reference_errors: the reference's points and their distances to the map.
-        spacing_m: edge of the cells that both were thinned to.
-        map_gap_m: median distance between neighbouring points of the thinned map; None for fewer than two points.
-    """
-
-    metrics: MapMetrics
-    map_errors: CloudErrors
-    reference_errors: CloudErrors
-    spacing_m: float
+    metrics: MapMetrics  # the errors in one number each
+    map_errors: CloudErrors  # the map's points and their distances to the reference
+    reference_errors: CloudErrors  # the reference's points and their distances to the map
+    spacing_m: float  # edge of the cells that both were thinned to
+    # median distance between neighbouring points of the thinned map; None for fewer than two points
     map_gap_m: float | None
 
 

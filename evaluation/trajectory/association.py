@@ -20,21 +20,13 @@ _OTHER_UNIT = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Pairs of poses of one instant, M of them.
+    """Pairs of poses of one instant, M of them."""
 
-    Attributes:
-        estimate: the matched poses of the estimate, `T_world_lidar` in the estimate's world.
-        reference: the reference at the same M stamps, `T_world_lidar` in the reference's world.
-        rows: (M,) increasing, of the matched poses in the whole estimate.
-        estimate_count: poses of the whole estimate.
-        reference_count: poses of the whole reference.
-    """
-
-    estimate: Trajectory
-    reference: Trajectory
-    rows: NDArray[np.intp]
-    estimate_count: int
-    reference_count: int
+    estimate: Trajectory  # the matched poses of the estimate, `T_world_lidar` in the estimate's world
+    reference: Trajectory  # the reference at the same M stamps, `T_world_lidar` in the reference's world
+    rows: NDArray[np.intp]  # (M,) increasing, of the matched poses in the whole estimate
+    estimate_count: int  # poses of the whole estimate
+    reference_count: int  # poses of the whole reference
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -23,17 +23,11 @@ _KITTI_SPEED_WINDOW_MPS = 2.0
 
 @dataclass(frozen=True)
 class Drift:
-    """Mean error over segments, relative to their length.
+    """Mean error over segments, relative to their length."""
 
-    Attributes:
-        translation_percent: translation error.
-        rotation_deg_per_m: rotation error.
-        segments: number of segments.
-    """
-
-    translation_percent: float
-    rotation_deg_per_m: float
-    segments: int
+    translation_percent: float  # translation error
+    rotation_deg_per_m: float  # rotation error
+    segments: int  # number of segments
 
     def to_json(self, per_m: int) -> dict[str, float]:
         """Both means, the rotation over `per_m` metres, as metrics.json names them."""
@@ -45,16 +39,11 @@ class Drift:
 
 @dataclass(frozen=True)
 class KittiDrift:
-    """Drift as the KITTI odometry development kit computes it.
+    """Drift as the KITTI odometry development kit computes it."""
 
-    Attributes:
-        overall: the mean over all segments of all lengths, the figure of the KITTI table.
-        by_length: metres -> drift; None where the trajectory is too short.
-        by_speed: m/s -> drift over segments driven within 2 m/s of it; None where there is no segment.
-    """
-
-    overall: Drift
-    by_length: Mapping[int, Drift | None]
+    overall: Drift  # the mean over all segments of all lengths, the figure of the KITTI table
+    by_length: Mapping[int, Drift | None]  # metres -> drift; None where the trajectory is too short
+    # m/s -> drift over segments driven within 2 m/s of it; None where there is no segment
     by_speed: Mapping[int, Drift | None]
 
     def to_json(self) -> dict[str, object]:
@@ -66,19 +55,12 @@ class KittiDrift:
 
 @dataclass(frozen=True, eq=False)
 class SegmentErrors:
-    """Errors of S segments, divided by their lengths.
+    """Errors of S segments, divided by their lengths."""
 
-    Attributes:
-        lengths_m: (S,) the length asked for.
-        speeds_mps: (S,) the distance travelled over the time it took.
-        translation: (S,) metres per metre.
-        rotation_rad_per_m: (S,).
-    """
-
-    lengths_m: FloatArray
-    speeds_mps: FloatArray
-    translation: FloatArray
-    rotation_rad_per_m: FloatArray
+    lengths_m: FloatArray  # (S,) the length asked for
+    speeds_mps: FloatArray  # (S,) the distance travelled over the time it took
+    translation: FloatArray  # (S,) metres per metre
+    rotation_rad_per_m: FloatArray  # (S,)
 
     def mean(self, chosen: NDArray[np.bool_] | slice = slice(None)) -> Drift | None:
         """The mean over the chosen segments, None when there are none."""

@@ -21,24 +21,15 @@ _OTHER_UNIT = 20.0
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """Errors in one number each; None where one cannot be computed.
+    """Errors in one number each; None where one cannot be computed."""
 
-    Attributes:
-        length_m: path length of the reference over the matched poses.
-        ate_rmse_m: absolute trajectory error, the positions' root mean square distance after SE(3) alignment.
-        ate_rotation_rmse_deg: root mean square angle between the orientations after the same alignment.
-        rpe_translation_rmse_m: relative pose error from one scan to the next; None when no two successive scans
-            have a reference pose.
-        rpe_rotation_rmse_deg: likewise for the rotation.
-        end_error_m: distance between the last positions after the first poses are made to coincide; no smaller for a
-            closed loop.
-    """
-
-    length_m: float
-    ate_rmse_m: float
-    ate_rotation_rmse_deg: float
+    length_m: float  # path length of the reference over the matched poses
+    ate_rmse_m: float  # absolute trajectory error, the positions' root mean square distance after SE(3) alignment
+    ate_rotation_rmse_deg: float  # root mean square angle between the orientations after the same alignment
+    # relative pose error from one scan to the next; None when no two successive scans have a reference pose
     rpe_translation_rmse_m: float | None
-    rpe_rotation_rmse_deg: float | None
+    rpe_rotation_rmse_deg: float | None  # likewise for the rotation
+    # distance between the last positions after the first poses are made to coincide; no smaller for a closed loop
     end_error_m: float
 
     def to_json(self) -> dict[str, float | None]:
@@ -48,23 +39,14 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryMetrics:
-    """All errors of a trajectory.
+    """All errors of a trajectory."""
 
-    Attributes:
-        association: the pairs of poses that were compared.
-        T_reference_estimate: (4, 4) the alignment of the ATE.
-        errors: absolute and relative errors.
-        kitti: KITTI's drift; None under 100 m.
-        segments: metres -> drift over short segments; None where the reference is too short.
-        alignment: how the alignment was found.
-    """
-
-    association: Association
-    T_reference_estimate: FloatArray
-    errors: TrajectoryErrors
-    kitti: KittiDrift | None
-    segments: Mapping[int, Drift | None]
-    alignment: AlignmentMethod = "se3"
+    association: Association  # the pairs of poses that were compared
+    T_reference_estimate: FloatArray  # (4, 4) the alignment of the ATE
+    errors: TrajectoryErrors  # absolute and relative errors
+    kitti: KittiDrift | None  # KITTI's drift; None under 100 m
+    segments: Mapping[int, Drift | None]  # metres -> drift over short segments; None where the reference is too short
+    alignment: AlignmentMethod = "se3"  # how the alignment was found
 
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json, with no map compared."""

@@ -27,17 +27,11 @@ METHODS = "learned+map+graph,kiss-icp"
 
 @dataclass(frozen=True)
 class Demo:
-    """A finished demonstration.
+    """A finished demonstration."""
 
-    Attributes:
-        out: the folder that everything is in.
-        outcome: both methods beside the truth.
-        pictures: of the true map and of the methods' maps.
-    """
-
-    out: Path
-    outcome: CompareOutcome
-    pictures: tuple[Path, ...]
+    out: Path  # the folder that everything is in
+    outcome: CompareOutcome  # both methods beside the truth
+    pictures: tuple[Path, ...]  # of the true map and of the methods' maps
 
 
 def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], None] = lambda _: None) -> Demo:

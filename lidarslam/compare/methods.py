@@ -15,15 +15,10 @@ _GRAMMAR = f"{', '.join(_BASES)}; each with +map, +graph or +map+graph; and kiss
 
 @dataclass(frozen=True)
 class Method:
-    """One method of a comparison.
+    """One method of a comparison."""
 
-    Attributes:
-        name: as the user named it, such as `kiss-icp@0.5` or `learned+map`.
-        settings: of the configuration, `key.path=value`.
-    """
-
-    name: str
-    settings: tuple[str, ...]
+    name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`
+    settings: tuple[str, ...]  # of the configuration, `key.path=value`
 
     @property
     def needs_prior(self) -> bool:

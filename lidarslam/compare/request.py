@@ -28,59 +28,38 @@ class Simulated(BaseModel):
 
 @dataclass(frozen=True)
 class RecordingEntry:
-    """One recording of a comparison, as in a benchmark file too.
-
-    Attributes:
-        source: where it lies; None only where it is simulated.
-        name: in tables and of its folder; None: the recording's own.
-        set: settings for this recording alone, `key.path=value`.
-        start, stop, step: which scans, as in `range`.
-        prior: TUM file for the methods that take their motions from one.
-        reference: a method's name or a TUM file; None: the ground truth.
-        reference_map: a point cloud; None: the map that a simulated recording came with.
-        simulate: how it is made when it is not there.
-    """
+    """One recording of a comparison, as in a benchmark file too."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    source: Path | None = None
-    name: str | None = None
-    set: tuple[str, ...] = ()
+    source: Path | None = None  # where it lies; None only where it is simulated
+    name: str | None = None  # in tables and of its folder; None: the recording's own
+    set: tuple[str, ...] = ()  # settings for this recording alone, `key.path=value`
+    # start, stop, step: which scans, as in `range`
     start: Annotated[int, Field(ge=0)] = 0
     stop: Annotated[int, Field(ge=0)] | None = None
     step: Annotated[int, Field(ge=1)] = 1
-    prior: Path | None = None
-    reference: str | None = None
-    reference_map: Path | None = None
-    simulate: Simulated | None = None
+    prior: Path | None = None  # TUM file for the methods that take their motions from one
+    reference: str | None = None  # a method's name or a TUM file; None: the ground truth
+    reference_map: Path | None = None  # a point cloud; None: the map that a simulated recording came with
+    simulate: Simulated | None = None  # how it is made when it is not there
 
 
 @dataclass(frozen=True)
 class CompareRequest:
-    """A comparison.
+    """A comparison."""
 
-    Attributes:
-        out: the folder for everything.
-        recordings: one or more.
-        methods: in the order of the tables.
-        config_file, settings: for every method on every recording; the method's own settings come last.
-        limits: of each method on each recording.
-        overwrite: whether an earlier comparison in `out` is replaced.
-        reuse: whether finished runs in `out` with the same settings are kept.
-        skip_missing: whether recordings that are not there are left out and named, instead of an error.
-        title, command: of the report; how to make it again.
-        tables: means over recordings.
-    """
-
-    out: Path
-    recordings: tuple[RecordingEntry, ...]
-    methods: tuple[Method, ...]
+    out: Path  # the folder for everything
+    recordings: tuple[RecordingEntry, ...]  # one or more
+    methods: tuple[Method, ...]  # in the order of the tables
+    # config_file, settings: for every method on every recording; the method's own settings come last
     config_file: Path | None = None
     settings: tuple[str, ...] = ()
-    limits: Limits = field(default_factory=Limits)
-    overwrite: bool = False
-    reuse: bool = False
-    skip_missing: bool = False
+    limits: Limits = field(default_factory=Limits)  # of each method on each recording
+    overwrite: bool = False  # whether an earlier comparison in `out` is replaced
+    reuse: bool = False  # whether finished runs in `out` with the same settings are kept
+    skip_missing: bool = False  # whether recordings that are not there are left out and named, instead of an error
+    # title, command: of the report; how to make it again
     title: str = ""
     command: str = ""
-    tables: tuple[TablePlan, ...] = ()
+    tables: tuple[TablePlan, ...] = ()  # means over recordings

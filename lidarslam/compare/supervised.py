@@ -23,32 +23,21 @@ Cause = Literal["itself", "memory", "time", "interrupt"]
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a command; None: no limit.
+    """Limits of a command; None: no limit."""
 
-    Attributes:
-        memory_mb: resident memory of all its processes together.
-        timeout_s: wall time.
-    """
-
-    memory_mb: float | None = None
-    timeout_s: float | None = None
+    memory_mb: float | None = None  # resident memory of all its processes together
+    timeout_s: float | None = None  # wall time
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a command ended.
+    """How a command ended."""
 
-    Attributes:
-        cause: by itself, or because a limit or an interruption ended it.
-        status: its exit status, negative for the signal that ended it.
-        wall_s: from its start to its end.
-        peak_rss_mb: largest resident memory of its process tree, sampled five times a second, units of 1024 x 1024
-            bytes; shared pages count for each process. None where no sample was taken.
-    """
-
-    cause: Cause
-    status: int
-    wall_s: float
+    cause: Cause  # by itself, or because a limit or an interruption ended it
+    status: int  # its exit status, negative for the signal that ended it
+    wall_s: float  # from its start to its end
+    # largest resident memory of its process tree, sampled five times a second, units of 1024 x 1024 bytes; shared pages
+    # count for each process. None where no sample was taken.
     peak_rss_mb: float | None
 
 

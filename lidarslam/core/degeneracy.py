@@ -16,15 +16,10 @@ def lever_scale(lever_m: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Degeneracy:
-    """Directions of motion that a scan does not constrain.
+    """Directions of motion that a scan does not constrain."""
 
-    Attributes:
-        directions: (D, 6) orthonormal, rotation first, rotations scaled by `lever_m`, in the LiDAR frame.
-        lever_m: metres that correspond to a rotation of one radian.
-    """
-
-    directions: FloatArray
-    lever_m: float
+    directions: FloatArray  # (D, 6) orthonormal, rotation first, rotations scaled by `lever_m`, in the LiDAR frame
+    lever_m: float  # metres that correspond to a rotation of one radian
 
     def __len__(self) -> int:
         return len(self.directions)

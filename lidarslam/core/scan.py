@@ -19,22 +19,15 @@ _MOST_RINGS = 4096
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One sweep, in the LiDAR frame (x forward, z up).
+    """One sweep, in the LiDAR frame (x forward, z up)."""
 
-    Attributes:
-        points: (N, 3) float64, metres, finite, none at the origin.
-        stamp: seconds; the instant the scan's pose belongs to.
-        time_offsets: (N,) float64, seconds from the stamp at which each point was measured; None when unknown or
-            when the points are already motion compensated to the stamp.
-        rings: (N,) int32, the laser each point came from; None when unknown.
-        dropped: how many points of the raw sweep were left out as invalid.
-    """
-
-    points: FloatArray
-    stamp: float
+    points: FloatArray  # (N, 3) float64, metres, finite, none at the origin
+    stamp: float  # seconds; the instant the scan's pose belongs to
+    # (N,) float64, seconds from the stamp at which each point was measured; None when unknown or when the points are
+    # already motion compensated to the stamp
     time_offsets: FloatArray | None = None
-    rings: NDArray[np.int32] | None = None
-    dropped: int = 0
+    rings: NDArray[np.int32] | None = None  # (N,) int32, the laser each point came from; None when unknown
+    dropped: int = 0  # how many points of the raw sweep were left out as invalid
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:

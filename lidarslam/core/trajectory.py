@@ -10,15 +10,10 @@ from lidarslam.core.geometry import FloatArray, interpolate, inverse, is_rigid
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of the LiDAR in a world frame.
+    """Poses of the LiDAR in a world frame."""
 
-    Attributes:
-        stamps: (N,) float64, seconds, strictly increasing.
-        T_world_lidar: (N, 4, 4) float64, rigid.
-    """
-
-    stamps: FloatArray
-    T_world_lidar: FloatArray
+    stamps: FloatArray  # (N,) float64, seconds, strictly increasing
+    T_world_lidar: FloatArray  # (N, 4, 4) float64, rigid
 
     def __post_init__(self) -> None:
         if self.stamps.ndim != 1:

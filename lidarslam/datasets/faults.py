@@ -17,13 +17,9 @@ _UNREADABLE = "scans were left out: they could not be read"
 
 @dataclass
 class Faults:
-    """The faults of one pass through a recording, counted by kind; of each kind the first is remembered.
+    """The faults of one pass through a recording, counted by kind; of each kind the first is remembered."""
 
-    Attributes:
-        left_out: number of scans that were left out.
-    """
-
-    left_out: int = 0
+    left_out: int = 0  # number of scans that were left out
     _counts: Counter[str] = field(default_factory=Counter)
     _first: dict[str, str] = field(default_factory=dict)
 

@@ -60,17 +60,11 @@ def is_return(points: FloatArray) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class PointTimeModel:
-    """Conversion of a time field's raw values to seconds from the scan's stamp.
+    """Conversion of a time field's raw values to seconds from the scan's stamp."""
 
-    Attributes:
-        field: name of the field.
-        unit: "s", "ms", "us" or "ns".
-        reference: "relative" (the values count from the stamp) or "absolute" (they read a clock).
-    """
-
-    field: str
-    unit: str
-    reference: str
+    field: str  # name of the field
+    unit: str  # "s", "ms", "us" or "ns"
+    reference: str  # "relative" (the values count from the stamp) or "absolute" (they read a clock)
 
     def offsets(self, values: NDArray[np.generic], stamp: float) -> FloatArray:
         """Seconds from the stamp, float64, of the shape of the values (N,).

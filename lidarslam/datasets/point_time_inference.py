@@ -103,19 +103,14 @@ def infer_point_time(
 
 
 class ValueSpread(NamedTuple):
-    """The values of one scan, in their own unit.
+    """The values of one scan, in their own unit."""
 
-    Attributes:
-        first, middle, last: near the smallest, the median and near the largest, a few stray values left out.
-        span: last minus first, without the rounding of large values.
-        resolution: the step between neighbouring values at this size.
-    """
-
+    # first, middle, last: near the smallest, the median and near the largest, a few stray values left out
     first: float
     middle: float
     last: float
-    span: float
-    resolution: float
+    span: float  # last minus first, without the rounding of large values
+    resolution: float  # the step between neighbouring values at this size
 
 
 def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:

@@ -40,30 +40,18 @@ class PointField:
 
 @dataclass(frozen=True, eq=False)
 class RecordingInfo:
-    """Description of a recording, as `lidarslam info` prints it.
+    """Description of a recording, as `lidarslam info` prints it."""
 
-    Attributes:
-        reader: name of the reader in the registry.
-        scans: number of scans.
-        first: the first scan that can be read.
-        last_stamp: stamp of the last scan, seconds.
-        ground_truth: where the true trajectory was found, if it was.
-        point_time: as inferred from the values of a time field; None without.
-        topics: of a bag, all of them; `topic` is the one that is read.
-        fields: of the points as stored.
-        notes: further facts for the user, one sentence each.
-    """
-
-    reader: str
-    scans: int
-    first: Scan
-    last_stamp: float
-    ground_truth: Path | None
-    point_time: PointTimeModel | None
+    reader: str  # name of the reader in the registry
+    scans: int  # number of scans
+    first: Scan  # the first scan that can be read
+    last_stamp: float  # stamp of the last scan, seconds
+    ground_truth: Path | None  # where the true trajectory was found, if it was
+    point_time: PointTimeModel | None  # as inferred from the values of a time field; None without
     topic: str | None = None
-    topics: tuple[Topic, ...] = ()
-    fields: tuple[PointField, ...] = ()
-    notes: tuple[str, ...] = ()
+    topics: tuple[Topic, ...] = ()  # of a bag, all of them; `topic` is the one that is read
+    fields: tuple[PointField, ...] = ()  # of the points as stored
+    notes: tuple[str, ...] = ()  # further facts for the user, one sentence each
 
     @property
     def first_stamp(self) -> float:

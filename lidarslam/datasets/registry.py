@@ -15,17 +15,11 @@ SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 
 
 class Reader(NamedTuple):
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        module: has `open_recording(source: Path, config: ReaderConfig) -> Recording`.
-        reads: the layout, in words.
-        recognises: whether names alone fit; no file is opened.
-    """
-
-    module: str
-    reads: str
-    recognises: Callable[[Path], bool]
+    module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`
+    reads: str  # the layout, in words
+    recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
 
 
 def _is_rosbag(source: Path) -> bool:

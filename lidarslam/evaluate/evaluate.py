@@ -20,57 +20,35 @@ from lidarslam.storage.directory import RunDirectory
 
 @dataclass(frozen=True)
 class EvaluateRequest:
-    """Estimate, references and outputs.
+    """Estimate, references and outputs."""
 
-    Attributes:
-        run: a run directory, or a trajectory in TUM or KITTI text.
-        reference: a trajectory file, a run directory or a recording; None: the truth that came with the run's source.
-        reference_map: a cloud; None: the exact map of a simulated source, else none.
-        map_file: the map of a bare trajectory, or another one than the run's.
-        alignment: of the trajectory, for the ATE.
-        tolerance_s, max_gap_s: of the association in time.
-        map_options: of the comparison of maps.
-        errors: files for the map coloured by its errors.
-        errors_clip_m: distance of the brightest colour.
-        out: file for the figures; None: metrics.json of the run, and nothing of a bare trajectory.
-        needs_reference: whether it is an error that there is no reference.
-    """
-
-    run: Path
+    run: Path  # a run directory, or a trajectory in TUM or KITTI text
+    # a trajectory file, a run directory or a recording; None: the truth that came with the run's source
     reference: Path | None = None
-    reference_map: Path | None = None
-    map_file: Path | None = None
-    alignment: AlignmentMethod = "se3"
+    reference_map: Path | None = None  # a cloud; None: the exact map of a simulated source, else none
+    map_file: Path | None = None  # the map of a bare trajectory, or another one than the run's
+    alignment: AlignmentMethod = "se3"  # of the trajectory, for the ATE
+    # tolerance_s, max_gap_s: of the association in time
     tolerance_s: float = DEFAULT_TOLERANCE_S
     max_gap_s: float = DEFAULT_MAX_GAP_S
-    map_options: MapOptions = field(default_factory=MapOptions)
-    errors: Sequence[Path] = ()
-    errors_clip_m: float = DEFAULT_CLIP_M
-    out: Path | None = None
-    needs_reference: bool = True
+    map_options: MapOptions = field(default_factory=MapOptions)  # of the comparison of maps
+    errors: Sequence[Path] = ()  # files for the map coloured by its errors
+    errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
+    out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
+    needs_reference: bool = True  # whether it is an error that there is no reference
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Errors of an estimate.
+    """Errors of an estimate."""
 
-    Attributes:
-        estimate: the trajectory and its map.
-        reference: description of the reference trajectory; None without one.
-        metrics: errors of the trajectory.
-        map: errors of the map; None without a map or a reference for it.
-        entropy: of the map; None without a map.
-        notes: remarks for the reader.
-        written: the files.
-    """
-
-    estimate: Estimate
-    reference: str | None
-    metrics: TrajectoryMetrics | None
-    map: MapEvaluation | None
-    entropy: MapEntropy | None
-    notes: Sequence[str]
-    written: Sequence[Path]
+    estimate: Estimate  # the trajectory and its map
+    reference: str | None  # description of the reference trajectory; None without one
+    metrics: TrajectoryMetrics | None  # errors of the trajectory
+    map: MapEvaluation | None  # errors of the map; None without a map or a reference for it
+    entropy: MapEntropy | None  # of the map; None without a map
+    notes: Sequence[str]  # remarks for the reader
+    written: Sequence[Path]  # the files
 
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json."""

@@ -25,19 +25,12 @@ _KITTI_COLUMNS = 12
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """A trajectory with or without stamps.
+    """A trajectory with or without stamps."""
 
-    Attributes:
-        label: for messages.
-        stamps: (N,), None in KITTI's text format.
-        T_world_lidar: (N, 4, 4); of KITTI's camera where the file is in that frame.
-        T_cam_lidar: of a KITTI recording, whose pose files are in the camera's frame.
-    """
-
-    label: str
-    stamps: FloatArray | None
-    T_world_lidar: FloatArray
-    T_cam_lidar: FloatArray | None = None
+    label: str  # for messages
+    stamps: FloatArray | None  # (N,), None in KITTI's text format
+    T_world_lidar: FloatArray  # (N, 4, 4); of KITTI's camera where the file is in that frame
+    T_cam_lidar: FloatArray | None = None  # of a KITTI recording, whose pose files are in the camera's frame
 
     def in_camera(self) -> "Poses":
         """The same in the frame of KITTI's camera, if there is one."""
@@ -48,21 +41,13 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A trajectory and its map.
+    """A trajectory and its map."""
 
-    Attributes:
-        poses: the trajectory.
-        run: the run directory, None of a bare trajectory.
-        map_file: its map, None when there is none.
-        source: the recording of the run, None of a bare trajectory.
-        config: of the run; the defaults of a bare trajectory.
-    """
-
-    poses: Poses
-    run: Path | None
-    map_file: Path | None
-    source: Path | None
-    config: Config
+    poses: Poses  # the trajectory
+    run: Path | None  # the run directory, None of a bare trajectory
+    map_file: Path | None  # its map, None when there is none
+    source: Path | None  # the recording of the run, None of a bare trajectory
+    config: Config  # of the run; the defaults of a bare trajectory
 
     def map_points(self) -> FloatArray:
         """The map's points (N, 3).

@@ -25,22 +25,16 @@ _DRAWN_POINTS = 200_000
 
 @dataclass(frozen=True)
 class MapOptions:
-    """Options of the comparison of maps.
+    """Options of the comparison of maps."""
 
-    Attributes:
-        alignment: initial `T_reference_map`. "trajectory": the alignment of the trajectory with one in the reference
-            map's world; "none": the identity; "global": global registration; or the name of a text file with the 4x4
-            matrix. "auto": the trajectory where it is known to be in the reference map's world, else the first of
-            trajectory, none and global that fits.
-        refine: whether ICP follows; None: unless the alignment is "none".
-        spacing_m: edge of the cells that both clouds are thinned to one point in.
-        max_range_m: range of the sensor; None: that of the run's map.
-    """
-
+    # initial `T_reference_map`. "trajectory": the alignment of the trajectory with one in the reference map's world;
+    # "none": the identity; "global": global registration; or the name of a text file with the 4x4 matrix. "auto": the
+    # trajectory where it is known to be in the reference map's world, else the first of trajectory, none and global
+    # that fits.
     alignment: str = "auto"
-    refine: bool | None = None
-    spacing_m: float = DEFAULT_SPACING_M
-    max_range_m: float | None = None
+    refine: bool | None = None  # whether ICP follows; None: unless the alignment is "none"
+    spacing_m: float = DEFAULT_SPACING_M  # edge of the cells that both clouds are thinned to one point in
+    max_range_m: float | None = None  # range of the sensor; None: that of the run's map
 
     def __post_init__(self) -> None:
         if self.alignment == GLOBAL and self.refine is False:
@@ -49,23 +43,14 @@ class MapOptions:
 
 @dataclass(frozen=True, eq=False)
 class MapEvaluation:
-    """Errors of a map.
+    """Errors of a map."""
 
-    Attributes:
-        reference: description of the reference map.
-        alignment: of the map with it.
-        comparison: the errors, in numbers and point by point.
-        entropy: of the map by itself; None when it is too sparse.
-        positions: (K, 3) of the sensor, in the reference's frame.
-        max_range_m: range of the sensor.
-    """
-
-    reference: str
-    alignment: MapAlignment
-    comparison: MapComparison
-    entropy: MapEntropy | None
-    positions: FloatArray
-    max_range_m: float
+    reference: str  # description of the reference map
+    alignment: MapAlignment  # of the map with it
+    comparison: MapComparison  # the errors, in numbers and point by point
+    entropy: MapEntropy | None  # of the map by itself; None when it is too sparse
+    positions: FloatArray  # (K, 3) of the sensor, in the reference's frame
+    max_range_m: float  # range of the sensor
 
     @property
     def json(self) -> dict[str, object]:

@@ -12,17 +12,11 @@ from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README,
 
 @dataclass(frozen=True, eq=False)
 class ReferenceMap:
-    """A map to compare with.
+    """A map to compare with."""
 
-    Attributes:
-        path: of its file.
-        points: (N, 3) in its own frame.
-        truth: the true trajectory in that frame; None when none is known.
-    """
-
-    path: Path
-    points: FloatArray
-    truth: Trajectory | None = None
+    path: Path  # of its file
+    points: FloatArray  # (N, 3) in its own frame
+    truth: Trajectory | None = None  # the true trajectory in that frame; None when none is known
 
     @property
     def label(self) -> str:

@@ -16,19 +16,12 @@ STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """A scan with its odometry.
+    """A scan with its odometry."""
 
-    Attributes:
-        scan: as read.
-        motion: the estimated motion since the previous scan.
-        interval_s: time between the two stamps; None when no motion was measured.
-        stage_ms: wall time of reading and odometry.
-    """
-
-    scan: Scan
-    motion: Motion
-    interval_s: float | None
-    stage_ms: dict[str, float] = field(default_factory=dict)
+    scan: Scan  # as read
+    motion: Motion  # the estimated motion since the previous scan
+    interval_s: float | None  # time between the two stamps; None when no motion was measured
+    stage_ms: dict[str, float] = field(default_factory=dict)  # wall time of reading and odometry
 
     @property
     def velocity(self) -> FloatArray | None:
@@ -64,49 +57,32 @@ class SweepMotion:
 
 @dataclass(frozen=True, eq=False)
 class Localised:
-    """The pose of a scan.
+    """The pose of a scan."""
 
-    Attributes:
-        T_world_lidar: (4, 4) at the stamp; the world is the LiDAR frame of the first scan.
-        T_odom_lidar: (4, 4), the odometry alone; where it measured nothing, the predicted motion.
-        covariance: (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none.
-        motion: of the sensor during the sweep.
-        status, message: the tracking status, and its reason unless it is ok.
-        belongs_in_map: whether the pose is accurate enough to add the scan to the map.
-        points_used: number of correspondences that the pose was estimated from.
-        residual_m, inlier_ratio: of the fit to the map or the previous scan; None when it could not be computed.
-        degenerate: axes along which the scan does not constrain the motion.
-        stage_ms: wall time of the stages, see `STAGES`.
-        is_connected: whether the pose follows from that of the previous scan; not when lost or relocalised.
-    """
-
-    T_world_lidar: FloatArray
-    T_odom_lidar: FloatArray
-    covariance: FloatArray | None
-    motion: SweepMotion
+    T_world_lidar: FloatArray  # (4, 4) at the stamp; the world is the LiDAR frame of the first scan
+    T_odom_lidar: FloatArray  # (4, 4), the odometry alone; where it measured nothing, the predicted motion
+    covariance: FloatArray | None  # (6, 6) of the pose, rotation first, in the LiDAR frame; None when there is none
+    motion: SweepMotion  # of the sensor during the sweep
+    # status, message: the tracking status, and its reason unless it is ok
     status: Status
     message: str
-    belongs_in_map: bool
-    points_used: int
+    belongs_in_map: bool  # whether the pose is accurate enough to add the scan to the map
+    points_used: int  # number of correspondences that the pose was estimated from
+    # residual_m, inlier_ratio: of the fit to the map or the previous scan; None when it could not be computed
     residual_m: float | None
     inlier_ratio: float | None
-    degenerate: tuple[str, ...]
-    stage_ms: dict[str, float]
-    is_connected: bool = True
+    degenerate: tuple[str, ...]  # axes along which the scan does not constrain the motion
+    stage_ms: dict[str, float]  # wall time of the stages, see `STAGES`
+    is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanResult(Localised):
-    """A scan that is done: its pose, and beside `Localised`:
+    """A scan that is done: its pose, and beside `Localised`:"""
 
-    Attributes:
-        stamp: seconds.
-        points: (N, 3) in the LiDAR frame at the stamp, deskewed, within the map's range, one a voxel.
-        points_read, points_dropped: valid points of the raw scan, and invalid ones that were left out.
-    """
-
-    stamp: float
-    points: FloatArray
+    stamp: float  # seconds
+    points: FloatArray  # (N, 3) in the LiDAR frame at the stamp, deskewed, within the map's range, one a voxel
+    # points_read, points_dropped: valid points of the raw scan, and invalid ones that were left out
     points_read: int
     points_dropped: int
 

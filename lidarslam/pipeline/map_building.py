@@ -17,37 +17,23 @@ from mapping.slides.slides import SlideCheck
 
 @dataclass(frozen=True, eq=False)
 class PendingScan:
-    """A scan on its way into the global map.
+    """A scan on its way into the global map."""
 
-    Attributes:
-        number: its index in the run, from 0.
-        thinned: its points within the map's range, one a voxel, as read.
-        motion: the motion it was deskewed with.
-        points: (N, 3) of those, deskewed, in the LiDAR frame at the stamp.
-        T_world_lidar: (4, 4).
-    """
-
-    number: int
-    thinned: Scan
-    motion: SweepMotion
-    points: FloatArray
-    T_world_lidar: FloatArray
+    number: int  # its index in the run, from 0
+    thinned: Scan  # its points within the map's range, one a voxel, as read
+    motion: SweepMotion  # the motion it was deskewed with
+    points: FloatArray  # (N, 3) of those, deskewed, in the LiDAR frame at the stamp
+    T_world_lidar: FloatArray  # (4, 4)
 
 
 class MapBuilder(Stateful):
-    """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration.
+    """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration."""
 
-    Attributes:
-        voxel_size_m: of the map; derived from the first scan with points unless it is configured, None until then.
-        global_map: None until a scan was added.
-        views: range images of some scans, for the removal of moving objects.
-        slides: pairs of scans, for the detection of slips.
-    """
-
+    # of the map; derived from the first scan with points unless it is configured, None until then
     voxel_size_m: float | None
-    global_map: GlobalMap | None
-    views: Views
-    slides: SlideCheck
+    global_map: GlobalMap | None  # None until a scan was added
+    views: Views  # range images of some scans, for the removal of moving objects
+    slides: SlideCheck  # pairs of scans, for the detection of slips
     _pending: PendingScan | None
     _scans: int
 

@@ -22,19 +22,12 @@ if TYPE_CHECKING:  # GTSAM takes a while to load
 
 @dataclass(frozen=True)
 class LoopReport:
-    """A loop closure in the summary.
+    """A loop closure in the summary."""
 
-    Attributes:
-        closure: between keyframes.
-        accepted: whether it is in the graph: an outlier of the optimisation is not.
-        scans: which of their recordings, the second the later one.
-        recordings: which, from 1; None where there is one only.
-    """
-
-    closure: LoopClosure
-    accepted: bool
-    scans: tuple[int, int]
-    recordings: tuple[int, int] | None = None
+    closure: LoopClosure  # between keyframes
+    accepted: bool  # whether it is in the graph: an outlier of the optimisation is not
+    scans: tuple[int, int]  # which of their recordings, the second the later one
+    recordings: tuple[int, int] | None = None  # which, from 1; None where there is one only
 
     def to_json(self) -> dict[str, Any]:
         """An entry of summary.json."""
@@ -58,24 +51,16 @@ class LoopReport:
 
 @dataclass(frozen=True, eq=False)
 class GraphOutcome:
-    """A run, or several connected ones, corrected by the graph.
+    """A run, or several connected ones, corrected by the graph."""
 
-    Attributes:
-        T_world_lidar: (M, 4, 4) corrected poses of all scans.
-        global_map: drawn anew.
-        keyframe_poses, edges: (K, 4, 4) and the relative poses between them, for pose_graph.g2o.
-        loops: accepted and rejected.
-        largest_correction_m: by how much a scan moved; a move into the frame of another run does not count.
-        keyframe_ms: wall time of each keyframe, on a thread of its own.
-    """
-
-    T_world_lidar: FloatArray
-    global_map: GlobalMap
+    T_world_lidar: FloatArray  # (M, 4, 4) corrected poses of all scans
+    global_map: GlobalMap  # drawn anew
+    # keyframe_poses, edges: (K, 4, 4) and the relative poses between them, for pose_graph.g2o
     keyframe_poses: FloatArray
     edges: tuple[RelativePose, ...]
-    loops: tuple[LoopReport, ...]
-    largest_correction_m: float
-    keyframe_ms: tuple[float, ...]
+    loops: tuple[LoopReport, ...]  # accepted and rejected
+    largest_correction_m: float  # by how much a scan moved; a move into the frame of another run does not count
+    keyframe_ms: tuple[float, ...]  # wall time of each keyframe, on a thread of its own
 
 
 def begin_graph(config: Config, directory: Path | None = None, file: Path | None = None) -> "SlamGraph | None":

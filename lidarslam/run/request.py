@@ -11,33 +11,21 @@ from lidarslam.viewer.viewer import RerunMode
 
 @dataclass(frozen=True)
 class RunRequest:
-    """Source, configuration and destination of a run.
+    """Source, configuration and destination of a run."""
 
-    Attributes:
-        source: the recording.
-        out: the run directory.
-        config: of the computation.
-        start, stop, step: which scans, as in `range`.
-        prior: TUM file of an external odometry, for `odometry.method: external`.
-        rerun: no Rerun recording, one in the run directory, or that and a window.
-        pcd: whether the map is written as .pcd too.
-        overwrite: whether an earlier run in `out` is replaced.
-        resume: whether the run in `out`, which was killed or stopped, is continued.
-        resumable: whether checkpoints are saved.
-    """
-
-    source: Path
-    out: Path
-    config: Config
+    source: Path  # the recording
+    out: Path  # the run directory
+    config: Config  # of the computation
+    # start, stop, step: which scans, as in `range`
     start: int = 0
     stop: int | None = None
     step: int = 1
-    prior: Path | None = None
-    rerun: RerunMode = "off"
-    pcd: bool = False
-    overwrite: bool = False
-    resume: bool = False
-    resumable: bool = True
+    prior: Path | None = None  # TUM file of an external odometry, for `odometry.method: external`
+    rerun: RerunMode = "off"  # no Rerun recording, one in the run directory, or that and a window
+    pcd: bool = False  # whether the map is written as .pcd too
+    overwrite: bool = False  # whether an earlier run in `out` is replaced
+    resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
+    resumable: bool = True  # whether checkpoints are saved
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:

@@ -23,31 +23,21 @@ from mapping.slides.slides import find_contradictions
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """The outcome of a run.
+    """The outcome of a run."""
 
-    Attributes:
-        summary: the run in numbers.
-        metrics: its errors; None without ground truth.
-        stopped: why it ended before its last scan, None when it did not.
-    """
-
-    summary: RunSummary
-    metrics: TrajectoryMetrics | None
-    stopped: str | None = None
+    summary: RunSummary  # the run in numbers
+    metrics: TrajectoryMetrics | None  # its errors; None without ground truth
+    stopped: str | None = None  # why it ended before its last scan, None when it did not
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnMap:
-    """The final map.
+    """The final map."""
 
-    Attributes:
-        cloud, voxel_size_m: its points, one in each voxel; None when no scan was added.
-        moved: number of points that were removed as moving objects.
-    """
-
+    # cloud, voxel_size_m: its points, one in each voxel; None when no scan was added
     cloud: PointCloud | None
     voxel_size_m: float | None
-    moved: int = 0
+    moved: int = 0  # number of points that were removed as moving objects
 
 
 def final_map(tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig) -> DrawnMap:

@@ -46,15 +46,10 @@ _ROW = np.dtype(
 
 
 class ScanLog(Stateful):
-    """The scans of a run so far; no points.
+    """The scans of a run so far; no points."""
 
-    Attributes:
-        messages: of each scan.
-        warnings: sentences for the summary.
-    """
-
-    messages: list[str]
-    warnings: list[str]
+    messages: list[str]  # of each scan
+    warnings: list[str]  # sentences for the summary
     _degenerate: list[str]
 
     def __init__(self) -> None:

@@ -48,20 +48,14 @@ class LostStretch:
 
 @dataclass(frozen=True)
 class GraphSummary:
-    """The pose graph of a run.
+    """The pose graph of a run."""
 
-    Attributes:
-        keyframes, edges: how many.
-        loops: accepted loop closures, and rejected candidates.
-        largest_correction_m: by how much the graph moved a scan.
-        ms_per_keyframe: on the thread of the graph; None when there was no keyframe.
-    """
-
+    # keyframes, edges: how many
     keyframes: int
     edges: int
-    loops: tuple[LoopReport, ...]
-    largest_correction_m: float
-    ms_per_keyframe: Milliseconds | None
+    loops: tuple[LoopReport, ...]  # accepted loop closures, and rejected candidates
+    largest_correction_m: float  # by how much the graph moved a scan
+    ms_per_keyframe: Milliseconds | None  # on the thread of the graph; None when there was no keyframe
 
     @classmethod
     def of(cls, closed: GraphOutcome) -> "GraphSummary":
@@ -86,18 +80,13 @@ class GraphSummary:
 
 @dataclass(frozen=True)
 class WrittenMap:
-    """The map as it was written.
+    """The map as it was written."""
 
-    Attributes:
-        points, voxel_size_m: number of points and edge of a voxel; None without a map.
-        moved: number of points that were removed as moving objects.
-        entropy: mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed.
-    """
-
+    # points, voxel_size_m: number of points and edge of a voxel; None without a map
     points: int
     voxel_size_m: float | None
-    moved: int
-    entropy: float | None = None
+    moved: int  # number of points that were removed as moving objects
+    entropy: float | None = None  # mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed
 
 
 @dataclass(frozen=True)

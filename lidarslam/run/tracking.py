@@ -39,27 +39,18 @@ Progress = Callable[[int, int, ScanResult], None]
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """A recording after the pipeline.
+    """A recording after the pipeline."""
 
-    Attributes:
-        recording, truth, log: the recording, its ground truth, its scans.
-        asked: number of scans that were asked for.
-        faults: what was left out of them, and what is wrong with them.
-        global_map: of the poses before loop closure; None when no scan was added.
-        views: range images of some scans, for the removal of moving objects.
-        slides: pairs of scans, for the detection of slips.
-        error: what ended it before its last scan, None when nothing did.
-    """
-
+    # recording, truth, log: the recording, its ground truth, its scans
     recording: Recording
     truth: Trajectory | None
     log: ScanLog
-    asked: int
-    faults: Faults
-    global_map: GlobalMap | None
-    views: Views
-    slides: PairTests
-    error: InputError | KeyboardInterrupt | None
+    asked: int  # number of scans that were asked for
+    faults: Faults  # what was left out of them, and what is wrong with them
+    global_map: GlobalMap | None  # of the poses before loop closure; None when no scan was added
+    views: Views  # range images of some scans, for the removal of moving objects
+    slides: PairTests  # pairs of scans, for the detection of slips
+    error: InputError | KeyboardInterrupt | None  # what ended it before its last scan, None when nothing did
 
     @property
     def stopped(self) -> str | None:

@@ -29,21 +29,13 @@ _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A run as it is viewed.
+    """A run as it is viewed."""
 
-    Attributes:
-        name: of its directory.
-        trajectory: the final poses.
-        lost: (N,) which scans were lost.
-        map_points: (M, 3) in the world, none when the map is missing.
-        loops: (L, 2) pairs of scans between which loops were closed.
-    """
-
-    name: str
-    trajectory: Trajectory
-    lost: NDArray[np.bool_]
-    map_points: FloatArray
-    loops: NDArray[np.intp]
+    name: str  # of its directory
+    trajectory: Trajectory  # the final poses
+    lost: NDArray[np.bool_]  # (N,) which scans were lost
+    map_points: FloatArray  # (M, 3) in the world, none when the map is missing
+    loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
 
 
 def load_run(path: Path) -> FinishedRun:

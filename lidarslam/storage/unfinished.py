@@ -22,17 +22,11 @@ Standing = Literal["at work", "stopped"]
 
 @dataclass(frozen=True)
 class About:
-    """Which run is unfinished; the content of run.json.
+    """Which run is unfinished; the content of run.json."""
 
-    Attributes:
-        description: everything that decides what it computes.
-        standing: at work, or stopped with its results so far written.
-        resumed_after: how many scans were done each time it was resumed.
-    """
-
-    description: dict[str, Any]
-    standing: Standing = "at work"
-    resumed_after: tuple[int, ...] = ()
+    description: dict[str, Any]  # everything that decides what it computes
+    standing: Standing = "at work"  # at work, or stopped with its results so far written
+    resumed_after: tuple[int, ...] = ()  # how many scans were done each time it was resumed
 
     @classmethod
     def read(cls, run: Path) -> "About | None":

@@ -35,19 +35,13 @@ Counter = Callable[[int], None]
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Consecutive scans of a recording that is opened when it is needed.
+    """Consecutive scans of a recording that is opened when it is needed."""
 
-    Attributes:
-        name: of the recording.
-        identity: differs from that of any other recording, and of itself before it was changed; values that JSON can
-            hold.
-        open: gives its scans.
-        first, stop: which of them, as in `range`.
-    """
-
-    name: str
+    name: str  # of the recording
+    # differs from that of any other recording, and of itself before it was changed; values that JSON can hold
     identity: dict[str, Any]
-    open: Callable[[], ScanSequence]
+    open: Callable[[], ScanSequence]  # gives its scans
+    # first, stop: which of them, as in `range`
     first: int
     stop: int
 

@@ -15,21 +15,13 @@ _NETWORK, _OPTIMIZER = "network/", "optimizer/"
 
 @dataclass
 class Progress:
-    """The state beside weights and moments.
+    """The state beside weights and moments."""
 
-    Attributes:
-        step: how many steps are done.
-        best: the lowest score of a validation so far, None before the first.
-        sums: of each part of the loss since the last line of the log.
-        counted: over how many steps.
-        data: digest of the recordings.
-    """
-
-    step: int = 0
-    best: float | None = None
-    sums: dict[str, float] = field(default_factory=dict)
-    counted: int = 0
-    data: str = ""
+    step: int = 0  # how many steps are done
+    best: float | None = None  # the lowest score of a validation so far, None before the first
+    sums: dict[str, float] = field(default_factory=dict)  # of each part of the loss since the last line of the log
+    counted: int = 0  # over how many steps
+    data: str = ""  # digest of the recordings
 
 
 def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:

@@ -31,27 +31,16 @@ from odometry.training.training import Validation, make_optimizer
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """A training.
+    """A training."""
 
-    Attributes:
-        sources: recordings; may be none where the configuration names simulated ones.
-        out: the directory of the training.
-        config: how it is trained.
-        start_from: weights to begin with instead of random ones.
-        device: where to compute.
-        prepared: where prepared recordings are kept; None: in `out`.
-        resume: go on with the training in `out`.
-        overwrite: replace it.
-    """
-
-    sources: tuple[Path, ...]
-    out: Path
-    config: TrainConfig
-    start_from: Path | None = None
-    device: DeviceName = "auto"
-    prepared: Path | None = None
-    resume: bool = False
-    overwrite: bool = False
+    sources: tuple[Path, ...]  # recordings; may be none where the configuration names simulated ones
+    out: Path  # the directory of the training
+    config: TrainConfig  # how it is trained
+    start_from: Path | None = None  # weights to begin with instead of random ones
+    device: DeviceName = "auto"  # where to compute
+    prepared: Path | None = None  # where prepared recordings are kept; None: in `out`
+    resume: bool = False  # go on with the training in `out`
+    overwrite: bool = False  # replace it
 
 
 def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:

@@ -24,16 +24,11 @@ _SUFFIXES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a cloud is looked at from.
+    """Where a cloud is looked at from."""
 
-    Attributes:
-        azimuth_deg: direction the camera looks from, counter-clockwise from x.
-        elevation_deg: how far above the horizon; 90 looks straight down.
-        width, height: of the picture, pixels.
-    """
-
-    azimuth_deg: float = -120.0
-    elevation_deg: float = 40.0
+    azimuth_deg: float = -120.0  # direction the camera looks from, counter-clockwise from x
+    elevation_deg: float = 40.0  # how far above the horizon; 90 looks straight down
+    # width, height: of the picture, pixels
     width: int = 1600
     height: int = 900
 

@@ -32,15 +32,10 @@ def means_points(means: VoxelMeans) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """A map or a part of it.
+    """A map or a part of it."""
 
-    Attributes:
-        points: (N, 3) float64, metres, in the world.
-        normals: (N, 3) float64, unit length, towards the side it was seen from.
-    """
-
-    points: FloatArray
-    normals: FloatArray
+    points: FloatArray  # (N, 3) float64, metres, in the world
+    normals: FloatArray  # (N, 3) float64, unit length, towards the side it was seen from
 
     def __len__(self) -> int:
         return len(self.points)

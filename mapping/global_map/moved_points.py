@@ -36,18 +36,13 @@ _LEAST_REACH_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class PlacedViews:
-    """Range images with poses.
+    """Range images with poses."""
 
-    Attributes:
-        images: (V, rows, columns) float32, the nearest range in each pixel, 0 where there is none.
-        grids: (V, 3) the elevation of the centre of row 0, radians; rows a radian; and the distance from the centre of
-            a row, in rows, up to which there are beams.
-        T_world_lidar: (V, 4, 4).
-    """
-
-    images: NDArray[np.float32]
+    images: NDArray[np.float32]  # (V, rows, columns) float32, the nearest range in each pixel, 0 where there is none
+    # (V, 3) the elevation of the centre of row 0, radians; rows a radian; and the distance from the centre of a row, in
+    # rows, up to which there are beams
     grids: FloatArray
-    T_world_lidar: FloatArray
+    T_world_lidar: FloatArray  # (V, 4, 4)
 
     def __len__(self) -> int:
         return len(self.images)

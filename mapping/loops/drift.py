@@ -20,18 +20,12 @@ _LEAST_TRANSLATION_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The present estimates of all keyframes.
+    """The present estimates of all keyframes."""
 
-    Attributes:
-        T_world_lidar: (K, 4, 4).
-        way_m: (K,) path length from the recording's start.
-        segment: (K,) stretch of continuous tracking; the drift model holds within one.
-        drift_rates: standard deviations of attitude and position for each metre of the way, radians and metres.
-    """
-
-    T_world_lidar: FloatArray
-    way_m: FloatArray
-    segment: NDArray[np.int64]
+    T_world_lidar: FloatArray  # (K, 4, 4)
+    way_m: FloatArray  # (K,) path length from the recording's start
+    segment: NDArray[np.int64]  # (K,) stretch of continuous tracking; the drift model holds within one
+    # standard deviations of attitude and position for each metre of the way, radians and metres
     drift_rates: tuple[float, float]
 
     def __post_init__(self) -> None:

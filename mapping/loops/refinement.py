@@ -39,20 +39,14 @@ _CORRELATION = 2.0 * CORRELATION
 
 @dataclass(frozen=True, eq=False)
 class DenseSubmap:
-    """All points around a keyframe and planes through some of them, in its LiDAR frame.
+    """All points around a keyframe and planes through some of them, in its LiDAR frame."""
 
-    Attributes:
-        points: (N, 3).
-        tree: of the points.
-        centroids, normals: (M, 3) of the planes.
-        cell_m: the size of detail that suits the scene.
-    """
-
-    points: FloatArray
-    tree: cKDTree
+    points: FloatArray  # (N, 3)
+    tree: cKDTree  # of the points
+    # centroids, normals: (M, 3) of the planes
     centroids: FloatArray
     normals: FloatArray
-    cell_m: float
+    cell_m: float  # the size of detail that suits the scene
 
     @classmethod
     def join(cls, submaps: Sequence[tuple[FloatArray, FloatArray]], max_range_m: float, cell_m: float) -> "DenseSubmap":

@@ -29,28 +29,18 @@ GUESS_SIGMAS = np.array([0.2] * 3 + [2.0] * 3)
 
 @dataclass(frozen=True, eq=False)
 class SubmapCloud:
-    """A sparse submap united with its neighbours, in its keyframe's LiDAR frame; only points on planes and lines.
+    """A sparse submap united with its neighbours, in its keyframe's LiDAR frame; only points on planes and lines."""
 
-    Attributes:
-        submap: the keyframe's own.
-        points, axes: (N, 3).
-        tilt: (N,).
-        is_line: (N,).
-        ahead_m: (N,) way from the keyframe to that which a point is of, where the drifting estimates place it.
-        drift_rates: standard deviations of that drift for each metre, radians and metres.
-        middle_m: way on which a submap is drawn after its keyframe, on average.
-        tree: of the points.
-    """
-
-    submap: SparseSubmap
+    submap: SparseSubmap  # the keyframe's own
+    # points, axes: (N, 3)
     points: FloatArray
     axes: FloatArray
-    tilt: FloatArray
-    is_line: NDArray[np.bool_]
-    ahead_m: FloatArray
-    drift_rates: tuple[float, float]
-    middle_m: float
-    tree: cKDTree
+    tilt: FloatArray  # (N,)
+    is_line: NDArray[np.bool_]  # (N,)
+    ahead_m: FloatArray  # (N,) way from the keyframe to that which a point is of, where the drifting estimates place it
+    drift_rates: tuple[float, float]  # standard deviations of that drift for each metre, radians and metres
+    middle_m: float  # way on which a submap is drawn after its keyframe, on average
+    tree: cKDTree  # of the points
 
     @classmethod
     def join(
@@ -82,25 +72,15 @@ class SubmapCloud:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Residuals of points to planes, one each, and to lines, two each.
+    """Residuals of points to planes, one each, and to lines, two each."""
 
-    Attributes:
-        points: (M, 3) of the source, in its frame.
-        normals: (M, 3) directions of the residuals, in the source's frame.
-        residuals: (M,).
-        tilt: (M,) of the target's axes.
-        noise_m: (M,).
-        ahead_m: (M, 2) of the target's and the source's points.
-        drift_rates: as in `SubmapCloud`.
-    """
-
-    points: FloatArray
-    normals: FloatArray
-    residuals: FloatArray
-    tilt: FloatArray
-    noise_m: FloatArray
-    ahead_m: FloatArray
-    drift_rates: tuple[float, float]
+    points: FloatArray  # (M, 3) of the source, in its frame
+    normals: FloatArray  # (M, 3) directions of the residuals, in the source's frame
+    residuals: FloatArray  # (M,)
+    tilt: FloatArray  # (M,) of the target's axes
+    noise_m: FloatArray  # (M,)
+    ahead_m: FloatArray  # (M, 2) of the target's and the source's points
+    drift_rates: tuple[float, float]  # as in `SubmapCloud`
 
     @property
     def weights(self) -> FloatArray:

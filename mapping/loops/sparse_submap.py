@@ -29,26 +29,17 @@ _LARGEST_TILT = np.cos(np.deg2rad(45.0))
 
 @dataclass(frozen=True, eq=False)
 class SparseSubmap:
-    """A thinned submap, about 55 kB, in its keyframe's LiDAR frame.
+    """A thinned submap, about 55 kB, in its keyframe's LiDAR frame."""
 
-    Attributes:
-        points: (N, 3) float32, thinned.
-        axes: (N, 3) float16, of planes the normals, towards the sensor, of lines the directions.
-        tilt: (N,) float16, standard deviation of the axes, radians.
-        kinds: (N,) uint8, `PLANE`, `LINE` or 0 for neither.
-        range_image: (azimuth, elevation) float16, the nearest range seen in each direction; 0 where nothing was.
-        range_m: the median range.
-        cell_m: the size of detail that suits it.
-        R_level_lidar: (3, 3) that stands the sensor upright: "up", or if it hangs upside down "down", becomes z.
-    """
-
-    points: NDArray[np.float32]
-    axes: NDArray[np.float16]
-    tilt: NDArray[np.float16]
-    kinds: NDArray[np.uint8]
+    points: NDArray[np.float32]  # (N, 3) float32, thinned
+    axes: NDArray[np.float16]  # (N, 3) float16, of planes the normals, towards the sensor, of lines the directions
+    tilt: NDArray[np.float16]  # (N,) float16, standard deviation of the axes, radians
+    kinds: NDArray[np.uint8]  # (N,) uint8, `PLANE`, `LINE` or 0 for neither
+    # (azimuth, elevation) float16, the nearest range seen in each direction; 0 where nothing was
     range_image: NDArray[np.float16]
-    range_m: float
-    cell_m: float
+    range_m: float  # the median range
+    cell_m: float  # the size of detail that suits it
+    # (3, 3) that stands the sensor upright: "up", or if it hangs upside down "down", becomes z
     R_level_lidar: FloatArray
 
     def __len__(self) -> int:

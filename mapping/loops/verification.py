@@ -46,27 +46,17 @@ _MAX_SIGMA_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """A registered candidate.
+    """A registered candidate."""
 
-    Attributes:
-        T_target_source: (4, 4).
-        covariance: (6, 6) of xi in `T_true = T_target_source @ exp(xi)`; that of the guess along degenerate directions.
-        overlap: inliers among the points that either side sees of the other; the worse side.
-        information: the same, weighed by information on the direction of translation that fares worst.
-        residual_m: root mean square residual of the inliers.
-        inlier_ratio: inliers among the source's points.
-        inliers: their number.
-        degenerate: names of the degenerate directions of motion.
-    """
-
-    T_target_source: FloatArray
+    T_target_source: FloatArray  # (4, 4)
+    # (6, 6) of xi in `T_true = T_target_source @ exp(xi)`; that of the guess along degenerate directions
     covariance: FloatArray
-    overlap: float
-    information: float
-    residual_m: float
-    inlier_ratio: float
-    inliers: int
-    degenerate: tuple[str, ...]
+    overlap: float  # inliers among the points that either side sees of the other; the worse side
+    information: float  # the same, weighed by information on the direction of translation that fares worst
+    residual_m: float  # root mean square residual of the inliers
+    inlier_ratio: float  # inliers among the source's points
+    inliers: int  # their number
+    degenerate: tuple[str, ...]  # names of the degenerate directions of motion
 
     def objection(self, min_overlap: float) -> str:
         """Why it is rejected; empty when it is not."""

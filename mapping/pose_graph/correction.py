@@ -14,27 +14,16 @@ _STILL_M = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """The optimised graph.
+    """The optimised graph."""
 
-    Attributes:
-        T_world_lidar: (M, 4, 4) of all scans, one recording's after the other's.
-        keyframe_scans: (K,) the scans that are keyframes.
-        keyframe_poses: (K, 4, 4) T_world_lidar.
-        closures: loop closures, rejected ones too.
-        inliers: for each closure, whether the optimiser kept it.
-        edges: between keyframes, outlier closures left out.
-        first_scans: (R,) where the scans of each recording begin.
-        frames: (R,) the first recording of each one's connected component, in whose world it is.
-    """
-
-    T_world_lidar: FloatArray
-    keyframe_scans: NDArray[np.intp]
-    keyframe_poses: FloatArray
-    closures: tuple[LoopClosure, ...]
-    inliers: tuple[bool, ...]
-    edges: tuple[RelativePose, ...]
-    first_scans: NDArray[np.intp]
-    frames: NDArray[np.intp]
+    T_world_lidar: FloatArray  # (M, 4, 4) of all scans, one recording's after the other's
+    keyframe_scans: NDArray[np.intp]  # (K,) the scans that are keyframes
+    keyframe_poses: FloatArray  # (K, 4, 4) T_world_lidar
+    closures: tuple[LoopClosure, ...]  # loop closures, rejected ones too
+    inliers: tuple[bool, ...]  # for each closure, whether the optimiser kept it
+    edges: tuple[RelativePose, ...]  # between keyframes, outlier closures left out
+    first_scans: NDArray[np.intp]  # (R,) where the scans of each recording begin
+    frames: NDArray[np.intp]  # (R,) the first recording of each one's connected component, in whose world it is
 
     @property
     def keyframe_recordings(self) -> NDArray[np.intp]:

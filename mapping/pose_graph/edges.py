@@ -26,19 +26,12 @@ _ODOMETRY_CAUTION = 10.0
 
 @dataclass(frozen=True, eq=False)
 class MotionSinceKeyframe:
-    """The odometry's motion composed since the last keyframe.
+    """The odometry's motion composed since the last keyframe."""
 
-    Attributes:
-        T_keyframe_lidar: (4, 4); None once a scan had none.
-        covariance: (6, 6) of it, rotation first.
-        length_m: path length.
-        lost: whether tracking was lost on the way.
-    """
-
-    T_keyframe_lidar: FloatArray | None
-    covariance: FloatArray
-    length_m: float = 0.0
-    lost: bool = False
+    T_keyframe_lidar: FloatArray | None  # (4, 4); None once a scan had none
+    covariance: FloatArray  # (6, 6) of it, rotation first
+    length_m: float = 0.0  # path length
+    lost: bool = False  # whether tracking was lost on the way
 
     @classmethod
     def none(cls) -> "MotionSinceKeyframe":

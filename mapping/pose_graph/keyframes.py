@@ -22,18 +22,12 @@ _COMPARED_POINTS = 1500
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A keyframe of the pose graph.
+    """A keyframe of the pose graph."""
 
-    Attributes:
-        scan: which of all scans.
-        segment: stretch of continuous tracking, across which no drift model holds.
-        path_m: path length from the recording's start.
-        covariance: (6, 6) of its registration to the map, rotation first; None when it was not registered.
-    """
-
-    scan: int
-    segment: int
-    path_m: float
+    scan: int  # which of all scans
+    segment: int  # stretch of continuous tracking, across which no drift model holds
+    path_m: float  # path length from the recording's start
+    # (6, 6) of its registration to the map, rotation first; None when it was not registered
     covariance: FloatArray | None
 
 

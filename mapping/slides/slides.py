@@ -57,21 +57,13 @@ class _Candidate:
 
 @dataclass(frozen=True, eq=False)
 class PairTests:
-    """Tests of pairs of scans along a direction, a row each.
+    """Tests of pairs of scans along a direction, a row each."""
 
-    Attributes:
-        numbers: (P, 2) of the scans.
-        directions: (P, 3) unit vectors in the first one's frame.
-        translations: (P, 3) of the second in the first one's frame, at the tested poses.
-        peaks: (P, 2) the shift with most votes, metres, and its votes.
-        near: (P, 41) votes for the shifts around zero.
-    """
-
-    numbers: FloatArray
-    directions: FloatArray
-    translations: FloatArray
-    peaks: FloatArray
-    near: FloatArray
+    numbers: FloatArray  # (P, 2) of the scans
+    directions: FloatArray  # (P, 3) unit vectors in the first one's frame
+    translations: FloatArray  # (P, 3) of the second in the first one's frame, at the tested poses
+    peaks: FloatArray  # (P, 2) the shift with most votes, metres, and its votes
+    near: FloatArray  # (P, 41) votes for the shifts around zero
 
     @classmethod
     def of(cls, rows: FloatArray) -> "PairTests":
@@ -96,21 +88,16 @@ class PairTests:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A stretch of scans whose surfaces contradict its poses.
+    """A stretch of scans whose surfaces contradict its poses."""
 
-    Attributes:
-        first, last: kept scans at its ends.
-        shift_m: shift of the later scans along the way that the clearest pair votes for.
-        votes, votes_at_pose: for that shift, and for the poses of the run.
-        pairs: number of contradicting pairs.
-    """
-
+    # first, last: kept scans at its ends
     first: int
     last: int
-    shift_m: float
+    shift_m: float  # shift of the later scans along the way that the clearest pair votes for
+    # votes, votes_at_pose: for that shift, and for the poses of the run
     votes: float
     votes_at_pose: float
-    pairs: int
+    pairs: int  # number of contradicting pairs
 
 
 class SlideCheck(Stateful):

@@ -38,24 +38,16 @@ _MOST_POINTS = 60.0
 
 
 class Cells(NamedTuple):
-    """The arrays of a grid of M cells.
+    """The arrays of a grid of M cells."""
 
-    Attributes:
-        cell_m: edge of a cell.
-        bits: binary logarithm of the number of slots.
-        table_keys, table_rows: of the hash.
-        keys: (M,) of the cells, by row.
-        others: (M,) row of each cell's other side, or `ABSENT`.
-        sums: (M, 15) moments.
-    """
-
-    cell_m: float
-    bits: int
+    cell_m: float  # edge of a cell
+    bits: int  # binary logarithm of the number of slots
+    # table_keys, table_rows: of the hash
     table_keys: Keys
     table_rows: Rows
-    keys: Keys
-    others: Rows
-    sums: Floats
+    keys: Keys  # (M,) of the cells, by row
+    others: Rows  # (M,) row of each cell's other side, or `ABSENT`
+    sums: Floats  # (M, 15) moments
 
 
 @compiled

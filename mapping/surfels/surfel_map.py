@@ -26,21 +26,13 @@ _LEVEL_COSINE = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """M residuals of points with surfaces, each along one direction.
+    """M residuals of points with surfaces, each along one direction."""
 
-    Attributes:
-        index: (M,) of the point.
-        points: (M, 3) on the surface, in the world.
-        normals: (M, 3) unit, in the world.
-        thickness_m: (M,) standard deviation of the surface along the normal.
-        tilt: (M,) standard deviation of the normal, radians.
-    """
-
-    index: NDArray[np.intp]
-    points: FloatArray
-    normals: FloatArray
-    thickness_m: FloatArray
-    tilt: FloatArray
+    index: NDArray[np.intp]  # (M,) of the point
+    points: FloatArray  # (M, 3) on the surface, in the world
+    normals: FloatArray  # (M, 3) unit, in the world
+    thickness_m: FloatArray  # (M,) standard deviation of the surface along the normal
+    tilt: FloatArray  # (M,) standard deviation of the normal, radians
 
     def __len__(self) -> int:
         return len(self.index)
@@ -58,15 +50,10 @@ class Correspondences:
 
 
 class SurfelMap(Stateful):
-    """Surfels within a radius of the sensor.
+    """Surfels within a radius of the sensor."""
 
-    Attributes:
-        cell_m: edge of the finest cells.
-        scans: number of inserted scans.
-    """
-
-    cell_m: float
-    scans: int
+    cell_m: float  # edge of the finest cells
+    scans: int  # number of inserted scans
     _radius_m: float
     _grids: list[SurfelGrid]
     _centre: Annotated[FloatArray, Shape(3)] | None

@@ -42,25 +42,15 @@ _DISPLACED_CELLS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """A registration attempt.
+    """A registration attempt."""
 
-    Attributes:
-        prediction: that the result is compared with.
-        surfel_map: that the scan was registered to.
-        registration: None where there were too few correspondences.
-        fit: of the scan to the map.
-        status: by the fit.
-        relocalised: whether it began elsewhere than at the prediction.
-        ambiguous: whether another displacement fits nearly as well while the velocity is unknown.
-    """
-
-    prediction: Prediction
-    surfel_map: SurfelMap
-    registration: Registration | None
-    fit: Fit
-    status: Status
-    relocalised: bool = False
-    ambiguous: bool = False
+    prediction: Prediction  # that the result is compared with
+    surfel_map: SurfelMap  # that the scan was registered to
+    registration: Registration | None  # None where there were too few correspondences
+    fit: Fit  # of the scan to the map
+    status: Status  # by the fit
+    relocalised: bool = False  # whether it began elsewhere than at the prediction
+    ambiguous: bool = False  # whether another displacement fits nearly as well while the velocity is unknown
 
     @property
     def is_plausible(self) -> bool:

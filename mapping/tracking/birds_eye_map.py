@@ -32,21 +32,13 @@ _MOST_CELLS = 512
 
 @dataclass(frozen=True, eq=False)
 class BirdsEyeMap:
-    """Image of the map from above, levelled.
+    """Image of the map from above, levelled."""
 
-    Attributes:
-        R_level_world: (3, 3) rotation that takes the vertical to z.
-        points: (M, 3) of the map, levelled.
-        corner: (2,) of the image, levelled.
-        cell_m: edge of a cell.
-        columns: (X, Y) image of the upright structure.
-    """
-
-    R_level_world: FloatArray
-    points: FloatArray
-    corner: FloatArray
-    cell_m: float
-    columns: FloatArray
+    R_level_world: FloatArray  # (3, 3) rotation that takes the vertical to z
+    points: FloatArray  # (M, 3) of the map, levelled
+    corner: FloatArray  # (2,) of the image, levelled
+    cell_m: float  # edge of a cell
+    columns: FloatArray  # (X, Y) image of the upright structure
 
     @classmethod
     def of(cls, points: FloatArray, up: FloatArray, cell_m: float) -> "BirdsEyeMap":

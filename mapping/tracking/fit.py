@@ -26,22 +26,16 @@ _RIDGE = 0.005
 
 @dataclass(frozen=True)
 class Fit:
-    """Fit of a scan to the map.
+    """Fit of a scan to the map."""
 
-    Attributes:
-        matched: points with a correspondence.
-        overlap: their share of all points.
-        residual_m: median distance of the matched points from their surfaces; None when there are none.
-        inlier_ratio: share of inliers among the matched points, the least of the world's axes by which the surfaces
-            are grouped: nearly everything fits the ground. None when there are none.
-        support: the inlier ratio of the points that constrain the least supported direction of translation: most points
-            fit wherever a scan slides along a street, the constraining ones do not. None when there are none.
-    """
-
-    matched: int
-    overlap: float
-    residual_m: float | None
+    matched: int  # points with a correspondence
+    overlap: float  # their share of all points
+    residual_m: float | None  # median distance of the matched points from their surfaces; None when there are none
+    # share of inliers among the matched points, the least of the world's axes by which the surfaces are grouped: nearly
+    # everything fits the ground. None when there are none.
     inlier_ratio: float | None
+    # the inlier ratio of the points that constrain the least supported direction of translation: most points fit
+    # wherever a scan slides along a street, the constraining ones do not. None when there are none.
     support: float | None = None
 
     @property

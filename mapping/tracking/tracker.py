@@ -39,29 +39,19 @@ _BETTER, _CLEARLY_BETTER = 1.05, 1.1
 
 @dataclass(frozen=True, eq=False)
 class MappedScan:
-    """Result of a scan.
+    """Result of a scan."""
 
-    Attributes:
-        state: pose at the stamp and velocity during the sweep, with their covariance.
-        T_world_predicted: (4, 4) predicted pose.
-        registered: whether the pose is that of a registration; else it is the predicted one.
-        status, message: tracking status, and its reason.
-        fit: to the map; None where the scan was not compared with it.
-        degenerate: names of the directions along which the prediction was kept.
-        iterations: of the registration.
-        added: whether the scan is good enough for the map, and was inserted.
-        is_connected: whether the sensor was tracked from the scan before; else it was relocalised, or only predicted.
-    """
-
-    state: MotionState
-    T_world_predicted: FloatArray
-    registered: bool
+    state: MotionState  # pose at the stamp and velocity during the sweep, with their covariance
+    T_world_predicted: FloatArray  # (4, 4) predicted pose
+    registered: bool  # whether the pose is that of a registration; else it is the predicted one
+    # status, message: tracking status, and its reason
     status: Status
     message: str = ""
-    fit: Fit | None = None
-    degenerate: tuple[str, ...] = ()
-    iterations: int = 0
-    added: bool = False
+    fit: Fit | None = None  # to the map; None where the scan was not compared with it
+    degenerate: tuple[str, ...] = ()  # names of the directions along which the prediction was kept
+    iterations: int = 0  # of the registration
+    added: bool = False  # whether the scan is good enough for the map, and was inserted
+    # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
     is_connected: bool = True
 
 

@@ -17,17 +17,11 @@ GIVE_UP_AFTER = 20
 
 
 class TrackingState(Stateful):
-    """Summary of the latest scans.
+    """Summary of the latest scans."""
 
-    Attributes:
-        lost_in_a_row: scans with points that could not be registered.
-        is_lost: whether the pose of the last scan is unknown.
-        velocity_known: whether the velocity of the last scan was estimated.
-    """
-
-    lost_in_a_row: int
-    is_lost: bool
-    velocity_known: bool
+    lost_in_a_row: int  # scans with points that could not be registered
+    is_lost: bool  # whether the pose of the last scan is unknown
+    velocity_known: bool  # whether the velocity of the last scan was estimated
     _was_degraded: bool
     _to_confirm: int
     _relocalised_s: float | None

@@ -53,51 +53,37 @@ NORMAL = Effort()
 
 @dataclass(frozen=True, eq=False)
 class InitialEstimate:
-    """Where alignment begins.
+    """Where alignment begins."""
 
-    Attributes:
-        T_prev_curr: (4, 4) between the middles of the sweeps.
-        information: (6, 6) inverse covariance, for a change from the left; None: it is only where to start from. It
-            counts along the directions of which the images have less.
-        change_information: (6, 6) that holds the change of velocity at the expected one; None: no more than usual.
-        sigmas: how much less likely it is than the first initial estimate, in standard deviations.
-    """
-
-    T_prev_curr: FloatArray
+    T_prev_curr: FloatArray  # (4, 4) between the middles of the sweeps
+    # (6, 6) inverse covariance, for a change from the left; None: it is only where to start from. It counts along the
+    # directions of which the images have less.
     information: FloatArray | None = None
+    # (6, 6) that holds the change of velocity at the expected one; None: no more than usual
     change_information: FloatArray | None = None
-    sigmas: float = 0.0
+    sigmas: float = 0.0  # how much less likely it is than the first initial estimate, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """An image aligned with another.
+    """An image aligned with another."""
 
-    Attributes:
-        T_prev_curr: (4, 4) from the middle of the current sweep to the middle of the previous one.
-        velocity_change: (6,) velocity in the middle of the current sweep above the mean between the two middles,
-            rotation first, in radians and metres a second; in the middle of the previous sweep it is as much below.
-        information: (6, 6) of the images alone, for a change of `T_prev_curr` from the left, rotation first, if points
-            scattered independently by 1 m about their planes; the change of velocity is marginalised.
-        prior_information: (6, 6) of the initial estimate, along the directions in which it counts.
-        inlier_share: of the points with a normal.
-        explained: ratio of the information of inliers to that of all points in view, along the direction of
-            translation where it is least. Most of a street looks the same a metre on, and a wrong motion has many
-            inliers; the points that constrain the motion are not among them. 1 where no point constrains it.
-        weakest: (3,) that direction, unit, in the previous frame.
-        residual_m: root mean square of the inliers.
-        inliers: how many.
-    """
-
-    T_prev_curr: FloatArray
+    T_prev_curr: FloatArray  # (4, 4) from the middle of the current sweep to the middle of the previous one
+    # (6,) velocity in the middle of the current sweep above the mean between the two middles, rotation first, in
+    # radians and metres a second; in the middle of the previous sweep it is as much below
     velocity_change: FloatArray
+    # (6, 6) of the images alone, for a change of `T_prev_curr` from the left, rotation first, if points scattered
+    # independently by 1 m about their planes; the change of velocity is marginalised
     information: FloatArray
-    prior_information: FloatArray
-    inlier_share: float
+    prior_information: FloatArray  # (6, 6) of the initial estimate, along the directions in which it counts
+    inlier_share: float  # of the points with a normal
+    # ratio of the information of inliers to that of all points in view, along the direction of translation where it is
+    # least. Most of a street looks the same a metre on, and a wrong motion has many inliers; the points that constrain
+    # the motion are not among them. 1 where no point constrains it.
     explained: float
-    weakest: FloatArray
-    residual_m: float
-    inliers: int
+    weakest: FloatArray  # (3,) that direction, unit, in the previous frame
+    residual_m: float  # root mean square of the inliers
+    inliers: int  # how many
 
 
 def align(start: InitialEstimate, sweeps: SweepPair, effort: Effort = NORMAL) -> Alignment:

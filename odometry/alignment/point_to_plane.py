@@ -22,23 +22,17 @@ FINE_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Sums over the inliers of a motion, which have residuals within twice the finest scale.
+    """Sums over the inliers of a motion, which have residuals within twice the finest scale."""
 
-    Attributes:
-        H: (12, 12) of the normal equations, each inlier with a weight of 1.
-        in_view, inlier: (3, 3) of the squares of normals in the previous frame: of all points in view, and of inliers.
-        share_in_view, inlier_share: of the points with a normal.
-        inliers: how many.
-        squared_residuals: their sum.
-    """
-
-    H: FloatArray
+    H: FloatArray  # (12, 12) of the normal equations, each inlier with a weight of 1
+    # in_view, inlier: (3, 3) of the squares of normals in the previous frame: of all points in view, and of inliers
     in_view: FloatArray
     inlier: FloatArray
+    # share_in_view, inlier_share: of the points with a normal
     share_in_view: float
     inlier_share: float
-    inliers: int
-    squared_residuals: float
+    inliers: int  # how many
+    squared_residuals: float  # their sum
 
 
 class PointToPlane:

@@ -24,21 +24,16 @@ _MOST_GRAZING = 0.2
 
 
 class Planes(NamedTuple):
-    """The image that points are projected into.
+    """The image that points are projected into."""
 
-    Attributes:
-        pixels: (H * W, 7) point, normal and seconds from the middle of the sweep, of each pixel.
-        height, width: H and W.
-        low, high: elevation of the centres of the first and the last row, radians.
-        rolling: whether any of the seconds is not zero.
-    """
-
-    pixels: Floats
+    pixels: Floats  # (H * W, 7) point, normal and seconds from the middle of the sweep, of each pixel
+    # height, width: H and W
     height: int
     width: int
+    # low, high: elevation of the centres of the first and the last row, radians
     low: float
     high: float
-    rolling: bool
+    rolling: bool  # whether any of the seconds is not zero
 
 
 class Motion(NamedTuple):
@@ -50,29 +45,21 @@ class Motion(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """A block of points and their correspondences, each (256,).
+    """A block of points and their correspondences, each (256,)."""
 
-    Attributes:
-        x, y, z: points in the frame of the previous sweep at the time of their pixel.
-        u, v, w: normals of the planes.
-        residuals: distances from the planes, metres.
-        offsets_s: seconds of point and pixel from the middles of their sweeps, added up.
-        pixels: flat indices.
-        in_view: whether the point falls into the image.
-        inlier: whether it is in view, near enough to its pixel, and turned like it.
-    """
-
+    # x, y, z: points in the frame of the previous sweep at the time of their pixel
     x: FloatArray
     y: FloatArray
     z: FloatArray
+    # u, v, w: normals of the planes
     u: FloatArray
     v: FloatArray
     w: FloatArray
-    residuals: FloatArray
-    offsets_s: FloatArray
-    pixels: NDArray[np.int64]
-    in_view: NDArray[np.bool_]
-    inlier: NDArray[np.bool_]
+    residuals: FloatArray  # distances from the planes, metres
+    offsets_s: FloatArray  # seconds of point and pixel from the middles of their sweeps, added up
+    pixels: NDArray[np.int64]  # flat indices
+    in_view: NDArray[np.bool_]  # whether the point falls into the image
+    inlier: NDArray[np.bool_]  # whether it is in view, near enough to its pixel, and turned like it
 
 
 @compiled

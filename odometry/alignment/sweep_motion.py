@@ -14,17 +14,11 @@ Twist = Annotated[FloatArray, Shape(6)]
 
 @dataclass(frozen=True, eq=False)
 class SweepMotion:
-    """Motion of constant acceleration between the middles of two sweeps.
+    """Motion of constant acceleration between the middles of two sweeps."""
 
-    Attributes:
-        velocity: (6,) mean, rotation first, in radians and metres a second.
-        velocity_change: (6,) velocity in the later middle above the mean, and in the earlier one below.
-        interval_s: from one middle to the other.
-    """
-
-    velocity: Twist
-    velocity_change: Twist
-    interval_s: float
+    velocity: Twist  # (6,) mean, rotation first, in radians and metres a second
+    velocity_change: Twist  # (6,) velocity in the later middle above the mean, and in the earlier one below
+    interval_s: float  # from one middle to the other
 
     def pose_after(self, seconds: float) -> FloatArray:
         """(4, 4) in the frame of the earlier middle, so long after it."""
@@ -33,18 +27,13 @@ class SweepMotion:
 
 @dataclass(frozen=True, eq=False)
 class SweepPair:
-    """A sweep and the one before it.
+    """A sweep and the one before it."""
 
-    Attributes:
-        current, previous: the sweeps; their images may differ in size.
-        interval_s: from the middle of the previous one to that of the current one.
-        last: the motion that ended in the middle of the previous one; None where unknown.
-    """
-
+    # current, previous: the sweeps; their images may differ in size
     current: SweepImages
     previous: SweepImages
-    interval_s: float
-    last: SweepMotion | None = None
+    interval_s: float  # from the middle of the previous one to that of the current one
+    last: SweepMotion | None = None  # the motion that ended in the middle of the previous one; None where unknown
 
 
 class StampInterpolator(Stateful):

@@ -30,24 +30,16 @@ _STRIDE = _BLOCK + 32
 
 
 class Patch(NamedTuple):
-    """The neighbourhood of a pixel, and when its points are a plane.
+    """The neighbourhood of a pixel, and when its points are a plane."""
 
-    Attributes:
-        rows, columns: how far it reaches up and down, and to the left and to the right.
-        gate_m: neighbours whose range differs by more are left out.
-        nearest_m: the nearest neighbour must be as close as this.
-        min_neighbours: points that are needed, the pixel's own included.
-        max_flatness: smallest eigenvalue of the scatter over the middle one, at most.
-        min_spread: middle eigenvalue over the largest one, at least.
-    """
-
+    # rows, columns: how far it reaches up and down, and to the left and to the right
     rows: int
     columns: int
-    gate_m: float
-    nearest_m: float = 1.0
-    min_neighbours: int = 6
-    max_flatness: float = 0.1
-    min_spread: float = 0.02
+    gate_m: float  # neighbours whose range differs by more are left out
+    nearest_m: float = 1.0  # the nearest neighbour must be as close as this
+    min_neighbours: int = 6  # points that are needed, the pixel's own included
+    max_flatness: float = 0.1  # smallest eigenvalue of the scatter over the middle one, at most
+    min_spread: float = 0.02  # middle eigenvalue over the largest one, at least
 
 
 PATCHES = (Patch(rows=1, columns=4, gate_m=0.5), Patch(rows=1, columns=8, gate_m=2.0))

@@ -32,17 +32,13 @@ _P0, _P1, _P2, _P3 = (
 class ImageGrid:
     """The pixels of a range image: rows by elevation from the lowest up, columns by azimuth, without a seam.
 
-    Attributes:
-        rows: H, 2 or more.
-        columns: W; column c covers azimuths from c to c + 1 times 2 pi / W.
-        elevation_low, elevation_high: elevations of the centres of rows 0 and H - 1, rad.
-
     Raises:
         ValueError: there are no pixels, or the elevations do not ascend.
     """
 
-    rows: int
-    columns: int
+    rows: int  # H, 2 or more
+    columns: int  # W; column c covers azimuths from c to c + 1 times 2 pi / W
+    # elevation_low, elevation_high: elevations of the centres of rows 0 and H - 1, rad
     elevation_low: float
     elevation_high: float
 
@@ -77,15 +73,10 @@ class ImageGrid:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A range image, and which points it shows.
+    """A range image, and which points it shows."""
 
-    Attributes:
-        image: (4, H, W) float32 of x, y, z and range, metres; zero where no point is.
-        index: (H, W) int64, the point in each pixel; -1 where there is none.
-    """
-
-    image: Floats
-    index: NDArray[np.int64]
+    image: Floats  # (4, H, W) float32 of x, y, z and range, metres; zero where no point is
+    index: NDArray[np.int64]  # (H, W) int64, the point in each pixel; -1 where there is none
 
 
 def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:

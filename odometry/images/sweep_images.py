@@ -26,18 +26,14 @@ _SEEN_COLUMNS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SweepImages:
-    """A sweep as images, float32.
+    """A sweep as images, float32."""
 
-    Attributes:
-        points: (3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
-        normals: (3, H, W) unit, zero where there is none.
-        offsets: (H, W) seconds from the middle of the sweep; all zero where unknown or already compensated.
-        low, high: elevation of the centres of the first and the last row, radians.
-    """
-
+    # (3, H, W) metres in the LiDAR frame at the time of each point; zero where empty
     points: Annotated[Floats, Shape(3, None, None)]
-    normals: Annotated[Floats, Shape(3, None, None)]
+    normals: Annotated[Floats, Shape(3, None, None)]  # (3, H, W) unit, zero where there is none
+    # (H, W) seconds from the middle of the sweep; all zero where unknown or already compensated
     offsets: Annotated[Floats, Shape(None, None)]
+    # low, high: elevation of the centres of the first and the last row, radians
     low: float
     high: float
 

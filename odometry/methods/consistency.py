@@ -36,17 +36,11 @@ _MAX_POINTS = 20_000
 
 @dataclass(frozen=True)
 class Consistency:
-    """How well a scan fits the previous one.
+    """How well a scan fits the previous one."""
 
-    Attributes:
-        residual_m: median point-to-plane distance; None with too few planes.
-        inlier_ratio: of the points that have a plane, 0 to 1; None likewise.
-        status: what the ratio means.
-    """
-
-    residual_m: float | None
-    inlier_ratio: float | None
-    status: Status
+    residual_m: float | None  # median point-to-plane distance; None with too few planes
+    inlier_ratio: float | None  # of the points that have a plane, 0 to 1; None likewise
+    status: Status  # what the ratio means
 
 
 class ConsistencyCheck(Stateful):

@@ -30,17 +30,11 @@ Graph = Callable[..., list[Floats]]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A motion that is likely by a network's scores.
+    """A motion that is likely by a network's scores."""
 
-    Attributes:
-        T_prev_curr: (4, 4).
-        covariance: (6, 6) of a change of it from the left, rotation first.
-        log_probability: natural logarithm; of all candidates of a pair together at most 0.
-    """
-
-    T_prev_curr: FloatArray
-    covariance: FloatArray
-    log_probability: float
+    T_prev_curr: FloatArray  # (4, 4)
+    covariance: FloatArray  # (6, 6) of a change of it from the left, rotation first
+    log_probability: float  # natural logarithm; of all candidates of a pair together at most 0
 
     def is_motion(self) -> bool:
         """Whether all of it is finite."""
@@ -53,17 +47,12 @@ _NO_MOTION = Candidate(np.full((4, 4), np.nan), np.full((6, 6), np.nan), 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """The features of a scan, to compare the next one with.
+    """The features of a scan, to compare the next one with."""
 
-    Attributes:
-        columns: (1, C, H', W') features of the range image.
-        spectrum: (F, CELLS, CELLS / 2 + 1) of the features seen from above.
-        heading: angle by which the scan was turned for these, radians. It follows the sensor's turns, so that each scan
-            has to be seen from above only once.
-    """
-
-    columns: Floats
-    spectrum: NDArray[np.complex64]
+    columns: Floats  # (1, C, H', W') features of the range image
+    spectrum: NDArray[np.complex64]  # (F, CELLS, CELLS / 2 + 1) of the features seen from above
+    # angle by which the scan was turned for these, radians. It follows the sensor's turns, so that each scan has to be
+    # seen from above only once.
     heading: float
 
 
@@ -78,19 +67,12 @@ class Search(Protocol):
 
 
 class CorrelationParts(NamedTuple):
-    """The parts of the network `correlation`.
+    """The parts of the network `correlation`."""
 
-    Attributes:
-        columns: points and normals (1, 3, H, W) -> features (1, C, H', W').
-        turns: features (1, C, H', W') of the previous and the current scan -> scores (1, W').
-        bird: grid (1, CHANNELS, CELLS, CELLS) -> features (1, F, CELLS, CELLS).
-        peaks: scores (1, W') and (1, SHIFTS, SHIFTS) -> turn (1,), radians; shift (1, 2), metres; log sigma (1, 6).
-    """
-
-    columns: Graph
-    turns: Graph
-    bird: Graph
-    peaks: Graph
+    columns: Graph  # points and normals (1, 3, H, W) -> features (1, C, H', W')
+    turns: Graph  # features (1, C, H', W') of the previous and the current scan -> scores (1, W')
+    bird: Graph  # grid (1, CHANNELS, CELLS, CELLS) -> features (1, F, CELLS, CELLS)
+    peaks: Graph  # scores (1, W') and (1, SHIFTS, SHIFTS) -> turn (1,), radians; shift (1, 2), metres; log sigma (1, 6)
 
 
 class CorrelationSearch:

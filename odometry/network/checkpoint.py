@@ -19,18 +19,12 @@ WEIGHTS = Kind("weights", version=1)
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A trained network.
+    """A trained network."""
 
-    Attributes:
-        network: which one.
-        images: size of its images.
-        weights: its parameters and buffers by name, finite.
-        about: what it was trained on and the like; values that JSON can hold.
-    """
-
-    network: NetworkConfig
-    images: ImageConfig
-    weights: dict[str, Tensor]
+    network: NetworkConfig  # which one
+    images: ImageConfig  # size of its images
+    weights: dict[str, Tensor]  # its parameters and buffers by name, finite
+    # what it was trained on and the like; values that JSON can hold
     about: dict[str, Any] = field(default_factory=dict)
 
 

@@ -8,37 +8,29 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class PairImages:
-    """The input of the networks for B pairs of scans.
+    """The input of the networks for B pairs of scans."""
 
-    Attributes:
-        previous, current: (B, 6, H, W) points and normals.
-        bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) seen from above, the current scan turned by about the
-            turn between the two; None for networks that do not look from above.
-    """
-
+    # previous, current: (B, 6, H, W) points and normals
     previous: Tensor
     current: Tensor
+    # bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) seen from above, the current scan turned by about the
+    # turn between the two; None for networks that do not look from above
     bird_previous: Tensor | None = None
     bird_current: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The output of a network for B pairs.
+    """The output of a network for B pairs."""
 
-    Attributes:
-        T_prev_curr: (B, 4, 4).
-        log_sigma: (B, 6) logarithm of the standard deviation along each direction of a change of `T_prev_curr` from the
-            left: rotation in radians, then translation in metres.
-        turn_scores: (B, S) log-likelihoods, up to a constant, of the turns about z by a whole number of feature
-            columns; (B, 0) where the network has none.
-        shift_scores: (B, SHIFTS, SHIFTS) the same of shifts by whole cells along y and x; (B, 0, 0) without.
-    """
-
-    T_prev_curr: Tensor
+    T_prev_curr: Tensor  # (B, 4, 4)
+    # (B, 6) logarithm of the standard deviation along each direction of a change of `T_prev_curr` from the left:
+    # rotation in radians, then translation in metres
     log_sigma: Tensor
+    # (B, S) log-likelihoods, up to a constant, of the turns about z by a whole number of feature columns; (B, 0) where
+    # the network has none
     turn_scores: Tensor
-    shift_scores: Tensor
+    shift_scores: Tensor  # (B, SHIFTS, SHIFTS) the same of shifts by whole cells along y and x; (B, 0, 0) without
 
 
 class PairNetwork(Protocol):

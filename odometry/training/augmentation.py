@@ -43,24 +43,19 @@ AUGMENTATION = Augmentation()
 
 @dataclass(frozen=True, eq=False)
 class PairBatch:
-    """B pairs of scans.
+    """B pairs of scans."""
 
-    Attributes:
-        previous, current: (B, 6, H, W) input of the network: points and normals of the raw sweeps.
-        previous_surfaces, current_surfaces: (B, 6, H, W) the same, compensated to the middle of each sweep; None
-            where the losses do not need them.
-        T_prev_curr: (B, 4, 4) pseudo-labels.
-        valid: (B,) whether these are reliable.
-        bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) both scans from above, the current one turned by about
-            the turn between the two; None where the network does not need them.
-    """
-
+    # previous, current: (B, 6, H, W) input of the network: points and normals of the raw sweeps
     previous: Tensor
     current: Tensor
+    # previous_surfaces, current_surfaces: (B, 6, H, W) the same, compensated to the middle of each sweep; None where
+    # the losses do not need them
     previous_surfaces: Tensor | None
     current_surfaces: Tensor | None
-    T_prev_curr: Tensor
-    valid: Tensor
+    T_prev_curr: Tensor  # (B, 4, 4) pseudo-labels
+    valid: Tensor  # (B,) whether these are reliable
+    # bird_previous, bird_current: (B, CHANNELS, CELLS, CELLS) both scans from above, the current one turned by about
+    # the turn between the two; None where the network does not need them
     bird_previous: Tensor | None = None
     bird_current: Tensor | None = None
 

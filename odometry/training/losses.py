@@ -20,34 +20,21 @@ _GATE_M, _HUBER_M = 1.0, 0.1
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Points of scans and the surfaces they lie on.
+    """Points of scans and the surfaces they lie on."""
 
-    Attributes:
-        points: (B, N, 3), metres, in the frame of each scan; zero where there is none. Finite everywhere.
-        normals: (B, N, 3), unit where valid. Finite everywhere.
-        valid: (B, N) bool, which points have a normal.
-    """
-
-    points: Tensor
-    normals: Tensor
-    valid: Tensor
+    points: Tensor  # (B, N, 3), metres, in the frame of each scan; zero where there is none. Finite everywhere.
+    normals: Tensor  # (B, N, 3), unit where valid. Finite everywhere.
+    valid: Tensor  # (B, N) bool, which points have a normal
 
 
 @dataclass(frozen=True, eq=False)
 class GeometricLoss:
-    """A loss and its parts, (B,) each; parts that are switched off are there, but not in the total.
+    """A loss and its parts, (B,) each; parts that are switched off are there, but not in the total."""
 
-    Attributes:
-        total: the objective.
-        point_to_plane: m^2 (also with the robust kernel).
-        plane_to_plane: no unit.
-        matched_share: correspondences, of the source points with a normal, 0 to 1.
-    """
-
-    total: Tensor
-    point_to_plane: Tensor
-    plane_to_plane: Tensor
-    matched_share: Tensor
+    total: Tensor  # the objective
+    point_to_plane: Tensor  # m^2 (also with the robust kernel)
+    plane_to_plane: Tensor  # no unit
+    matched_share: Tensor  # correspondences, of the source points with a normal, 0 to 1
 
 
 def geometric_loss(T_prev_curr: Tensor, source: Surfaces, target: Surfaces, config: LossConfig) -> GeometricLoss:

@@ -32,23 +32,14 @@ _SHORTEST_S = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PreparedRecording:
-    """N consecutive scans of one sensor, as images of the network's size.
+    """N consecutive scans of one sensor, as images of the network's size."""
 
-    Attributes:
-        points: (N, 3, H, W) metres in the LiDAR frame at the time of each point; zero where empty.
-        normals: (N, 3, H, W) unit, zero where there is none; they may be of half precision.
-        offsets: (N, H, W) seconds from the middle of the sweep, likewise; all zero where unknown.
-        interval_s: (N - 1,) from the middle of each sweep to the next.
-        T_prev_curr: (N - 1, 4, 4) pseudo-labels of the motions between the middles of sweeps.
-        valid: (N - 1,) whether they are reliable.
-    """
-
-    points: Tensor
-    normals: Tensor
-    offsets: Tensor
-    interval_s: Tensor
-    T_prev_curr: Tensor
-    valid: Tensor
+    points: Tensor  # (N, 3, H, W) metres in the LiDAR frame at the time of each point; zero where empty
+    normals: Tensor  # (N, 3, H, W) unit, zero where there is none; they may be of half precision
+    offsets: Tensor  # (N, H, W) seconds from the middle of the sweep, likewise; all zero where unknown
+    interval_s: Tensor  # (N - 1,) from the middle of each sweep to the next
+    T_prev_curr: Tensor  # (N - 1, 4, 4) pseudo-labels of the motions between the middles of sweeps
+    valid: Tensor  # (N - 1,) whether they are reliable
 
     def __len__(self) -> int:
         return len(self.points)

@@ -23,21 +23,16 @@ _WEIGHT_DECAY = 1e-3
 
 @dataclass(frozen=True)
 class Validation:
-    """Errors of a network against the pseudo-labels of recordings that it is not trained on.
+    """Errors of a network against the pseudo-labels of recordings that it is not trained on."""
 
-    Attributes:
-        rotation_rms_deg, translation_rms_m: over all valid pairs.
-        rotation_median_deg, translation_median_m: likewise.
-        covered_percent: of the errors that lie within one, two and three standard deviations.
-        pairs: how many; without any, all else is not a number.
-    """
-
+    # rotation_rms_deg, translation_rms_m: over all valid pairs
     rotation_rms_deg: float
     translation_rms_m: float
+    # rotation_median_deg, translation_median_m: likewise
     rotation_median_deg: float
     translation_median_m: float
-    covered_percent: tuple[float, float, float]
-    pairs: int
+    covered_percent: tuple[float, float, float]  # of the errors that lie within one, two and three standard deviations
+    pairs: int  # how many; without any, all else is not a number
 
 
 def learning_rate(step: int, config: TrainingConfig) -> float:

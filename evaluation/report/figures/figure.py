@@ -31,13 +31,9 @@ EQUAL_AXES: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class Style:
-    """Line style of a method.
+    """Line style of a method."""
 
-    Attributes:
-        order: of the method in the report, from 0.
-    """
-
-    order: int
+    order: int  # of the method in the report, from 0
 
     @property
     def key(self) -> str:
@@ -67,21 +63,13 @@ class Style:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One plot.
+    """One plot."""
 
-    Attributes:
-        title: quantity and unit.
-        traces: plotly's.
-        layout: differences from the page's layout.
-        height: in pixels; the width is the page's.
-        log: whether the vertical axis starts logarithmic; None where it cannot be.
-    """
-
-    title: str
-    traces: Sequence[Any]
-    layout: Mapping[str, Any]
-    height: int
-    log: bool | None = None
+    title: str  # quantity and unit
+    traces: Sequence[Any]  # plotly's
+    layout: Mapping[str, Any]  # differences from the page's layout
+    height: int  # in pixels; the width is the page's
+    log: bool | None = None  # whether the vertical axis starts logarithmic; None where it cannot be
 
     @property
     def json(self) -> str:
@@ -94,23 +82,14 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels under one number.
+    """Panels under one number."""
 
-    Attributes:
-        title: a few words, the beginning of the caption.
-        caption: content, units and frames.
-        panels: of the same methods.
-        methods: entries of the legend.
-        reference: name of the reference in the legend; empty where it is not drawn.
-        columns: number of panels beside one another on a wide page.
-    """
-
-    title: str
-    caption: str
-    panels: Sequence[Panel]
-    methods: Sequence[str] = ()
-    reference: str = ""
-    columns: int = 2
+    title: str  # a few words, the beginning of the caption
+    caption: str  # content, units and frames
+    panels: Sequence[Panel]  # of the same methods
+    methods: Sequence[str] = ()  # entries of the legend
+    reference: str = ""  # name of the reference in the legend; empty where it is not drawn
+    columns: int = 2  # number of panels beside one another on a wide page
 
 
 Styles = Mapping[str, Style]

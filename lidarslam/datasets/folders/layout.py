@@ -19,23 +19,14 @@ _STAMP_FILES = ("timestamps.txt", "times.txt")
 
 @dataclass(frozen=True, eq=False)
 class FolderLayout:
-    """The scans of a folder.
+    """The scans of a folder."""
 
-    Attributes:
-        files: N files in the order of time, all with one suffix.
-        stamps: (N,) seconds, strictly increasing.
-        from_clock: whether the stamps were found; else they are made from the rate.
-        truth: a TUM file, or None.
-        notes: facts for the user.
-        warnings: faults and repairs.
-    """
-
-    files: tuple[Path, ...]
-    stamps: FloatArray
-    from_clock: bool
-    truth: Path | None
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    files: tuple[Path, ...]  # N files in the order of time, all with one suffix
+    stamps: FloatArray  # (N,) seconds, strictly increasing
+    from_clock: bool  # whether the stamps were found; else they are made from the rate
+    truth: Path | None  # a TUM file, or None
+    notes: tuple[str, ...]  # facts for the user
+    warnings: tuple[str, ...]  # faults and repairs
 
 
 def find_layout(folder: Path, rate_hz: float) -> FolderLayout:

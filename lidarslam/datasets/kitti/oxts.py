@@ -19,17 +19,11 @@ _POSITION_ACCURACY_COLUMN = 23
 
 
 class OxtsPoses(NamedTuple):
-    """The unit's poses.
+    """The unit's poses."""
 
-    Attributes:
-        numbers: (N,) the row of the stamp file each pose belongs to.
-        T_enu_imu: (N, 4, 4) in an east-north-up frame; imu is x forward, y left, z up.
-        accuracy_m: (N,) standard deviation of the position as the unit itself states it.
-    """
-
-    numbers: NDArray[np.intp]
-    T_enu_imu: FloatArray
-    accuracy_m: FloatArray
+    numbers: NDArray[np.intp]  # (N,) the row of the stamp file each pose belongs to
+    T_enu_imu: FloatArray  # (N, 4, 4) in an east-north-up frame; imu is x forward, y left, z up
+    accuracy_m: FloatArray  # (N,) standard deviation of the position as the unit itself states it
 
 
 def read_oxts(folder: Path) -> OxtsPoses:

@@ -15,20 +15,14 @@ _SWEEP_TOLERANCE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class SweepTiming:
-    """The times of N sweeps.
+    """The times of N sweeps."""
 
-    Attributes:
-        stamps: (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras.
-        before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end.
-        from_clock: whether the stamps are clock readings; else they are made from the rate.
-        notes: facts for the user.
-    """
-
-    stamps: FloatArray
+    stamps: FloatArray  # (N,) seconds, strictly increasing; the laser faces forward, which triggers the cameras
+    # before_s, after_s: (N,) seconds from the sweep's start to the stamp and from the stamp to its end
     before_s: FloatArray
     after_s: FloatArray
-    from_clock: bool
-    notes: tuple[str, ...]
+    from_clock: bool  # whether the stamps are clock readings; else they are made from the rate
+    notes: tuple[str, ...]  # facts for the user
 
 
 def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], rate_hz: float) -> SweepTiming:

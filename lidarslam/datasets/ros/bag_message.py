@@ -29,21 +29,14 @@ _CLOCK_NS = 10**17
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message, not decoded.
+    """One message, not decoded."""
 
-    Attributes:
-        record_ns: time of recording, nanoseconds.
-        header_ns: time stamp of its header, nanoseconds.
-        frame_id: of its header, the sensor's frame.
-        damage: why it is no message; it has neither stamp nor frame then.
-    """
-
-    record_ns: int
-    header_ns: int
-    frame_id: str
+    record_ns: int  # time of recording, nanoseconds
+    header_ns: int  # time stamp of its header, nanoseconds
+    frame_id: str  # of its header, the sensor's frame
     message_type: str
     raw: bytes
-    damage: str | None = None
+    damage: str | None = None  # why it is no message; it has neither stamp nor frame then
 
 
 def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
@@ -89,15 +82,10 @@ def _typestore(ros2: bool) -> Typestore:
 
 @dataclass(frozen=True)
 class StampSource:
-    """How the messages of one topic are stamped.
+    """How the messages of one topic are stamped."""
 
-    Attributes:
-        from_header: the stamps are those of the headers, else the times of recording.
-        before_first: stamps up to this one, seconds, were never set.
-    """
-
-    from_header: bool
-    before_first: float
+    from_header: bool  # the stamps are those of the headers, else the times of recording
+    before_first: float  # stamps up to this one, seconds, were never set
 
     def stamp(self, message: BagMessage) -> float:
         """The scan's stamp in seconds."""

@@ -19,21 +19,13 @@ _TYPES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32
 
 @dataclass(frozen=True, eq=False)
 class DecodedCloud:
-    """The points of one message, invalid ones included, in the order of the message.
+    """The points of one message, invalid ones included, in the order of the message."""
 
-    Attributes:
-        points: (N, 3) float64, metres, in the LiDAR frame.
-        time_field: name of the field the times come from; None without per-point time.
-        times: (N,) as stored, None without per-point time.
-        rings: (N,) as stored, None when the points do not carry the number of their laser.
-        fields: all fields of the message.
-    """
-
-    points: FloatArray
-    time_field: str | None
-    times: NDArray[np.generic] | None
-    rings: NDArray[np.generic] | None
-    fields: tuple[PointField, ...]
+    points: FloatArray  # (N, 3) float64, metres, in the LiDAR frame
+    time_field: str | None  # name of the field the times come from; None without per-point time
+    times: NDArray[np.generic] | None  # (N,) as stored, None without per-point time
+    rings: NDArray[np.generic] | None  # (N,) as stored, None when the points do not carry the number of their laser
+    fields: tuple[PointField, ...]  # all fields of the message
 
 
 def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> DecodedCloud:

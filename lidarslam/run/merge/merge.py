@@ -37,17 +37,11 @@ Show = Callable[[str], AbstractContextManager[Progress]]
 
 @dataclass(frozen=True)
 class MergeOutcome:
-    """A merge that was written.
+    """A merge that was written."""
 
-    Attributes:
-        summary: in numbers.
-        runs: of each recording; None where none of its scans could be used.
-        stopped: which recordings ended before their last scan, and why, a line each.
-    """
-
-    summary: MergeSummary
-    runs: tuple[RunOutcome | None, ...]
-    stopped: tuple[str, ...]
+    summary: MergeSummary  # in numbers
+    runs: tuple[RunOutcome | None, ...]  # of each recording; None where none of its scans could be used
+    stopped: tuple[str, ...]  # which recordings ended before their last scan, and why, a line each
 
     @property
     def apart(self) -> tuple[MergedRecording, ...]:

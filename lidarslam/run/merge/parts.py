@@ -25,21 +25,14 @@ _PART = re.compile(r"\d{2,}_[\w.-]+")
 
 @dataclass(frozen=True)
 class MergeRequest:
-    """Several recordings to be merged into one map.
+    """Several recordings to be merged into one map."""
 
-    Attributes:
-        sources: two recordings or more, each once; the first of those that are connected gives the frame.
-        out: the directory of the merged map.
-        config: loops are closed whatever it says.
-        pcd: whether the maps are written as .pcd too.
-        overwrite: whether an earlier merge, or a run, in `out` is replaced.
-    """
-
+    # two recordings or more, each once; the first of those that are connected gives the frame
     sources: tuple[Path, ...]
-    out: Path
-    config: Config
-    pcd: bool = False
-    overwrite: bool = False
+    out: Path  # the directory of the merged map
+    config: Config  # loops are closed whatever it says
+    pcd: bool = False  # whether the maps are written as .pcd too
+    overwrite: bool = False  # whether an earlier merge, or a run, in `out` is replaced
 
     def describe(self) -> dict[str, Any]:
         """For config.yaml, and for an unfinished merge."""

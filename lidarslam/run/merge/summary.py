@@ -8,23 +8,16 @@ from lidarslam.run.summary import GraphSummary, WrittenMap, graph_and_map_json
 
 @dataclass(frozen=True)
 class MergedRecording:
-    """One recording of a merge.
+    """One recording of a merge."""
 
-    Attributes:
-        name: of the recording.
-        directory: of its run, beside the common map; None when no scan could be used.
-        source: its path.
-        scans, length_m, lost_scans: of its run.
-        joined: whether its poses are in the common frame.
-    """
-
-    name: str
-    directory: str | None
-    source: str
+    name: str  # of the recording
+    directory: str | None  # of its run, beside the common map; None when no scan could be used
+    source: str  # its path
+    # scans, length_m, lost_scans: of its run
     scans: int
     length_m: float
     lost_scans: int
-    joined: bool
+    joined: bool  # whether its poses are in the common frame
 
 
 @dataclass(frozen=True)
