@@ -93,7 +93,12 @@ odometry_options = _together(
     click.option(
         "--odometry", type=click.Choice(["learned", "kiss-icp", "constant-velocity"]), help="[default: learned]"
     ),
-    click.option("--weights", type=FILE, metavar="FILE", help="Weights of the learned odometry.  [default: included]"),
+    click.option(
+        "--weights",
+        type=click.Path(path_type=Path, exists=True),
+        metavar="FILE",
+        help="Weights of the learned odometry, or the folder of an exported network.  [default: included]",
+    ),
 )
 
 

@@ -88,7 +88,8 @@ def supervise(
 
 def _pass_on(lines: Iterable[str] | None, on_line: Callable[[str], None]) -> None:
     for line in lines or ():
-        on_line(line.rstrip("\n"))
+        with contextlib.suppress(Exception):  # the pipe has to be emptied, or the process waits for ever
+            on_line(line.rstrip("\n"))
 
 
 def _wait(process: "subprocess.Popen[str]", limits: Limits, peaks: list[float]) -> Cause:

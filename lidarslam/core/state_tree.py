@@ -151,7 +151,8 @@ def _decode_plain(kind: Any, tree: Any, saved: Saved) -> Any:
 
 def _decode_array(dtype: Any, shape: Shape | None, tree: Any, saved: Saved) -> Any:
     (wanted,) = typing.get_args(dtype)
-    if not isinstance(tree, np.ndarray) or not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted):
+    is_array = isinstance(tree, np.ndarray) and tree.dtype.isnative
+    if not is_array or not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted):
         raise saved.unfit(f"an array of {getattr(wanted, '__name__', wanted)}", tree)
     if shape is not None and not shape.fits(tree.shape):
         raise saved.unfit(f"an array of shape {shape.lengths}", tree)

@@ -49,6 +49,8 @@ def learn_point_time(
     """
     model, failures = None, 0
     for cloud in islice(clouds, _CLOUDS_LOOKED_AT):
+        if cloud.values is not None and len(cloud.values) < 2:
+            continue  # an empty scan shows nothing of the field
         found = None
         if cloud.field is not None and cloud.values is not None:
             found = infer_point_time(cloud.field, cloud.values, cloud.stamp, unit, reference, period_s)

@@ -133,6 +133,7 @@ def _evaluate_map(
         sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
         reference = next((found for found in map(find_reference_map, sources) if found is not None), None)
         if reference is not None and estimate.map_file is None:
-            notes.append("there is no map to compare with that of the simulation")
+            if estimate.run is not None:
+                notes.append("there is no map to compare with that of the simulation")
             return None
     return None if reference is None else evaluate_map(estimate, metrics, reference, request.map_options)

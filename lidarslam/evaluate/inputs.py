@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import read_yaml
@@ -17,6 +18,7 @@ from lidarslam.evaluate.reference_cloud import read_cloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.finished_run import read_trajectory
 from lidarslam.storage.unfinished import require_whole
+from mapping.config import GlobalMapConfig
 
 # KITTI's LiDAR turns ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1
@@ -81,7 +83,25 @@ def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
         source = Path(read_yaml(config_file)[files.RUN_SECTION]["source"])
     except (ConfigError, TypeError, KeyError):
         source = None
-    return Estimate(poses, path, chosen_map, source, load_config(config_file))
+    return Estimate(poses, path, chosen_map, source, _config_of_run(config_file))
+
+
+def _config_of_run(file: Path) -> Config:
+    """The settings of a run; of one by another version, those that evaluation needs, where they are known."""
+    try:
+        return load_config(file)
+    except ConfigError:
+        tree = read_yaml(file)
+    known = {}
+    needed: dict[str, type[BaseModel]] = {"reader": ReaderConfig, "global_map": GlobalMapConfig}
+    for name, model in needed.items():
+        section = tree.get(name)
+        if isinstance(section, dict):
+            known[name] = {key: value for key, value in section.items() if key in model.model_fields}
+    try:
+        return Config.model_validate(known)
+    except ValidationError:
+        return Config()
 
 
 def read_reference(path: Path, config: ReaderConfig) -> Poses:

@@ -32,5 +32,7 @@ class BackgroundWorker:
 
     def close(self) -> None:
         """Wait for all calls and end the thread."""
-        self.wait()
-        self._pool.shutdown()
+        try:
+            self.wait()
+        finally:
+            self._pool.shutdown(cancel_futures=True)

@@ -1,11 +1,13 @@
 """A scan on its way through the pipeline: with its odometry, with its pose, done."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Shape
 from lidarslam.core.tracking import Status
 from mapping.deskew import body_velocity, deskew
 from mapping.pose_graph.graph_scan import GraphScan
@@ -33,8 +35,8 @@ class Estimated:
 class SweepMotion:
     """Body velocities (6,) before and after the stamp of a scan, rotation first; None where unknown."""
 
-    before: FloatArray | None
-    after: FloatArray | None
+    before: Annotated[FloatArray, Shape(6)] | None
+    after: Annotated[FloatArray, Shape(6)] | None
 
     def compensate(self, scan: Scan) -> FloatArray:
         """Deskew: the scan's points (N, 3) in the LiDAR frame at its stamp.

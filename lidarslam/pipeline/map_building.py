@@ -1,12 +1,13 @@
 """Building the global map: each scan is added one scan late, once the motion it was deskewed with is confirmed."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Stateful
+from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.pipeline.estimates import Localised, SweepMotion
 from mapping.config import GlobalMapConfig
@@ -22,8 +23,12 @@ class PendingScan:
     number: int  # its index in the run, from 0
     thinned: Scan  # its points within the map's range, one a voxel, as read
     motion: SweepMotion  # the motion it was deskewed with
-    points: FloatArray  # (N, 3) of those, deskewed, in the LiDAR frame at the stamp
-    T_world_lidar: FloatArray  # (4, 4)
+    points: Annotated[FloatArray, Shape(None, 3)]  # of those, deskewed, in the LiDAR frame at the stamp
+    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]
+
+    def __post_init__(self) -> None:
+        if len(self.points) != len(self.thinned):
+            raise ValueError(f"{len(self.points)} deskewed points of {len(self.thinned)}")
 
 
 class MapBuilder(Stateful):

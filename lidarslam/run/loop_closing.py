@@ -40,7 +40,7 @@ class LoopReport:
             "reason": "does not fit the other edges of the graph" if outlier else closure.reason,
             "found_by": "appearance" if closure.by_appearance else "nearby",
             "overlap": round(closure.overlap, 4),
-            "residual_m": round(closure.residual_m, 4),
+            "residual_m": round(closure.residual_m, 4) if np.isfinite(closure.residual_m) else None,
             "inlier_ratio": round(closure.inlier_ratio, 4),
             "consistent": closure.consistent,
             "distance_m": round(float(np.linalg.norm(closure.T_first_second[:3, 3])), 4),
@@ -127,7 +127,7 @@ class FinishedGraph:
 
     def common(self) -> GraphOutcome | None:
         """The connected recordings, and why others are apart: the rejected loops between recordings."""
-        outcome = self.outcome(self.joined)
+        outcome = self.outcome(self.joined, numbered=True)
         if outcome is None:
             return None
         apart = [
@@ -137,8 +137,8 @@ class FinishedGraph:
         ]
         return replace(outcome, loops=(*outcome.loops, *apart))
 
-    def outcome(self, recordings: Sequence[int]) -> GraphOutcome | None:
-        """Some recordings, and the loops between them; None when none has a keyframe."""
+    def outcome(self, recordings: Sequence[int], numbered: bool = False) -> GraphOutcome | None:
+        """Some recordings, and the loops between them, on request with their numbers; None when none has a keyframe."""
         result = self._result
         chosen = np.flatnonzero(np.isin(result.keyframe_recordings, recordings))
         if not len(chosen):
@@ -153,7 +153,7 @@ class FinishedGraph:
                 for edge in result.edges
                 if self._are_in(recordings, edge)
             ),
-            loops=self._loops(recordings, numbered=len(recordings) > 1),
+            loops=self._loops(recordings, numbered or len(recordings) > 1),
             largest_correction_m=max(self._correction_m(recording) for recording in recordings),
             keyframe_ms=tuple(self._graph.keyframe_ms[k] for k in chosen),
         )

@@ -132,7 +132,7 @@ def _process(
                 progress(len(log), result)
     except (InputError, KeyboardInterrupt) as error:
         log.warn(f"stopped after {len(log)} scans: {_reason(error)}")
-        return error
+        return error.with_traceback(None)  # whose frames hold maps and scans
     return None
 
 

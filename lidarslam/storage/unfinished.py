@@ -52,7 +52,10 @@ class About:
             OSError, OutputError: it cannot be written.
         """
         with replacing(run / ABOUT, durable=True) as partial:
-            partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
+            try:
+                partial.write_text(json.dumps(vars(self), indent=2), encoding="utf-8")
+            except OSError as error:
+                raise cannot_write(run / ABOUT, error) from error
 
     def remedy(self, run: Path) -> str:
         """What to do about it, as the end of a sentence that begins with the directory."""
@@ -88,6 +91,7 @@ def remove_unfinished(run: Path) -> None:
         OutputError: it is at work.
     """
     with only_writer(run):
+        remove_partial_files(run)
         for name in FILES:
             (run / name).unlink(missing_ok=True)
         Unfinished(run, About({})).end(stopped=False)

@@ -31,6 +31,8 @@ class Devices:
         self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if is_cuda else torch.device("cpu")
         self.processes = int(os.environ.get("WORLD_SIZE", "1"))
         self.process = int(os.environ.get("RANK", "0")) if self.processes > 1 else 0
+        if is_cuda:
+            torch.cuda.set_device(self.device)
         if self.processes > 1 and not distributed.is_initialized():
             distributed.init_process_group("nccl" if is_cuda else "gloo")
 

@@ -80,13 +80,15 @@ def _start(port: int, *options: str) -> "subprocess.Popen[bytes] | None":
         env=os.environ | {"PYTHONSAFEPATH": "1", "RERUN_APP_ONLY": "true"},
         start_new_session=True,  # Ctrl-C is not meant for it
     )
-    begun = time.monotonic()
-    while process.poll() is None and time.monotonic() - begun < _START_S:
-        if is_taken(port):
-            return process
-        time.sleep(_POLL_S)
-    _end(process)
-    return None
+    begun, listens = time.monotonic(), False
+    try:
+        while process.poll() is None and time.monotonic() - begun < _START_S and not listens:
+            time.sleep(_POLL_S)
+            listens = is_taken(port)
+    finally:
+        if not listens:
+            _end(process)
+    return process if listens else None
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:

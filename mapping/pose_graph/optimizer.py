@@ -94,6 +94,8 @@ def _graph(
 def _factor(edge: RelativePose) -> gtsam.BetweenFactorPose3:
     """GTSAM's residual is the logarithm of the error in `T_first_second`, so covariances are the same."""
     if edge not in _factors:
+        if not (np.isfinite(edge.covariance).all() and np.isfinite(edge.T_first_second).all()):
+            raise ValueError(f"edge {edge.first} to {edge.second} must be finite, got {edge.T_first_second.tolist()}")
         noise = gtsam.noiseModel.Gaussian.Covariance(bounded(edge.covariance))
         _factors[edge] = gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise)
     return _factors[edge]

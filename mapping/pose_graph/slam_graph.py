@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.state import Stateful
 from mapping.config import PoseGraphConfig
 from mapping.global_map.global_map import GlobalMap, means_points
@@ -185,8 +185,13 @@ class SlamGraph(Stateful):
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
         self._refine_closures(until=index - _REACH)
-        if any(closure.accepted for closure in found):
+        if any(closure.accepted and self._contradicts_poses(closure) for closure in found):
             self._poses = list(relax(np.array(self._poses), self._edges, self._accepted()))
+
+    def _contradicts_poses(self, closure: LoopClosure) -> bool:
+        """Whether a closure is farther from the present poses than its own deviation: only then it moves them."""
+        error = log(inverse(self._poses[closure.first] @ closure.T_first_second) @ self._poses[closure.second])
+        return float(error @ np.linalg.solve(closure.covariance, error)) > len(error)
 
     def _refine_closures(self, until: int) -> None:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""

@@ -282,6 +282,12 @@ def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive,
     assert recording.describe().duration_s > 0.0
 
 
+def test_behind_the_damaged_header_of_a_chunk_the_next_one_is_read(write_drive):
+    file, _, points = write_drive("mcap", **BIG)
+    overwrite(file, chunks_of(file)[1][0] - 24, bytes([255]) * 24)
+    assert_all_but(open_recording(file), points, [2, 3], "1 damaged places", "2 scans are missing")
+
+
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
     """Around a damaged chunk, too: the first half before it, and the second behind it."""

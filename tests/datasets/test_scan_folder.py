@@ -123,11 +123,32 @@ def test_pcd_with_padding_and_vector_fields(tmp_path, rng):
     for data in ("binary", "binary_compressed"):
         (tmp_path / "a.pcd").write_bytes(_pcd_bytes(table, data))
         read = read_pcd(tmp_path / "a.pcd")
-        assert read.dtype.names == ("x", "y", "z")
         np.testing.assert_array_equal(read["x"], table["x"])
+        np.testing.assert_array_equal(read["normal"], table["normal"])
     twice = _pcd_bytes(table, "binary").replace(b"FIELDS x y z _ normal", b"FIELDS x y z _ _")
     (tmp_path / "a.pcd").write_bytes(twice)
     np.testing.assert_array_equal(read_pcd(tmp_path / "a.pcd")["x"], table["x"])
+
+
+def test_pcd_as_other_programs_write_it(tmp_path):
+    """Without COUNT and WIDTH, with tabs and blanks at the ends of lines, and a single point."""
+    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA ascii\n"
+    (tmp_path / "a.pcd").write_text(header + "1.5\t 2.5  3.5 \n")
+    assert read_pcd(tmp_path / "a.pcd").tolist() == [(1.5, 2.5, 3.5)]
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1 1\nPOINTS 1\nDATA ascii\n", "of one length each"),
+        ("FIELDS x\nSIZE 4\nTYPE F\nCOUNT 99999999\nPOINTS 1\nDATA ascii\n", "truncated"),
+        ("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 3\nDATA ascii\n", "truncated"),
+    ],
+)
+def test_pcd_with_a_damaged_header_is_refused(tmp_path, header, message):
+    (tmp_path / "a.pcd").write_text(header + "1.5 2.5 3.5\n")
+    with pytest.raises(InputError, match=message):
+        read_pcd(tmp_path / "a.pcd")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])

@@ -4,13 +4,13 @@ Read here because Open3D 0.20 drops properties of unsigned types, such as `uint 
 takes eight times as long for ascii files (4.3 s for 100,000 points).
 """
 
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.folders.point_table import read_ascii_table, read_binary_table
 from lidarslam.datasets.folders.scan_files import read_bytes
 
 _TYPES = {
@@ -39,8 +39,8 @@ def read_ply(path: Path) -> NDArray[np.void]:
         if dtype.itemsize > _WIDEST_POINT:
             raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
         if encoding == "ascii":
-            return _ascii_table(data[length:].split(b"\n", skipped[0])[-1], dtype, rows)
-        return _binary_table(data[length + skipped[1] :], dtype, rows)
+            return read_ascii_table(data[length:].split(b"\n", skipped[0])[-1], dtype, rows)
+        return read_binary_table(data[length + skipped[1] :], dtype, rows)
     except ValueError as error:
         raise InputError(f"{path}: not a readable PLY file: {error}; copy it again or remove it") from None
 
@@ -88,20 +88,3 @@ def _row_type(properties: list[list[str]], order: str) -> np.dtype[np.void]:
             raise ValueError(f"expected properties of a plain type up to the vertices, got {' '.join(words)!r}")
         columns.append((words[1], order + _TYPES[words[0]]))
     return np.dtype(columns)
-
-
-def _ascii_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
-    """The first `rows` lines of blank-separated numbers."""
-    # A line takes a digit and a blank at least; NumPy makes room for all lines that it is told to expect.
-    possible = rows <= (len(body) + 1) // 2 and body.strip()
-    table = np.loadtxt(BytesIO(body), dtype=dtype, max_rows=rows, ndmin=1, comments=None) if possible else np.empty(0)
-    if len(table) != rows:
-        raise ValueError(f"expected {rows} points, got {len(table)} in {len(body)} bytes of text: it is truncated")
-    return np.asarray(table, dtype)
-
-
-def _binary_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
-    """The first `rows` rows of packed numbers."""
-    if len(body) < rows * dtype.itemsize:
-        raise ValueError(f"expected {rows} points of {dtype.itemsize} bytes, got {len(body)} bytes: it is truncated")
-    return np.frombuffer(body, dtype, count=rows)

@@ -1,9 +1,31 @@
 """Fields of points in a structured array."""
 
+from io import BytesIO
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+
+# Bytes; no format has a point with so many fields.
+_WIDEST_POINT = 1 << 16
+
+
+def read_ascii_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
+    """The first `rows` lines of blank-separated numbers; ValueError where there are fewer."""
+    # A line takes a digit and a blank at least; NumPy makes room for all lines that it is told to expect.
+    possible = dtype.itemsize <= _WIDEST_POINT and rows <= (len(body) + 1) // 2 and body.strip()
+    table = np.loadtxt(BytesIO(body), dtype=dtype, max_rows=rows, ndmin=1, comments=None) if possible else np.empty(0)
+    if len(table) != rows:
+        raise ValueError(f"expected {rows} points, got {len(table)} in {len(body)} bytes of text: it is truncated")
+    return np.asarray(table, dtype)
+
+
+def read_binary_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
+    """The first `rows` rows of packed numbers; ValueError where there are fewer."""
+    if len(body) < rows * dtype.itemsize:
+        raise ValueError(f"expected {rows} points of {dtype.itemsize} bytes, got {len(body)} bytes: it is truncated")
+    return np.frombuffer(body, dtype, count=rows)
 
 
 def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:

@@ -92,8 +92,13 @@ class KittiRawRecording(FileRecording):
         if not self._timing.from_clock:
             return oxts.numbers / self._config.rate_hz
         path = self._folder / "oxts" / "timestamps.txt"
-        table = read_stamps(path) if path.is_file() else np.empty(0)
-        return np.append(table, np.nan)[np.minimum(oxts.numbers, len(table))]
+        if path.is_file():
+            rows, table = oxts.numbers, read_stamps(path)
+        else:  # the stamps of the scans with the rows' numbers stand in
+            rows = np.searchsorted(self._numbers, oxts.numbers)
+            rows = np.where(np.append(self._numbers, -1)[rows] == oxts.numbers, rows, len(self))
+            table = self.stamps
+        return np.append(table, np.nan)[np.minimum(rows, len(table))]
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         points = read_bin(self._files[index])[:, :3]
@@ -126,8 +131,7 @@ class KittiRawRecording(FileRecording):
         truth = self.ground_truth
         if truth is None:
             yield (
-                "There is no calib_imu_to_velo.txt above the drive or no oxts/timestamps.txt, so its oxts poses cannot"
-                " be used as ground truth."
+                "There is no calib_imu_to_velo.txt above the drive, so its oxts poses cannot be used as ground truth."
             )
             return
         if len(truth) < len(self._oxts.numbers):

@@ -1,7 +1,7 @@
 """Messages of rosbag1 and rosbag2 files, by rosbags; a file whose index cannot be read is read without it."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -110,7 +110,7 @@ class BagFile:
             on_damage(str(error))
         reports: list[str] = []
         known = {each.id: (each.topic, each.msgtype) for each in storage.connections}
-        for message in self._in_sequence(storage.path, topic, reports.append, known):
+        for message in self._in_sequence(storage.path, topic, reports.append, known, _chunk_starts(storage)):
             if message.record_ns == last_ns and repeated:  # was read by the index
                 repeated -= 1
             elif message.record_ns >= last_ns:
@@ -131,10 +131,15 @@ class BagFile:
             yield self._message(found[1], found[2], topic)
 
     def _in_sequence(
-        self, path: Path, topic: Topic, report: Callable[[str], None], known: Connections
+        self,
+        path: Path,
+        topic: Topic,
+        report: Callable[[str], None],
+        known: Connections,
+        chunks: Sequence[int] = (),
     ) -> Iterator[BagMessage]:
         try:
-            for message in recover(path, self._suffix(path), report, known):
+            for message in recover(path, self._suffix(path), report, known, chunks):
                 if (message.topic, message.message_type) == (topic.name, topic.message_type):
                     yield self._message(message.record_ns, message.raw, topic)
         except Exception as error:  # not even its beginning makes sense
@@ -223,6 +228,13 @@ def _last(messages: Iterator[BagMessage]) -> BagMessage | None:
     for message in messages:
         last = message if message.damage is None else last
     return last
+
+
+def _chunk_starts(storage: Any) -> list[int]:
+    """Where the chunks of a file begin, by its index; none for a database."""
+    if isinstance(storage, Rosbag1Reader):
+        return sorted({entry.chunk_pos for entries in storage.indexes.values() for entry in entries})
+    return sorted(chunk.chunk_start_offset for chunk in getattr(storage, "chunks", None) or ())
 
 
 def _storages(reader: Rosbag1Reader | Rosbag2Reader) -> list[Any]:

@@ -6,7 +6,7 @@ because rosbags needs an index, and `StreamReader` of mcap 1.6 loses a chunk tha
 
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from io import BytesIO
 from itertools import chain, pairwise
@@ -39,7 +39,9 @@ class RecoveredMessage(NamedTuple):
     raw: bytes
 
 
-def recover(path: Path, suffix: str, report: Report, known: Connections | None = None) -> Iterator[RecoveredMessage]:
+def recover(
+    path: Path, suffix: str, report: Report, known: Connections | None = None, chunks: Sequence[int] = ()
+) -> Iterator[RecoveredMessage]:
     """The messages of a `.bag`, `.mcap` or `.db3` file, as far as it is readable; damage is reported.
 
     A damaged chunk costs its own messages alone, and so does a damaged page of a database.
@@ -49,6 +51,7 @@ def recover(path: Path, suffix: str, report: Report, known: Connections | None =
         suffix: which kind it is.
         report: called with one line for each damaged place.
         known: the connections that an index lists; the records about them may be damaged.
+        chunks: where its chunks begin by an index; behind a damaged record the next of them is read.
 
     Raises:
         ValueError, OSError, sqlite3.Error: it is no such file at all.
@@ -66,7 +69,7 @@ def recover(path: Path, suffix: str, report: Report, known: Connections | None =
                 yield from records.read(file)
             except Exception as error:  # damaged bytes make struct, codecs and look-ups raise nearly anything
                 report(f"it breaks off at byte {at:,} of {size:,} ({_reason(error)})")
-                return
+                file.seek(min((start for start in chunks if start > at), default=size))
 
 
 class _Records:

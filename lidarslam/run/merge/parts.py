@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from lidarslam.core.files import remove_partial_files
+from lidarslam.core.files import only_writer, remove_partial_files
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.run.request import RunRequest
@@ -94,9 +94,10 @@ def earlier_parts(out: Path) -> set[str]:
 
 def remove_part(path: Path) -> None:
     """Remove the run of a recording that is no longer merged, however far it came."""
-    if path.is_dir():
-        remove_partial_files(path)
     if (path / files.ABOUT).exists():
         remove_unfinished(path)
-    else:
-        remove_run(path)
+        return
+    if path.is_dir():
+        with only_writer(path):
+            remove_partial_files(path)
+    remove_run(path)
