@@ -14,6 +14,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from mapping.loops.sparse_submap import PLANE, SparseSubmap
+from mapping.tracking.birds_eye_map import height_shift
 
 _DIRECTIONS = 60  # over half a turn
 _BINS = 64
@@ -102,7 +103,7 @@ def align(
         if here_score > score:
             score, shift = here_score, shifts[list(peak)].tolist()
             turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    moved = make_transform(turn, [*shift, _height(target.heights, source.heights)])
+    moved = make_transform(turn, [*shift, height_shift(target.heights, source.heights, _HEIGHT_BIN_M)])
     target_level = make_transform(target.R_level_lidar, np.zeros(3))
     return inverse(target_level) @ moved @ make_transform(source.R_level_lidar, np.zeros(3)), score
 
@@ -113,13 +114,3 @@ def _image(xy: FloatArray, radius_m: float, size: int) -> FloatArray:
     cells = cells[((xy > -radius_m) & (xy < radius_m)).all(axis=1)]
     counts = np.bincount(cells[:, 0] * size + cells[:, 1], minlength=size * size).reshape(size, size)
     return np.asarray(np.sqrt(np.minimum(counts, 8)), dtype=np.float64)
-
-
-def _height(target: FloatArray, source: FloatArray) -> float:
-    """The source's height in the target's view, where the histograms of heights correlate best."""
-    if not len(target) or not len(source):
-        return 0.0
-    low, high = min(target.min(), source.min()), max(target.max(), source.max())
-    bins = int((high - low) / _HEIGHT_BIN_M) + 1
-    there, here = (np.sqrt(np.histogram(h, bins, (low, low + bins * _HEIGHT_BIN_M))[0]) for h in (target, source))
-    return (int(np.correlate(there, here, mode="full").argmax()) - (bins - 1)) * _HEIGHT_BIN_M

@@ -88,7 +88,7 @@ class BirdsEyeMap:
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         around = self.points[np.einsum("ij,ij->i", self.points[:, :2] - xy, self.points[:, :2] - xy) < reach_m**2]
-        z = _height(around[:, 2], level[:, 2], self.cell_m / _HEIGHT_BINS)
+        z = height_shift(around[:, 2], level[:, 2], self.cell_m / _HEIGHT_BINS)
         R = self.R_level_world.T @ turn @ self.R_level_world @ T_world_lidar[:3, :3]
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
 
@@ -157,8 +157,8 @@ def _apart(
     return chosen
 
 
-def _height(there: FloatArray, here: FloatArray, bin_m: float) -> float:
-    """Height of the sensor: shift between the heights of the map (M,) and of the scan (N,) that correlates best."""
+def height_shift(there: FloatArray, here: FloatArray, bin_m: float) -> float:
+    """Shift between two sets of heights, (M,) and (N,), at which their histograms correlate best."""
     if not len(there) or not len(here):
         return 0.0
     low, high = min(there.min(), here.min()), max(there.max(), here.max())
