@@ -39,7 +39,7 @@ from lidarslam.simulation.worlds.registry import WORLDS
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 from mapping.config import MappingConfig
-from mapping.mapper import Mapper
+from mapping.surfel_mapper import SurfelMapper
 from odometry.registry import make_odometry
 
 
@@ -57,7 +57,7 @@ class Sample:
 def watch(simulation: Simulation, every: int) -> list[Sample]:
     """Run, and print a row now and then."""
     config = without_odometry(MappingConfig())
-    mapper = Mapper(config.mapping)  # as `lidarslam run` makes it, but in reach
+    mapper = SurfelMapper(config.mapping)  # as `lidarslam run` makes it, but in reach
     samples: list[Sample] = []
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
@@ -74,7 +74,7 @@ def _follow(
     simulation: Simulation,
     every: int,
     pipeline: Pipeline,
-    mapper: Mapper,
+    mapper: SurfelMapper,
     log: ScanLog,
     unfinished: Unfinished,
     samples: list[Sample],

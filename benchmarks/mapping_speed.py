@@ -4,7 +4,7 @@
     python benchmarks/mapping_speed.py --simulate hdl-64e:street:car os1-128:street:car --scans 60
 
 Everything runs in one process, one scan after the other, without reading and without the pipeline's two threads: ours
-(without odometry, from `Mapper.process` to the pose and the updated map) then KISS-ICP with its defaults,
+(without odometry, from `SurfelMapper.process` to the pose and the updated map) then KISS-ICP with its defaults,
 for `--rounds` rounds, each from an empty map, so that whatever else
 the machine does meets all of them. The first `--warm-up` scans of every pass do not count. Wall time and CPU time
 (of all threads) of every scan; median and 95th percentile over all passes; the ratio is that of the medians of
@@ -41,10 +41,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.scan_stream import in_order
-from mapping import mapper, sampling
+from mapping import surfel_mapper
 from mapping.config import MappingConfig
-from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.surfels import sampling
 from mapping.tracking import attempts
 
 # Stage -> what is timed for it: the object that holds the function, and its name there.
@@ -52,8 +52,8 @@ _STAGES: dict[str, tuple[Any, str]] = {
     "thin": (sampling.Sampler, "sample"),
     "registration": (attempts, "register"),
     "fit": (attempts, "measure_fit"),
-    "map update": (mapper, "_insert"),
-    "rest": (mapper.Mapper, "process"),
+    "map update": (surfel_mapper, "_insert"),
+    "rest": (surfel_mapper.SurfelMapper, "process"),
 }
 _OURS = {"default": MappingConfig()}
 
@@ -108,7 +108,7 @@ class _Pass:
 
 def run_ours(scans: Sequence[Scan], config: MappingConfig, warm_up: int) -> _Pass:
     """Scan-to-map refinement without odometry."""
-    ours = Mapper(config)
+    ours = surfel_mapper.SurfelMapper(config)
     watches, bad = [], 0
     with threadpool_limits(1, "blas"):
         for scan in scans:

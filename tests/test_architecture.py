@@ -298,8 +298,16 @@ def test_light_modules_load_nothing_heavy(sources):
 @pytest.mark.parametrize(
     ("rule", "planted", "told"),
     [
-        (layer_breaches, {"odometry__learned": "import mapping.mapper"}, "odometry.learned imports mapping.mapper"),
-        (layer_breaches, {"mapping__mapper": "from lidarslam import run"}, "mapping.mapper imports lidarslam"),
+        (
+            layer_breaches,
+            {"odometry__learned": "import mapping.mapper"},
+            "odometry.learned imports mapping.mapper",
+        ),
+        (
+            layer_breaches,
+            {"mapping__mapper": "from lidarslam import run"},
+            "mapping.mapper imports lidarslam",
+        ),
         (
             layer_breaches,
             {"lidarslam__core__scan": "import evaluation.drift"},
@@ -338,7 +346,11 @@ def test_light_modules_load_nothing_heavy(sources):
         ),
         (foreign_breaches, {"lidarslam__core__scan": "import numba"}, "lidarslam.core.scan imports numba"),
         (foreign_breaches, {"mapping__mapper": "import numba"}, "mapping.mapper imports numba"),
-        (foreign_breaches, {"mapping__mapper": "from gtsam import Pose3"}, "mapping.mapper imports gtsam"),
+        (
+            foreign_breaches,
+            {"mapping__mapper": "from gtsam import Pose3"},
+            "mapping.mapper imports gtsam",
+        ),
         (foreign_breaches, {"odometry__learned": "import kiss_icp.metrics"}, "odometry.learned imports kiss_icp"),
         (foreign_breaches, {"lidarslam__run": "class A:\n  import click"}, "lidarslam.run imports click"),
         (foreign_breaches, {"evaluation__map_metrics": "import laspy"}, "evaluation.map_metrics imports laspy"),

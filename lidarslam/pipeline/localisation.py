@@ -10,8 +10,8 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
-from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.surfel_mapper import SurfelMapper
 from odometry.interface import Motion
 from odometry.methods.consistency import Consistency, ConsistencyCheck
 
@@ -66,11 +66,11 @@ class OdometryAlone(Stateful):
 class ScanToMap(Stateful):
     """Registers each scan to the map, with the odometry as initial guess."""
 
-    _mapper: Mapper
+    _mapper: SurfelMapper
     _T_odom_lidar: Annotated[FloatArray, Shape(4, 4)]
     _T_world_last: Annotated[FloatArray, Shape(4, 4)]
 
-    def __init__(self, mapper: Mapper) -> None:
+    def __init__(self, mapper: SurfelMapper) -> None:
         self._mapper = mapper
         self._T_odom_lidar = np.eye(4)
         self._T_world_last = np.eye(4)
@@ -119,5 +119,5 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
 def make_localiser(config: Config) -> Localiser:
     """Scan-to-map registration when it is enabled, else the odometry alone."""
     if config.mapping.enabled:
-        return ScanToMap(Mapper(config.mapping))
+        return ScanToMap(SurfelMapper(config.mapping))
     return OdometryAlone(ConsistencyCheck())

@@ -9,8 +9,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
-from mapping.mapper import Mapper
 from mapping.prediction import Prior
+from mapping.surfel_mapper import SurfelMapper
 from odometry.images.sweep_images import middle_offset_s
 from odometry.training.preparation import PreparedRecording
 
@@ -19,7 +19,7 @@ class MapTeacher:
     """Registers a recording at constant velocity, scan after scan."""
 
     def __init__(self) -> None:
-        self._mapper = Mapper(MappingConfig())
+        self._mapper = SurfelMapper(MappingConfig())
         self._T_world_middle: list[FloatArray] = []
         self._is_ok: list[bool] = []
 

@@ -3,7 +3,7 @@
 from lidarslam.core.state import Stateful
 from mapping.config import MappingConfig
 from mapping.prediction import MotionState, Prediction
-from mapping.sampling import SampledScan
+from mapping.surfels.sampling import SampledScan
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.attempts import Attempt, ScanMatcher
 

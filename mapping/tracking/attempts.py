@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.geometry import FloatArray, inverse, log, transform_points
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
 from mapping.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
-from mapping.registration import Registration, register, with_mean_velocity
-from mapping.sampling import SampledScan
+from mapping.surfels.registration import Registration, register, with_mean_velocity
+from mapping.surfels.sampling import SampledScan
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.birds_eye_map import BirdsEyeMap
-from mapping.tracking.fit import NO_FIT, Fit, measure_fit
+from mapping.tracking.fit import NO_FIT, Fit
 from mapping.tracking.start_poses import best_starts, best_supported, best_velocity, positions_around, turned_poses
 
 # Covariance (6, 6) of a start without a prediction.
@@ -199,3 +199,12 @@ class ScanMatcher:
         points = keypoints.compensated(registration.velocity)
         fit = measure_fit(points, registration.T_world_lidar, self._map)
         return Attempt(prediction, self._map, registration, fit, fit.status(self._config.tracking))
+
+
+def measure_fit(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> Fit:
+    """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4)."""
+    world = transform_points(T_world_lidar, points)
+    matches = surfel_map.match(world, T_world_lidar).first_of_each_point()
+    distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
+    ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
+    return Fit.of(distances, matches.normals, ranges, len(points), surfel_map.cell_m)

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from mapping.config import TrackingConfig
-from mapping.surfels.surfel_map import SurfelMap
 
 # Largest distance of an inlier from its surface: the largest of a length, a share of the cell and a share of the range.
 _GATE_MIN_M, _GATE_CELLS, _GATE_RATIO = 0.05, 0.5, 0.02
@@ -37,6 +36,31 @@ class Fit:
     # the inlier ratio of the points that constrain the least supported direction of translation: most points fit
     # wherever a scan slides along a street, the constraining ones do not. None when there are none.
     support: float | None = None
+
+    @classmethod
+    def of(cls, distances: FloatArray, normals: FloatArray, ranges: FloatArray, points: int, cell_m: float) -> "Fit":
+        """Fit of M correspondences.
+
+        Args:
+            distances: (M,) of the matched points from their surfaces.
+            normals: (M, 3) unit, of the surfaces, in the world.
+            ranges: (M,) of the matched points from the sensor.
+            points: how many there are, with and without a correspondence.
+            cell_m: spacing of the map.
+        """
+        if not len(distances):
+            return NO_FIT
+        nearest_m = max(_GATE_MIN_M, _GATE_CELLS * cell_m)
+        inlier = distances < np.maximum(nearest_m, _GATE_RATIO * ranges)
+        facing = np.abs(normals).argmax(axis=1)
+        ratios = [float(inlier[facing == axis].mean()) for axis in range(3) if (facing == axis).sum() >= _FEWEST_FACING]
+        return cls(
+            matched=len(distances),
+            overlap=len(distances) / points,
+            residual_m=float(np.median(distances)),
+            inlier_ratio=min(ratios, default=float(inlier.mean())),
+            support=directional_support(normals, distances / (_HALF_CELLS * cell_m)),
+        )
 
     @property
     def inlier_share(self) -> float:
@@ -67,27 +91,6 @@ class Fit:
 
 
 NO_FIT = Fit(0, 0.0, None, None)
-
-
-def measure_fit(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> Fit:
-    """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4)."""
-    world = transform_points(T_world_lidar, points)
-    matches = surfel_map.match(world, T_world_lidar).first_of_each_point()
-    if not len(matches):
-        return NO_FIT
-    distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
-    ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
-    nearest_m = max(_GATE_MIN_M, _GATE_CELLS * surfel_map.cell_m)
-    inlier = distances < np.maximum(nearest_m, _GATE_RATIO * ranges)
-    facing = np.abs(matches.normals).argmax(axis=1)
-    ratios = [float(inlier[facing == axis].mean()) for axis in range(3) if (facing == axis).sum() >= _FEWEST_FACING]
-    return Fit(
-        matched=len(matches),
-        overlap=len(matches) / len(points),
-        residual_m=float(np.median(distances)),
-        inlier_ratio=min(ratios, default=float(inlier.mean())),
-        support=directional_support(matches.normals, distances / (_HALF_CELLS * surfel_map.cell_m)),
-    )
 
 
 def directional_support(normals: FloatArray, distances: FloatArray) -> float:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,11 +21,11 @@ from mapping.prediction import (
     ProcessNoise,
     predict,
 )
-from mapping.sampling import SampledScan
+from mapping.surfels.sampling import SampledScan
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.archived_maps import ArchivedMaps
 from mapping.tracking.attempts import Attempt, ScanMatcher, best_of
-from mapping.tracking.fit import Fit
+from mapping.tracking.mapped_scan import MappedScan
 from mapping.tracking.pose_status import judge
 from mapping.tracking.tracking_state import TrackingState
 
@@ -35,24 +35,6 @@ _FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
 # Factors on the quality by which a result that is less consistent with the prediction must be better: with any
 # acceleration, and with any displacement.
 _BETTER, _CLEARLY_BETTER = 1.05, 1.1
-
-
-@dataclass(frozen=True, eq=False)
-class MappedScan:
-    """Result of a scan."""
-
-    state: MotionState  # pose at the stamp and velocity during the sweep, with their covariance
-    T_world_predicted: FloatArray  # (4, 4) predicted pose
-    registered: bool  # whether the pose is that of a registration; else it is the predicted one
-    # status, message: tracking status, and its reason
-    status: Status
-    message: str = ""
-    fit: Fit | None = None  # to the map; None where the scan was not compared with it
-    degenerate: tuple[str, ...] = ()  # names of the directions along which the prediction was kept
-    iterations: int = 0  # of the registration
-    added: bool = False  # whether the scan is good enough for the map, and was inserted
-    # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
-    is_connected: bool = True
 
 
 class Tracker(Stateful):

@@ -14,7 +14,7 @@ from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, Sweep
 from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
 from mapping.config import GlobalMapConfig, MappingConfig
-from mapping.mapper import Mapper
+from mapping.surfel_mapper import SurfelMapper
 from odometry.interface import Motion, Odometry
 from odometry.methods.consistency import ConsistencyCheck
 from odometry.methods.constant_velocity import ConstantVelocity
@@ -77,7 +77,7 @@ def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> No
 
 
 def localise_all(scans: list[Scan], motions: list[Motion]) -> list[Localised]:
-    localiser = ScanToMap(Mapper(MappingConfig()))
+    localiser = ScanToMap(SurfelMapper(MappingConfig()))
     measured = [motion.failure is None for motion in motions]
     estimates = [
         Estimated(scan, motion, 0.1 if k and measured[k] and measured[k - 1] else None)
@@ -113,7 +113,7 @@ def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_m
 
 
 def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanResult], Pipeline]:
-    pipeline = Pipeline(odometry, ScanToMap(Mapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
+    pipeline = Pipeline(odometry, ScanToMap(SurfelMapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
     return list(pipeline.run(scans)), pipeline
 
 

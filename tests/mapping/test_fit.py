@@ -7,7 +7,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
 from mapping.config import TrackingConfig
 from mapping.surfels.surfel_map import SurfelMap
-from mapping.tracking.fit import Fit, directional_support, measure_fit
+from mapping.tracking.attempts import measure_fit
+from mapping.tracking.fit import Fit, directional_support
 
 CONFIG = TrackingConfig()
 HALF = np.array([7.0, 5.0, 2.0])

@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from mapping.config import MappingConfig
-from mapping.sampling import SampledScan, Sampler
+from mapping.surfels.sampling import SampledScan, Sampler
 
 
 def shell(rng: np.random.Generator, radius_m: float, count: int = 20_000, stamp: float = 0.0) -> Scan:

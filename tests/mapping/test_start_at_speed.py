@@ -13,9 +13,9 @@ from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from mapping.config import MappingConfig
 from mapping.deskew import move
-from mapping.mapper import Mapper
 from mapping.prediction import Prior
-from mapping.tracking.tracker import MappedScan
+from mapping.surfel_mapper import SurfelMapper
+from mapping.tracking.mapped_scan import MappedScan
 
 COUNT = 12
 # What an odometry states of itself: a tenth of a degree and a centimetre.
@@ -41,7 +41,7 @@ def truth(at_speed: Simulation, scans: list[Scan]) -> FloatArray:
 
 
 def process(scans: list[Scan], motions: list[FloatArray | None]) -> list[MappedScan]:
-    mapper = Mapper(MappingConfig())
+    mapper = SurfelMapper(MappingConfig())
     priors = [Prior() if motion is None else Prior(motion, covariance=STATED) for motion in motions]
     return [mapper.process(scan, prior) for scan, prior in zip(scans, priors, strict=True)]
 

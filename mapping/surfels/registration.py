@@ -15,7 +15,7 @@ from mapping.degeneracy import find_degeneracy
 from mapping.deskew import Sweep, body_velocity
 from mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
 from mapping.prediction import MotionState, Prediction
-from mapping.sampling import MIN_CORRESPONDENCES
+from mapping.surfels.sampling import MIN_CORRESPONDENCES
 from mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.

@@ -15,10 +15,11 @@ from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
 from mapping.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
-from mapping.sampling import SampledScan, Sampler
+from mapping.surfels.sampling import SampledScan, Sampler
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.fit import Fit
-from mapping.tracking.tracker import MappedScan, Tracker
+from mapping.tracking.mapped_scan import MappedScan
+from mapping.tracking.tracker import Tracker
 
 # The velocity of a lost sensor fades by this factor a scan.
 _FADING = 0.7
@@ -27,7 +28,7 @@ _REDRAWS = 2
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 
 
-class Mapper(Stateful):
+class SurfelMapper(Stateful):
     """Holds the local map and the state of the last scan."""
 
     _sampler: Sampler
