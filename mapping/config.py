@@ -1,11 +1,14 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
 import math
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
+
+MappingName = Literal["surfels", "loam", "off"]
 
 
 class TrackingConfig(BaseModel):
@@ -22,30 +25,66 @@ class TrackingConfig(BaseModel):
         return self
 
 
+class _EarlierSwitch(BaseModel):
+    """The setting that `method` replaces; configurations of earlier versions have it."""
+
+    enabled: bool
+
+
 class MappingConfig(BaseModel):
-    """Scan-to-map registration."""
+    """Scan-to-map registration; LOAM's mapping ignores the settings marked "surfels only"."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    enabled: bool = Field(True, description="register scans to the local map, from the odometry's prediction")
+    method: MappingName = Field(
+        "surfels", description="surfels, loam (the mapping of LOAM) or off (the odometry alone)"
+    )
     cell_m: float | None = Field(
-        None, ge=0.01, description="edge of the finest surfel cells; null: a thirtieth of the scene's median range"
+        None,
+        ge=0.01,
+        description="edge of the finest surfel cells, null: the scene's median range / 30; loam: planar leaf size",
     )
     radius_m: float = Field(100.0, ge=1.0, description="radius of the local map around the sensor")
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")
     max_range_m: float = Field(100.0, gt=0.0, description="farther points are ignored")
-    keypoints: int = Field(3000, ge=100, description="points of a scan that are registered, at most")
-    continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
+    keypoints: int = Field(3000, ge=100, description="surfels only: points of a scan that are registered, at most")
+    continuous_time: bool = Field(
+        True, description="surfels only: estimate the velocity during the sweep together with its pose"
+    )
     prior_rotation_deg: float = Field(
-        3.0, gt=0.0, description="standard deviation of an odometry's rotation about each axis, where it gives none"
+        3.0,
+        gt=0.0,
+        description="surfels only: standard deviation of an odometry's rotation about an axis, where it gives none",
     )
     prior_translation_m: float = Field(
-        0.15, gt=0.0, description="standard deviation of an odometry's translation along each axis, where it gives none"
+        0.15,
+        gt=0.0,
+        description="surfels only: standard deviation of an odometry's translation along an axis, where it gives none",
     )
     prior_caution: float = Field(
-        10.0, gt=0.0, description="factor on the standard deviations of an odometry: its errors are correlated in time"
+        10.0,
+        gt=0.0,
+        description="surfels only: factor on an odometry's standard deviations; its errors are correlated in time",
     )
     tracking: TrackingConfig = TrackingConfig()
+
+    @property
+    def enabled(self) -> bool:
+        """Whether scans are registered to a map."""
+        return self.method != "off"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _takes_earlier_names(cls, values: Any) -> Any:
+        """`enabled: false` is the method off, unless a method is given; so is the false that YAML makes of off."""
+        if not isinstance(values, dict):
+            return values
+        values = dict(values)
+        if values.get("method") is False:
+            values["method"] = "off"
+        if "enabled" in values and not _EarlierSwitch(enabled=values.pop("enabled")).enabled:
+            values.setdefault("method", "off")
+        return values
 
     @model_validator(mode="after")
     def _ranges_leave_points(self) -> Self:

@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
 from lidarslam.core.errors import ConfigError
 from lidarslam.train.settings import TrainConfig, load_train_config
+from mapping.config import MappingConfig, MappingName
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -35,6 +36,47 @@ def test_settings_win_over_the_file(tmp_path: Path) -> None:
     config = load_config(file, ["odometry.kiss_icp.voxel_size_m=0.25"])
     assert config.odometry.kiss_icp.voxel_size_m == 0.25
     assert config.odometry.kiss_icp.max_range_m == 40.0
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "method"),
+    [
+        ("", [], "surfels"),
+        ("mapping: {method: loam}", [], "loam"),
+        ("mapping: {method: off}", [], "off"),
+        ("mapping: {method: 'off'}", [], "off"),
+        ("mapping: {enabled: true}", [], "surfels"),
+        ("mapping: {enabled: false}", [], "off"),
+        ("mapping: {enabled: 'no'}", [], "off"),
+        ("mapping: {enabled: false, method: loam}", [], "loam"),
+        ("mapping: {enabled: true, method: off}", [], "off"),
+        ("", ["mapping.enabled=false"], "off"),
+        ("", ["mapping.method=off"], "off"),
+        ("", ["mapping.enabled=false", "mapping.method=loam"], "loam"),
+        ("", ["mapping.method=loam", "mapping.enabled=false"], "loam"),
+        ("mapping: {enabled: false}", ["mapping.method=loam"], "loam"),
+        ("mapping: {enabled: false}", ["mapping.enabled=true"], "surfels"),
+        ("mapping: {method: loam}", ["mapping.enabled=false"], "off"),
+        ("mapping: {method: loam}", ["mapping.enabled=true"], "loam"),
+        ("mapping: {method: off}", ["mapping.enabled=true"], "surfels"),
+    ],
+)
+def test_the_switch_of_earlier_versions_gives_way_to_a_method_beside_it(
+    tmp_path: Path, text: str, settings: list[str], method: str
+) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(text)
+    mapping = load_config(file, settings).mapping
+    assert mapping.method == method
+    assert mapping.enabled == (method != "off")
+
+
+@pytest.mark.parametrize("method", get_args(MappingName))
+def test_every_mapping_is_dumped_so_that_it_loads_again(tmp_path: Path, method: MappingName) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_yaml(Config(mapping=MappingConfig(method=method))))
+    assert load_config(file).mapping.method == method
+    assert "enabled" not in Config().model_dump()["mapping"]
 
 
 def test_what_is_dumped_loads_again_with_the_section_on_the_run(tmp_path: Path) -> None:
@@ -75,6 +117,10 @@ def test_the_readers_options_stay_text(text: str) -> None:
             r"kiss_icp: min_range_m=6 must be less",
         ),
         (["mapping.tracking.lost_below=0.8"], r"tracking: lost_below=0\.8 must not exceed degraded_below=0\.6,"),
+        (["mapping.enabled=maybe"], r"mapping\.enabled='maybe': input should be a valid boolean"),
+        (["mapping.enabled=3", "mapping.method=loam"], r"mapping\.enabled=3: input should be a valid boolean"),
+        (["mapping.method=icp"], r"mapping\.method='icp': input should be 'surfels', 'loam' or 'off'"),
+        (["mapping.method=true"], r"mapping\.method=True: input should be 'surfels', 'loam' or 'off'"),
         (["mapping.min_range_m=100"], r"mapping: min_range_m=100 must be less than max_range_m=100, or"),
     ],
 )

@@ -20,6 +20,9 @@ from lidarslam.storage.directory import RUN_SECTION
 from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
 from odometry.config import OdometryConfig
 
+# The switch of earlier versions that mapping.method replaces.
+_MAPPING_SWITCH = "mapping.enabled"
+
 # Sections of config.yaml that are not settings: what was run, and what was trained on.
 SOURCES_SECTION = "trained_on"
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
@@ -68,10 +71,13 @@ class Config(BaseModel):
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """The defaults, changed by a YAML file and then by settings such as `odometry.kiss_icp.voxel_size_m=0.5`.
 
+    Among the settings, `mapping.enabled` of earlier versions overrules the file's `mapping.method`, not one beside it.
+
     Raises:
         ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
     """
-    return load_model(Config, path, settings, "odometry.kiss_icp.voxel_size_m=0.5")
+    switches_first = sorted(settings, key=lambda one: not _is_switch(one.partition("=")[0]))
+    return load_model(Config, path, switches_first, "odometry.kiss_icp.voxel_size_m=0.5")
 
 
 def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
@@ -130,6 +136,14 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
             raise ConfigError(f"--set {_short(setting)}: {key} is a value, not a section")
         tree = branch
     tree[keys[-1]] = value
+    if _is_switch(dotted) and value in (False, "off"):
+        tree["method"] = "off"
+    elif _is_switch(dotted) and tree.get("method") in (False, "off"):
+        del tree["method"]
+
+
+def _is_switch(dotted: str) -> bool:
+    return dotted.strip() == _MAPPING_SWITCH
 
 
 def _origin(path: Path | None, settings: Sequence[str]) -> str:

@@ -7,11 +7,13 @@ import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
 from mapping.prediction import Prior
 from mapping.surfel_mapper import SurfelMapper
+from mapping.tracking.mapped_scan import MappedScan
 from odometry.interface import Motion
 from odometry.methods.consistency import Consistency, ConsistencyCheck
 
@@ -24,6 +26,19 @@ class Localiser(Protocol):
 
     def state(self) -> State:
         """What it carries from scan to scan."""
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+
+
+class Mapper(Protocol):
+    """A scan-to-map registration with a map of its own."""
+
+    def process(self, scan: Scan, prior: Prior) -> MappedScan:
+        """Register the next scan to the map, and insert it."""
+
+    def state(self) -> State:
+        """What it carries from scan to scan, the map included."""
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state, before the first scan."""
@@ -66,11 +81,11 @@ class OdometryAlone(Stateful):
 class ScanToMap(Stateful):
     """Registers each scan to the map, with the odometry as initial guess."""
 
-    _mapper: SurfelMapper
+    _mapper: Mapper
     _T_odom_lidar: Annotated[FloatArray, Shape(4, 4)]
     _T_world_last: Annotated[FloatArray, Shape(4, 4)]
 
-    def __init__(self, mapper: SurfelMapper) -> None:
+    def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
         self._T_odom_lidar = np.eye(4)
         self._T_world_last = np.eye(4)
@@ -117,7 +132,11 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
 
 
 def make_localiser(config: Config) -> Localiser:
-    """Scan-to-map registration when it is enabled, else the odometry alone."""
-    if config.mapping.enabled:
-        return ScanToMap(SurfelMapper(config.mapping))
-    return OdometryAlone(ConsistencyCheck())
+    """The configured scan-to-map registration, or the odometry alone."""
+    if config.mapping.method == "off":
+        return OdometryAlone(ConsistencyCheck())
+    if config.mapping.method == "loam":
+        from mapping.loam.mapper import LoamMapper  # loads Open3D
+
+        return ScanToMap(LoamMapper(config.mapping))
+    return ScanToMap(SurfelMapper(config.mapping))

@@ -1,19 +1,24 @@
 """From odometry to a pose: what the motion during a sweep is taken for, and the way through the whole pipeline."""
 
+import copy
+import sys
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
 from lidarslam.core.scan import Scan
+from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, SweepMotion
-from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap
+from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from mapping.config import GlobalMapConfig, MappingConfig
+from mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from mapping.surfel_mapper import SurfelMapper
 from odometry.interface import Motion, Odometry
 from odometry.methods.consistency import ConsistencyCheck
@@ -171,3 +176,43 @@ def test_results_carry_what_the_map_says_of_the_pose(room_scans: list[Scan], roo
     assert results[3].inlier_ratio > 0.9
     assert results[3].degenerate == ()
     assert set(results[3].stage_ms) == {"read", "odometry", "refine", "deskew", "map"}
+
+
+class OtherMapper(SurfelMapper):
+    """Another registration with the same methods, in place of LOAM's."""
+
+
+@pytest.fixture
+def _other_mapper(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mapping.loam.mapper", SimpleNamespace(LoamMapper=OtherMapper))
+
+
+@pytest.mark.usefixtures("_other_mapper")
+def test_the_configuration_chooses_the_mapper() -> None:
+    assert type(_mapper_of(MappingConfig())) is SurfelMapper
+    assert type(_mapper_of(MappingConfig(method="loam"))) is OtherMapper
+    assert isinstance(make_localiser(Config(mapping=MappingConfig(method="off"))), OdometryAlone)
+
+
+def _mapper_of(mapping: MappingConfig) -> object:
+    localiser = make_localiser(Config(mapping=mapping))
+    assert isinstance(localiser, ScanToMap)
+    return localiser._mapper
+
+
+@pytest.mark.usefixtures("_other_mapper")
+@pytest.mark.parametrize("method", ["surfels", "loam"])
+def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
+    room_scans: list[Scan], room_truth: Trajectory, method: MappingName
+) -> None:
+    config = Config(mapping=MappingConfig(method=method))
+    motions = [np.eye(4), *room_truth.relative_motions()]
+    estimates = [Estimated(scan, Motion(T, 100), 0.1) for scan, T in zip(room_scans[:8], motions, strict=False)]
+    whole, resumed = make_localiser(config), make_localiser(config)
+    for estimated in estimates[:5]:
+        whole.localise(estimated, None)
+    resumed.restore(Saved(copy.deepcopy(whole.state())))
+    for estimated in estimates[5:]:
+        first, second = whole.localise(estimated, None), resumed.localise(estimated, None)
+        np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
+        np.testing.assert_array_equal(first.T_odom_lidar, second.T_odom_lidar)
