@@ -2,16 +2,21 @@
 
 import contextlib
 import json
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
+from lidarslam.commands.options import take_config
+from lidarslam.commands.run import run
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
@@ -19,6 +24,7 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.run.merge.merge import MergeOutcome
 from lidarslam.run.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary import WrittenMap
+from mapping.config import MappingName
 from odometry.config import ImageConfig, NetworkConfig
 from odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from odometry.network.networks import make_network
@@ -132,6 +138,16 @@ def test_weights_are_those_of_the_learned_odometry(recording: Path, tmp_path: Pa
             1,
             "only predicts",
         ),
+        (
+            ["run", "{recording}", "--out", "{out}", "--no-mapping", "--mapping", "loam"],
+            2,
+            "--no-mapping is --mapping off, not --mapping loam",
+        ),
+        (
+            ["run", "{recording}", "--out", "{out}", "--mapping", "icp"],
+            2,
+            "'icp' is not one of 'surfels', 'loam'",
+        ),
         (["run", "{recording}", "--out", "{recording}/000000.npy"], 1, "a file is in the way"),
         (["merge", "--out", "{out}"], 2, "Missing argument 'SOURCE...'"),
         (["merge", "{recording}", "--out", "{out}"], 1, "expected two recordings or more"),
@@ -153,6 +169,43 @@ def test_mistakes_get_one_line(
         assert result.stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("arguments", "method"),
+    [
+        ([], "surfels"),
+        (["--mapping"], "surfels"),
+        (["--mapping", "loam"], "loam"),
+        (["--mapping", "off"], "off"),
+        (["--no-mapping"], "off"),
+        (["--no-mapping", "--mapping", "off"], "off"),
+        (["--set", "mapping.enabled=false"], "off"),
+        (["--set", "mapping.enabled=false", "--mapping"], "surfels"),
+        (["--set", "mapping.method=loam"], "loam"),
+        (["--set", "mapping.method=loam", "--no-mapping"], "off"),
+    ],
+)
+def test_the_mapping_is_chosen_on_the_command_line(recording: Path, arguments: list[str], method: str) -> None:
+    context = run.make_context("run", [str(recording), *arguments, "--out", "run"])
+    assert take_config(context.params, recording).mapping.method == method
+
+
+def test_the_command_line_offers_the_mappings_that_there_are() -> None:
+    (option,) = [one for one in run.params if one.name == "mapping"]
+    assert isinstance(option.type, click.Choice)
+    assert tuple(option.type.choices) == get_args(MappingName)
+
+
+def test_a_run_of_an_earlier_version_is_recognised_as_finished(recording: Path, tmp_path: Path) -> None:
+    command = ("run", recording, "--out", tmp_path / "run", "--stop", 2)
+    assert lidarslam(*command).exit_code == 0
+    config = tmp_path / "run" / "config.yaml"
+    text = re.sub(r"method: surfels.*", "enabled: true", config.read_text())
+    assert "surfels " not in re.sub(r"#.*", "", text)
+    config.write_text(text)
+    assert "is finished already" in lidarslam(*command, "--resume").stdout
+    assert "holds another finished run" in lidarslam(*command, "--resume", "--mapping", "off").stderr
+
+
 def test_an_earlier_run_is_replaced_only_when_asked(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     assert lidarslam("run", recording, "--out", out, "--stop", 2).exit_code == 0
@@ -166,7 +219,7 @@ def test_an_earlier_run_is_replaced_only_when_asked(recording: Path, tmp_path: P
 def test_merge_says_who_is_left_out(recording: Path, tmp_path: Path) -> None:
     shutil.copytree(recording, tmp_path / "again")
     out = tmp_path / "merged"
-    fast = ("--odometry", "kiss-icp", "--set", "mapping.enabled=false")
+    fast = ("--odometry", "kiss-icp", "--set", "mapping.method=off")
     result = lidarslam("merge", recording, tmp_path / "again", "--out", out, *fast)
     assert result.exit_code == 1  # five scans are too few to be sure of
     assert "01_room: 5 scans" in result.stdout

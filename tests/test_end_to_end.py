@@ -28,13 +28,13 @@ from lidarslam.storage.finished_run import load_run
 
 KISS_ICP = [
     "odometry.method=kiss-icp",
-    "mapping.enabled=false",
+    "mapping.method=off",
     "odometry.kiss_icp.voxel_size_m=0.2",
     "odometry.kiss_icp.max_range_m=30",
     "global_map.voxel_size_m=0.1",
 ]
 MAPPING = ["global_map.voxel_size_m=0.1"]
-KITTI = ["odometry.method=kiss-icp", "mapping.enabled=false"]
+KITTI = ["odometry.method=kiss-icp", "mapping.method=off"]
 
 
 def quiet(number: int, total: int, result: ScanResult) -> None:
@@ -169,7 +169,7 @@ def test_a_wrong_odometry_is_corrected_by_the_map(recording: Path, tmp_path: Pat
 def test_an_external_trajectory_builds_an_exact_map(
     recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
 ) -> None:
-    config = load_config(None, ["odometry.method=external", "mapping.enabled=false", "global_map.voxel_size_m=0.1"])
+    config = load_config(None, ["odometry.method=external", "mapping.method=off", "global_map.voxel_size_m=0.1"])
     prior = recording / "ground_truth.tum"
     execute(RunRequest(recording, tmp_path / "run", config, prior=prior), quiet)
     cloud = o3d.io.read_point_cloud(str(tmp_path / "run" / "map.ply"))

@@ -21,6 +21,7 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, note, say
 @click.command(
     cls=CommandWithExample,
     epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods learned,learned+map,kiss-icp
+    lidarslam compare office.mcap --out compared --methods learned+map,learned+loam
     lidarslam compare office.mcap --out compared --methods kiss-icp,prior --prior wheel_odometry.tum
     lidarslam compare --benchmark configs/benchmarks/kitti.yaml --data KITTI --out compared""",
 )
@@ -29,12 +30,12 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, note, say
 @click.option(
     "--methods",
     metavar="NAME,...",
-    help="BASE[@VOXEL][+map][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  "
+    help="BASE[@VOXEL][+map|+loam][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  "
     "[default: learned+map,kiss-icp, or the benchmark's]",
 )
 @click.option("--benchmark", type=FILE, metavar="FILE", help="Recordings and methods as in the file.")
 @click.option("--data", type=PATH, metavar="DIR", help="Root of the benchmark's paths.")
-@click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory of the methods prior and prior+map.")
+@click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory of prior, prior+map and prior+loam.")
 @click.option("--reference", metavar="METHOD|FILE", help="Reference.  [default: the ground truth]")
 @click.option("--reference-map", type=FILE, metavar="FILE", help="Point cloud to compare the maps with.")
 @click.option("--memory-limit-mb", type=POSITIVE, help="Memory limit of a method.")

@@ -100,6 +100,17 @@ odometry_options = _together(
         help="Weights of the learned odometry, or the folder of an exported network.  [default: included]",
     ),
 )
+mapping_options = _together(
+    # With a value or without: before there was a choice, it switched mapping on.
+    click.option(
+        "--mapping",
+        type=click.Choice(["surfels", "loam", "off"]),
+        is_flag=False,
+        flag_value="surfels",
+        help="Register scans to a map of surfels or as LOAM's mapping does.  [default: surfels]",
+    ),
+    click.option("--no-mapping", is_flag=True, help="The odometry alone, as --mapping off."),
+)
 
 
 def take_config(options: dict[str, Any], *sources: Path) -> "Config":
@@ -138,10 +149,16 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
         odometry = "external"
     if odometry is not None:
         settings.append(f"odometry.method={odometry}")
-    for section in ("mapping", "pose_graph"):
-        enabled = options.pop(section, None)
-        if enabled is not None:
-            settings.append(f"{section}.enabled={str(enabled).lower()}")
+    mapping = options.pop("mapping", None)
+    if options.pop("no_mapping", False):
+        if mapping not in (None, "off"):
+            raise click.UsageError(f"--no-mapping is --mapping off, not --mapping {mapping}; leave one of them out")
+        mapping = "off"
+    if mapping is not None:
+        settings.append(f"mapping.method={mapping}")
+    pose_graph = options.pop("pose_graph", None)
+    if pose_graph is not None:
+        settings.append(f"pose_graph.enabled={str(pose_graph).lower()}")
     return settings
 
 

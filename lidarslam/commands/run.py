@@ -11,6 +11,7 @@ from lidarslam.commands.options import (
     SOURCE,
     CommandWithExample,
     config_options,
+    mapping_options,
     odometry_options,
     reader_options,
     scan_options,
@@ -23,6 +24,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
     cls=CommandWithExample,
     epilog="""lidarslam run KITTI --sequence 04 --out runs/04
     lidarslam run office.mcap --out runs/office --rerun save
+    lidarslam run office.mcap --out runs/loam --mapping loam
     lidarslam run office.mcap --out runs/wheels --prior wheel_odometry.tum
     lidarslam run office.mcap --out runs/office --rerun save --resume""",
 )
@@ -30,7 +32,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 @click.option("--out", type=PATH, required=True, metavar="RUN", help="Run directory for the results.")
 @odometry_options
 @click.option("--prior", type=FILE, metavar="TUM_FILE", help="External trajectory to use as the odometry.")
-@click.option("--mapping/--no-mapping", default=None, help="Register scans to the map.  [default: mapping]")
+@mapping_options
 @click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
 @scan_options
 @click.option(

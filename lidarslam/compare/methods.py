@@ -1,16 +1,21 @@
-"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map][+graph]."""
+"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph]."""
 
 import re
 from dataclasses import dataclass
 from typing import get_args
 
 from lidarslam.core.errors import ConfigError
+from mapping.config import MappingName
 from odometry.config import OdometryName
 
 # Name for the user -> name of the odometry in the configuration.
 _BASES = {"learned": "learned", "kiss-icp": "kiss-icp", "constant-velocity": "constant-velocity", "prior": "external"}
-_NAME = re.compile(r"(?P<base>[a-z][a-z-]*)(@(?P<voxel>[^+@]+))?(?P<map>\+map)?(?P<graph>\+graph)?")
-_GRAMMAR = f"{', '.join(_BASES)}; each with +map, +graph or +map+graph; and kiss-icp@0.5 for a voxel size of 0.5 m"
+_NAME = re.compile(r"(?P<base>[a-z][a-z-]*)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?")
+_MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
+_GRAMMAR = (
+    f"{', '.join(_BASES)}; each with +map or +loam, with +graph, or with both as in learned+map+graph;"
+    " and kiss-icp@0.5 for a voxel size of 0.5 m"
+)
 
 
 @dataclass(frozen=True)
@@ -38,11 +43,14 @@ def parse_method(name: str) -> Method:
     odometry = _BASES[match["base"]]
     if odometry not in get_args(OdometryName):
         raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
-    if odometry == "constant-velocity" and not match["map"]:
-        raise ConfigError(f"{name}: only predicts; compare constant-velocity+map, which corrects it against the map")
+    if odometry == "constant-velocity" and not match["mapping"]:
+        raise ConfigError(
+            f"{name}: only predicts; compare constant-velocity+map or constant-velocity+loam, which correct it against"
+            " a map"
+        )
     voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)
-    mapping, pose_graph = (str(match[part] is not None).lower() for part in ("map", "graph"))
-    switches = (f"mapping.enabled={mapping}", f"pose_graph.enabled={pose_graph}")
+    pose_graph = str(match["graph"] is not None).lower()
+    switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
     return Method(name, (f"odometry.method={odometry}", *voxel, *switches))
 
 

@@ -118,8 +118,8 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
     method = config.odometry.method
     if method == "constant-velocity" and not config.mapping.enabled:
         raise ConfigError(
-            "constant-velocity only predicts the motion, and needs scan-to-map registration."
-            " Choose --odometry learned, give a trajectory with --prior, or leave --no-mapping out"
+            "constant-velocity only predicts the motion, and needs scan-to-map registration. Choose --odometry learned,"
+            " give a trajectory with --prior, or a mapping with --mapping surfels or --mapping loam"
         )
     if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")

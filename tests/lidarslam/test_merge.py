@@ -195,7 +195,7 @@ def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) 
 # What follows is about files and errors; the rooms are too small to be joined.
 FAST = (
     "odometry.method=kiss-icp",
-    "mapping.enabled=false",
+    "mapping.method=off",
     "odometry.kiss_icp.voxel_size_m=0.2",
     "odometry.kiss_icp.max_range_m=30",
 )

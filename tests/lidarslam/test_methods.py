@@ -19,6 +19,24 @@ def test_map_overrules_a_configuration_either_way() -> None:
     assert not load_config(None, ["mapping.enabled=true", *parse_method("kiss-icp").settings]).mapping.enabled
 
 
+@pytest.mark.parametrize(
+    ("name", "method", "closes_loops"),
+    [
+        ("learned", "off", False),
+        ("learned+map", "surfels", False),
+        ("learned+loam", "loam", False),
+        ("constant-velocity+loam", "loam", False),
+        ("prior+loam+graph", "loam", True),
+        ("kiss-icp@0.5+loam", "loam", False),
+        ("learned+graph", "off", True),
+    ],
+)
+@pytest.mark.parametrize("before", ["surfels", "loam", "off"])
+def test_the_name_decides_the_mapping(name: str, method: str, closes_loops: bool, before: str) -> None:
+    config = load_config(None, [f"mapping.method={before}", *parse_method(name).settings])
+    assert (config.mapping.method, config.pose_graph.enabled) == (method, closes_loops)
+
+
 @pytest.mark.parametrize(("name", "size_m"), [("kiss-icp@0.5", 0.5), ("kiss-icp@1", 1.0), ("kiss-icp@0.25+map", 0.25)])
 def test_a_voxel_size_stands_behind_the_at(name: str, size_m: float) -> None:
     assert load_config(None, parse_method(name).settings).odometry.kiss_icp.voxel_size_m == size_m
@@ -38,12 +56,15 @@ def test_prior_is_the_external_odometry() -> None:
         ("external", "no method is called 'external'"),
         ("kiss-icp+mapping", r"no method is called 'kiss-icp\+mapping'"),
         ("kiss-icp+graph+map", "no method is called"),
+        ("kiss-icp+map+loam", r"no method is called .* each with \+map or \+loam, with \+graph, or"),
+        ("kiss-icp+graph+loam", "no method is called"),
+        ("learned+surfels", "no method is called"),
         ("", "no method is called ''"),
         ("prior@0.5", "only kiss-icp takes a voxel size"),
         ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
         ("kiss-icp@-1", "expected a voxel size"),
         ("kiss-icp@nan", "expected a voxel size"),
-        ("constant-velocity", r"only predicts; compare constant-velocity\+map"),
+        ("constant-velocity", r"only predicts; compare constant-velocity\+map or constant-velocity\+loam"),
     ],
 )
 def test_what_is_no_method_is_refused_in_words(name: str, message: str) -> None:

@@ -405,6 +405,8 @@ def contents(folder: Path) -> dict[str, bytes]:
         (["--stop", "13"], "stop 12 (now 13)"),
         (["--start", "1"], "start 0 (now 1)"),
         (["--pose-graph"], "pose_graph.enabled False (now True)"),
+        (["--mapping", "loam"], "mapping.method surfels (now loam)"),
+        (["--odometry", "learned", "--no-mapping"], "mapping.method surfels (now off)"),
         (["--set", "mapping.keypoints=900"], "mapping.keypoints 800 (now 900)"),
         (["--odometry", "learned"], "odometry.method constant-velocity (now learned)"),
     ],
