@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from mapping_accuracy import (
+    DEFAULT_METHODS,
     METHODS,
     Recorded,
     add_simulation_arguments,
@@ -42,6 +43,7 @@ from lidarslam.simulation.worlds.registry import WORLDS
 from odometry.config import OdometryConfig
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
+_DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]
 
 
 def nees_of_poses(results: Sequence[ScanResult], truth: FloatArray) -> FloatArray:
@@ -100,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
-    parser.add_argument("--methods", nargs="+", choices=_MAPPED, default=_MAPPED)
+    parser.add_argument("--methods", nargs="+", choices=_MAPPED, default=_DEFAULT)
     parser.add_argument("--all", action="store_true", help="lost and degraded scans too, where they have a covariance")
     options = parser.parse_args(arguments)
     if not options.sources and not options.worlds:

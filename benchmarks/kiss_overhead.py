@@ -77,7 +77,7 @@ def run_ours(source: Path) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
-        config = load_config(None, ["odometry.method=kiss-icp", "mapping.enabled=false"])
+        config = load_config(None, ["odometry.method=kiss-icp", "mapping.method=off"])
         outcome = execute(RunRequest(source, Path(folder) / "run", config), lambda *_: None)
         whole_s = time.perf_counter() - started
         trajectory = read_tum(Path(folder) / "run" / "trajectory.tum")

@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--graph", action="store_true", help="with a pose graph")
     arguments = parser.parse_args()
     global_map._MIN_PENDING = 20_000
-    settings = ["mapping.enabled=false", "global_map.voxel_size_m=0.1", f"pose_graph.enabled={arguments.graph}"]
+    settings = ["mapping.method=off", "global_map.voxel_size_m=0.1", f"pose_graph.enabled={arguments.graph}"]
     header = ["scans", "memory, MB", "state, MB", "ms a scan"]
     print_row(header)
     print_row(["---"] * len(header))

@@ -49,9 +49,14 @@ BEYOND_TRUTH_S = 0.2
 
 METHODS = {
     "learned+map": Config(),
+    "learned+loam": Config(mapping=MappingConfig(method="loam")),
     "constant-velocity+map": Config(odometry=OdometryConfig(method="constant-velocity")),
-    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(enabled=False)),
+    "constant-velocity+loam": Config(
+        odometry=OdometryConfig(method="constant-velocity"), mapping=MappingConfig(method="loam")
+    ),
+    "KISS-ICP": Config(odometry=OdometryConfig(method="kiss-icp"), mapping=MappingConfig(method="off")),
 }
+DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP")
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +171,7 @@ def with_odometry(mapping: MappingConfig) -> Config:
 def run_kiss(recorded: Recorded, kiss: KissConfig) -> Outcome:
     """KISS-ICP alone."""
     odometry = OdometryConfig(method="kiss-icp", kiss_icp=kiss)
-    return localise(recorded, Config(odometry=odometry, mapping=MappingConfig(enabled=False)))
+    return localise(recorded, Config(odometry=odometry, mapping=MappingConfig(method="off")))
 
 
 def tune_kiss(recorded: Recorded, voxels: Sequence[float]) -> tuple[float, Outcome]:

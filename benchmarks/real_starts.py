@@ -45,10 +45,13 @@ from lidarslam.pipeline.scan_stream import in_order
 # Methods that `lidarslam run` has, and the options that choose them.
 OPTIONS: dict[str, tuple[str, ...]] = {
     "learned+map": (),
+    "learned+loam": ("--mapping", "loam"),
     "constant-velocity+map": ("--odometry", "constant-velocity"),
+    "constant-velocity+loam": ("--odometry", "constant-velocity", "--mapping", "loam"),
     "KISS-ICP": ("--odometry", "kiss-icp", "--no-mapping"),
 }
 METHODS = (*OPTIONS, *PEERS)
+DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "CT-ICP")
 REFERENCE = "KISS-ICP"
 
 
@@ -219,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, run, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+", type=Path, help="recordings")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[*OPTIONS, "CT-ICP"])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=DEFAULT_METHODS)
     parser.add_argument("--steps", nargs="+", type=int, default=[1], help="take every n-th scan")
     parser.add_argument("--every", type=int, default=10, help="scans from one start to the next")
     parser.add_argument("--scans", type=int, default=50, help="of a run")

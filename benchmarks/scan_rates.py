@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from evalio_peers import PEERS, PeerError, run_peer
 from mapping_accuracy import (
+    DEFAULT_METHODS,
     METHODS,
     Recorded,
     add_simulation_arguments,
@@ -71,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--steps", nargs="+", type=int, default=[1, 2, 3, 5], help="times the scan interval")
-    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *PEERS], default=[*METHODS, "CT-ICP"])
+    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *PEERS], default=[*DEFAULT_METHODS, "CT-ICP"])
     options = parser.parse_args(arguments)
     if not options.sources and not options.worlds:
         options.worlds = list(WORLDS)

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mapping_accuracy import METHODS, make_simulation, print_row
+from mapping_accuracy import DEFAULT_METHODS, METHODS, make_simulation, print_row
 from simulated_faults import (
     Cover,
     Faulty,
@@ -235,7 +235,7 @@ def main() -> None:
     kinds = [*_FAULTS, "traffic", "still", "featureless"]
     parser.add_argument("--faults", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--places", nargs="+", choices=list(_PLACES), default=["office", "tunnel", "street"])
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=DEFAULT_METHODS)
     parser.add_argument("--wrong-m", type=float, default=0.2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep-moved", action="store_true", help="what was seen through stays in the map")

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from real_starts import Ended, Judged, judge, length_error, row, starts_of
+from real_starts import DEFAULT_METHODS, METHODS, OPTIONS, Ended, Judged, judge, length_error, row, starts_of
 
+from lidarslam.commands.run import run
 from lidarslam.core.geometry import make_transform
 from lidarslam.core.trajectory import Trajectory
 
@@ -15,6 +16,13 @@ def _straight(speed_mps: float, scans: int = 21) -> Trajectory:
 
 def _judged(start: int, ate_m: float | None, length_percent: float | None, status: int = 0) -> Judged:
     return Judged(start, 50, ate_m, length_percent, 0, 1, status)
+
+
+@pytest.mark.parametrize("method", OPTIONS)
+def test_our_methods_are_runs_of_the_program(method: str) -> None:
+    context = run.make_context("run", ["recording", "--out", "run", *OPTIONS[method]])
+    assert (context.params["mapping"] == "loam") == method.endswith("+loam")
+    assert set(DEFAULT_METHODS) <= set(METHODS)
 
 
 def test_runs_near_the_end_are_as_short_as_half_of_what_is_wanted() -> None:
