@@ -128,15 +128,15 @@ def simulate(world: str, motion: str, sensor: str, mount: str, seed: int, laps: 
     return Lap(f"{world}, {motion}", simulation, used, truth.T_world_lidar[used], truth.distances[used])
 
 
-def drifting(lap: Lap, factor: float, seed: int) -> FloatArray:
+def drifting(truth: FloatArray, way_m: FloatArray, factor: float, seed: int) -> FloatArray:
     """Estimates (M, 4, 4) with 1 % of the way and, mostly in heading, 2 degrees in 100 m of error, times a factor."""
     rng = np.random.default_rng([seed, 77])
-    motions = inverse(lap.truth[:-1]) @ lap.truth[1:]
-    steps = np.diff(lap.way_m)
-    stretch = (lap.way_m[1:] / _DRIFT_CHANGES_M).astype(np.intp)
+    motions = inverse(truth[:-1]) @ truth[1:]
+    steps = np.diff(way_m)
+    stretch = (way_m[1:] / _DRIFT_CHANGES_M).astype(np.intp)
     sigmas = np.array([np.deg2rad(0.3) / 100.0] * 2 + [np.deg2rad(2.0) / 100.0] + [0.01 / np.sqrt(3.0)] * 3)
     rates = factor * sigmas * rng.normal(size=(int(stretch.max()) + 1, 6))
-    return chain(lap.truth[0], motions @ exp(rates[stretch] * steps[:, None]))
+    return chain(truth[0], motions @ exp(rates[stretch] * steps[:, None]))
 
 
 def follow(lap: Lap, estimates: FloatArray, config: PoseGraphConfig) -> Followed:
@@ -287,7 +287,7 @@ def main() -> None:
     print_row(["---"] * len(header))
     notes: list[str] = []
     for lap in laps(arguments):
-        estimates = drifting(lap, arguments.drift, arguments.seed)
+        estimates = drifting(lap.truth, lap.way_m, arguments.drift, arguments.seed)
         followed = follow(lap, estimates, config)
         print_row(row(lap, estimates, followed))
         notes += [f"{lap.name}: {line}" for line in refusals(lap, followed)]

@@ -1,11 +1,9 @@
 """Mean map entropy: crispness of a map, without a reference."""
 
 from dataclasses import dataclass
-from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from evaluation.map.voxel_thinning import thin
 from lidarslam.core.geometry import FloatArray
@@ -26,8 +24,8 @@ _QUICK_SAMPLES = 10_000
 _FEWEST_NEIGHBOURS = 5
 # Standard deviation added in every direction, as the entropy of a flawless plane is -inf.
 _RESOLUTION_M = 1e-3
-# Neighbours held in memory at a time.
-_CHUNK = 4_000_000
+# Neighbourhoods held in memory at a time, of at most some 900 points each with the default radius and spacing.
+_CHUNK = 4_000
 
 
 @dataclass(frozen=True)
@@ -65,19 +63,22 @@ def map_entropy(
     thinned = thin(points, spacing_m)
     if len(thinned) < _FEWEST_NEIGHBOURS:
         return None
+    import open3d as o3d
+
     thinned = thinned - thinned.mean(axis=0)
-    tree = cKDTree(thinned, balanced_tree=False, compact_nodes=False)
+    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(thinned))
+    search.fixed_radius_index(radius_m)
     sample = thinned[:: max(1, -(-len(thinned) // most_samples))]
-    counts = np.asarray(tree.query_ball_point(sample, radius_m, return_length=True, workers=-1), dtype=np.int64)
-    sample, counts = sample[counts >= _FEWEST_NEIGHBOURS], counts[counts >= _FEWEST_NEIGHBOURS]
-    if not len(sample):
+    entropies = []
+    for start in range(0, len(sample), _CHUNK):
+        centres = sample[start : start + _CHUNK].copy()
+        found, _, ends = search.fixed_radius_search(o3d.core.Tensor.from_numpy(centres), radius_m, False)
+        counts = np.diff(ends.numpy())
+        entropies.append(_entropies(centres, thinned[found.numpy()], counts)[counts >= _FEWEST_NEIGHBOURS])
+    values = np.concatenate(entropies)
+    if not len(values):
         return None
-    entropies = np.empty(len(sample))
-    for chunk in _chunks(counts):
-        found = tree.query_ball_point(sample[chunk], radius_m, workers=-1)
-        neighbours = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(counts[chunk].sum()))
-        entropies[chunk] = _entropies(sample[chunk], thinned[neighbours], counts[chunk])
-    return MapEntropy(float(entropies.mean()), radius_m, spacing_m, len(sample))
+    return MapEntropy(float(values.mean()), radius_m, spacing_m, len(values))
 
 
 def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> MapEntropy | None:
@@ -91,13 +92,6 @@ def sampled_map_entropy(points: FloatArray, most_points: int = MOST_POINTS) -> M
         drawn = (cells @ _PRIMES) * _GOLDEN & _BITS
         points = points[drawn < share * _BITS]
     return map_entropy(points, most_samples=_QUICK_SAMPLES)
-
-
-def _chunks(counts: NDArray[np.int64]) -> list[slice]:
-    """Successive points with no more neighbours together than fit into memory."""
-    number = np.cumsum(counts) // _CHUNK
-    borders = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(counts)]
-    return [slice(first, end) for first, end in pairwise(borders)]
 
 
 def _entropies(centres: FloatArray, neighbours: FloatArray, counts: NDArray[np.int64]) -> FloatArray:
