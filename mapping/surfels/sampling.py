@@ -11,18 +11,13 @@ from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from mapping.config import MappingConfig
 from mapping.deskew import Sweep
+from mapping.scene_scale import MIN_POINTS, SceneScale
 
 # Fewer keypoints, or correspondences of them, make no pose.
-MIN_CORRESPONDENCES = 60
+MIN_CORRESPONDENCES = MIN_POINTS
 # Spacing of the points that go into the map, and of the keypoints, in cells.
 _MAP_SPACING = 0.5
 _KEYPOINT_SPACING = 2.5
-# Cells per median range, and bounds of their size.
-_CELLS_PER_RANGE = 30.0
-_CELL_BOUNDS_M = (0.05, 1.0)
-# The cell size changes when the smoothed median range has changed by this factor.
-_RANGE_CHANGE = 2.0
-_RANGE_SMOOTHING = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +64,16 @@ class SampledScan:
 class Sampler(Stateful):
     """Thins scans by the scale of the scene, the smoothed median range."""
 
-    _cell_range_m: float
-    _range_m: float
+    _scale: SceneScale
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
-        self._cell_range_m = 0.0  # median range of the present cell size
-        self._range_m = 0.0
+        self._scale = SceneScale(config)
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
         squared = np.einsum("ij,ij->i", scan.points, scan.points)
-        cell_m = self._update_scale(squared)
+        cell_m = self._scale.update(squared)
         kept = one_per_cell(scan.points, _MAP_SPACING * cell_m)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
         inside = squared.take(kept)
@@ -92,18 +85,4 @@ class Sampler(Stateful):
         if len(keys) > self._config.keypoints:
             keys = keys[np.linspace(0, len(keys) - 1, self._config.keypoints).astype(np.intp)]
         elevations = np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
-        return SampledScan(scan.stamp, cell_m, self._range_m, sweep, elevations, sweep.take(keys))
-
-    def _update_scale(self, squared: FloatArray) -> float:
-        """The cell size for the latest squared ranges (N,), with hysteresis."""
-        # Fewer points are a covered sensor, not another scene.
-        if np.count_nonzero(squared > self._config.min_range_m**2) >= MIN_CORRESPONDENCES:
-            median_m = float(np.sqrt(np.median(squared[:: max(1, len(squared) // 5000)])))
-            new = self._range_m == 0.0
-            self._range_m = median_m if new else self._range_m + _RANGE_SMOOTHING * (median_m - self._range_m)
-        if self._config.cell_m is not None:
-            return self._config.cell_m
-        low_m, high_m = self._cell_range_m / _RANGE_CHANGE, self._cell_range_m * _RANGE_CHANGE
-        if self._range_m > 0.0 and not low_m <= self._range_m <= high_m:
-            self._cell_range_m = self._range_m
-        return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
+        return SampledScan(scan.stamp, cell_m, self._scale.range_m, sweep, elevations, sweep.take(keys))
