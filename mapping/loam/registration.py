@@ -5,14 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
-from lidarslam.core.geometry import FloatArray, orthonormalize, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, orthonormalize, transform_points
 from mapping.degeneracy import find_degeneracy
 from mapping.gauss_newton import NormalEquations, gauss_newton, point_to_plane_jacobian
-from mapping.loam.feature_map import Correspondences, FeatureMap, match_lines, match_planes
+from mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from mapping.tracking.fit import Fit
 
-# Iterations, each with new correspondences, and the displacement of a point at the mean range that ends them.
+# Iterations, and the displacement of a point at the mean range that ends them.
 _ITERATIONS, _CONVERGED_M = 10, 0.005
+# Correspondences are kept over a displacement of this share of the spacing of the map.
+_SAME = 0.1
 _FEWEST_CORRESPONDENCES = 50
 # The weight of a residual falls by this for each metre, and vanishes below the least.
 _WEIGHT_SLOPE, _LEAST_WEIGHT = 0.9, 0.1
@@ -56,7 +58,7 @@ def register(
         maps: local map.
         spacing_m: of its points.
     """
-    problem = _Problem(edges, planes, maps, T_predicted)
+    problem = _Problem(edges, planes, maps, spacing_m, T_predicted)
     if not problem.is_constrained:
         return None
     degeneracy = problem.degeneracy()
@@ -82,50 +84,55 @@ def register(
 class _Problem:
     """Residuals of a sweep's features with the lines and planes of the map, at the latest pose."""
 
-    def __init__(self, edges: FloatArray, planes: FloatArray, maps: FeatureMaps, T_world_lidar: FloatArray) -> None:
-        self._edges, self._planes, self._maps = edges, planes, maps
+    def __init__(
+        self, edges: FloatArray, planes: FloatArray, maps: FeatureMaps, spacing_m: float, T_world_lidar: FloatArray
+    ) -> None:
+        self._edges, self._planes, self._maps, self._spacing_m = edges, planes, maps, spacing_m
         self._match(T_world_lidar)
+        self._evaluate(T_world_lidar)
 
     @property
     def is_constrained(self) -> bool:
         """Whether there are enough correspondences for a pose."""
         return int(np.count_nonzero(self.weights)) >= _FEWEST_CORRESPONDENCES
 
-    @property
-    def lever_m(self) -> float:
-        """Root mean square range of the matched features."""
-        return float(np.sqrt(np.mean(self.ranges**2)))
-
     def degeneracy(self) -> Degeneracy:
         """Directions of motion that the correspondences do not constrain."""
-        return find_degeneracy(self.jacobian, self.weights, self.tilt, self.lever_m)
+        return find_degeneracy(self.jacobian, self.weights, self._tilt, self.lever_m)
 
     def linearise(self, T_world_lidar: FloatArray) -> NormalEquations | None:
-        """Normal equations at a pose, with new correspondences; None where these are too few."""
-        if T_world_lidar is not self._T_world_lidar:
+        """Normal equations at a pose; None where there are too few correspondences.
+
+        These are found anew where the features have moved by a share of the map's spacing since they were found.
+        """
+        if displacement_m(log(inverse(self._T_matched) @ T_world_lidar), self.lever_m) > _SAME * self._spacing_m:
             self._match(T_world_lidar)
+        self._evaluate(T_world_lidar)
         if not self.is_constrained:
             return None
         return NormalEquations.of(self.jacobian, self.residuals, self.weights / (_CORRELATION * _NOISE_M**2))
 
     def _match(self, T_world_lidar: FloatArray) -> None:
-        self._T_world_lidar = T_world_lidar
-        world = transform_points(T_world_lidar, self._edges), transform_points(T_world_lidar, self._planes)
-        lines, planes = match_lines(world[0], self._maps.edges), match_planes(world[1], self._maps.planes)
-        points = np.concatenate([self._edges[lines.index], self._planes[planes.index]])
-        across, apart = _residuals(world[0], lines), _residuals(world[1], planes)
-        self.residuals = np.concatenate([across, apart])
+        """Find the correspondences: lines first, two residuals each, then planes."""
+        lines = match_lines(transform_points(T_world_lidar, self._edges), self._maps.edges)
+        planes = match_planes(transform_points(T_world_lidar, self._planes), self._maps.planes)
+        self._features = np.concatenate([self._edges[lines.index], self._planes[planes.index]])
+        self._points = np.concatenate([lines.points, planes.points])
         self.normals = np.concatenate([lines.normals, planes.normals])
-        self.tilt = np.concatenate([lines.tilt, planes.tilt])
-        self.ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
-        self.jacobian = point_to_plane_jacobian(points, self.normals @ T_world_lidar[:3, :3])
+        self._tilt = np.concatenate([lines.tilt, planes.tilt])
+        self._across_lines = len(lines.index)
+        self.ranges = np.sqrt(np.einsum("ij,ij->i", self._features, self._features))
+        self.lever_m = float(np.sqrt(np.mean(self.ranges**2))) if len(self.ranges) else 0.0
+        self._T_matched = T_world_lidar
+
+    def _evaluate(self, T_world_lidar: FloatArray) -> None:
+        """Residuals, their Jacobian and weights at a pose."""
+        world = transform_points(T_world_lidar, self._features)
+        self.residuals = np.einsum("ij,ij->i", world - self._points, self.normals)
+        self.jacobian = point_to_plane_jacobian(self._features, self.normals @ T_world_lidar[:3, :3])
         # A residual with a plane counts less when the feature is near: its weight is by the distance per root range.
         sizes = np.abs(self.residuals) / np.sqrt(self.ranges)
-        sizes[: len(across)] = np.hypot(across[0::2], across[1::2]).repeat(2)
+        across = self.residuals[: self._across_lines]
+        sizes[: self._across_lines] = np.hypot(across[0::2], across[1::2]).repeat(2)
         weights = 1.0 - _WEIGHT_SLOPE * sizes
         self.weights = np.where(weights > _LEAST_WEIGHT, weights, 0.0) ** 2
-
-
-def _residuals(world: FloatArray, matches: Correspondences) -> FloatArray:
-    """Signed distances (M,) of matched features, of (N, 3) in the world, along the normals."""
-    return np.asarray(np.einsum("ij,ij->i", world[matches.index] - matches.points, matches.normals), dtype=np.float64)
