@@ -2,9 +2,10 @@
 
     python benchmarks/mapping_ablation.py
 
-Every row of the Markdown table is a variant: with the velocity of the sweep estimated (continuous time) or taken from
-the pose before (mean velocity); each without any odometry, and with one that is wrong by `--wrong-deg` and `--wrong-m`
-at every scan (see `mapping_accuracy.py`). The columns are the ATE of each recording in metres after SE(3) alignment,
+Every row of the Markdown table is a variant: surfels, with the velocity of the sweep estimated (continuous time) or
+taken from the poses (discrete), and LOAM's features, whose sweeps are compensated with the odometry's velocity; each
+without any odometry, with the learned one, and with one that is wrong by `--wrong-deg` and `--wrong-m` at every scan
+(see `mapping_accuracy.py`). The columns are the ATE of each recording in metres after SE(3) alignment,
 lost scans in brackets, the mean, and the median time of a scan's registration and map update. All variants have the
 same scans; what each recording gives goes to standard error as it comes, as the table needs them all.
 """
@@ -26,27 +27,27 @@ from mapping_accuracy import (
     wrong_odometry,
 )
 
+from lidarslam.config.settings import Config
 from mapping.config import MappingConfig
 
-_PARTS: dict[str, dict[str, bool]] = {
-    "continuous time": {"continuous_time": True},
-    "mean velocity": {"continuous_time": False},
+_PARTS: dict[str, MappingConfig] = {
+    "surfels, continuous time (default)": MappingConfig(),
+    "surfels, discrete": MappingConfig(continuous_time=False),
+    "LOAM, discrete": MappingConfig(method="loam"),
 }
 
 
 def run_variants(recorded: Recorded, wrong_deg: float, wrong_m: float, seed: int) -> list[Outcome]:
-    """One recording through all variants, without odometry and with the wrong one."""
-    prior = wrong_odometry(recorded, wrong_deg, wrong_m, seed)
-    mappings = [MappingConfig(**parts) for parts in _PARTS.values()]
+    """One recording through all variants, without odometry, with the learned and with the wrong one."""
+    prior, mappings = wrong_odometry(recorded, wrong_deg, wrong_m, seed), _PARTS.values()
     alone = [localise(recorded, without_odometry(mapping)) for mapping in mappings]
-    return alone + [localise(recorded, with_odometry(mapping), prior) for mapping in mappings]
+    learned = [localise(recorded, Config(mapping=mapping)) for mapping in mappings]
+    return alone + learned + [localise(recorded, with_odometry(mapping), prior) for mapping in mappings]
 
 
 def _labels() -> list[str]:
-    """Variants in the order of `run_variants`; what the defaults are is marked."""
-    default = MappingConfig()
-    names = [f"{name} (default)" if MappingConfig(**parts) == default else name for name, parts in _PARTS.items()]
-    return [f"{name} | {odometry}" for odometry in ("none", "wrong") for name in names]
+    """Variants in the order of `run_variants`."""
+    return [f"{name} | {odometry}" for odometry in ("none", "learned", "wrong") for name in _PARTS]
 
 
 def _cells(outcomes: Sequence[Outcome]) -> list[str]:

@@ -1,19 +1,21 @@
 """How long scan-to-map refinement takes a scan, stage by stage, beside KISS-ICP's `register_frame` on the same scans.
 
     python benchmarks/mapping_speed.py KITTI/sequences/04
+    python benchmarks/mapping_speed.py KITTI/sequences/04 --methods surfels loam
     python benchmarks/mapping_speed.py --simulate hdl-64e:street:car os1-128:street:car --scans 60
 
 Everything runs in one process, one scan after the other, without reading and without the pipeline's two threads: ours
-(without odometry, from `SurfelMapper.process` to the pose and the updated map) then KISS-ICP with its defaults,
-for `--rounds` rounds, each from an empty map, so that whatever else
-the machine does meets all of them. The first `--warm-up` scans of every pass do not count. Wall time and CPU time
+(without odometry, to the pose and the updated map), each mapping of `--methods`, then KISS-ICP with its defaults, for
+`--rounds` rounds, each from an empty map, so that whatever else the machine does meets all of them.
+The first `--warm-up` scans of every pass do not count. Wall time and CPU time
 (of all threads) of every scan; median and 95th percentile over all passes; the ratio is that of the medians of
 passes next to each other, its median, smallest and largest.
 
 Ours runs with BLAS on one thread, as `lidarslam run` has it; KISS-ICP uses as many threads as it likes. A stage's time
 is without the stages inside it:
 
-- thin: choosing the points of the scan;
+- thin: choosing the points of the scan; features: LOAM's;
+- search: neighbours in LOAM's map, and their principal axes;
 - registration: finding the surfaces and solving for the pose;
 - fit: holding the result against the map;
 - map update: compensating the scan, adding it, forgetting what is far;
@@ -43,19 +45,32 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.pipeline.scan_stream import in_order
 from mapping import surfel_mapper
 from mapping.config import MappingConfig
+from mapping.loam import mapper as loam_mapper
+from mapping.loam.feature_map import FeatureMap
+from mapping.loam.mapper import LoamMapper
 from mapping.prediction import Prior
+from mapping.surfel_mapper import SurfelMapper
 from mapping.surfels import sampling
 from mapping.tracking import attempts
 
-# Stage -> what is timed for it: the object that holds the function, and its name there.
-_STAGES: dict[str, tuple[Any, str]] = {
-    "thin": (sampling.Sampler, "sample"),
-    "registration": (attempts, "register"),
-    "fit": (attempts, "measure_fit"),
-    "map update": (surfel_mapper, "_insert"),
-    "rest": (surfel_mapper.SurfelMapper, "process"),
+# Method -> its mapper, and stage -> what is timed for it: the object that holds the function, and its name there.
+_MAPPERS: dict[str, type[SurfelMapper | LoamMapper]] = {"surfels": SurfelMapper, "loam": LoamMapper}
+_STAGES: dict[str, dict[str, tuple[Any, str]]] = {
+    "surfels": {
+        "thin": (sampling.Sampler, "sample"),
+        "registration": (attempts, "register"),
+        "fit": (attempts, "measure_fit"),
+        "map update": (surfel_mapper, "_insert"),
+        "rest": (SurfelMapper, "process"),
+    },
+    "loam": {
+        "features": (loam_mapper, "extract_features"),
+        "search": (FeatureMap, "neighbourhoods"),
+        "registration": (loam_mapper, "register"),
+        "map update": (LoamMapper, "_insert"),
+        "rest": (LoamMapper, "process"),
+    },
 }
-_OURS = {"default": MappingConfig()}
 
 
 @dataclass
@@ -106,21 +121,21 @@ class _Pass:
     bad: int = 0
 
 
-def run_ours(scans: Sequence[Scan], config: MappingConfig, warm_up: int) -> _Pass:
+def run_ours(scans: Sequence[Scan], method: str, warm_up: int) -> _Pass:
     """Scan-to-map refinement without odometry."""
-    ours = surfel_mapper.SurfelMapper(config)
+    ours, stages = _MAPPERS[method](MappingConfig()), _STAGES[method]
     watches, bad = [], 0
     with threadpool_limits(1, "blas"):
         for scan in scans:
             watch = _Stopwatch()
             with ExitStack() as stack:
-                for stage, (owner, name) in _STAGES.items():
+                for stage, (owner, name) in stages.items():
                     stack.enter_context(patch.object(owner, name, watch.replacement(stage, owner, name)))
                 mapped = ours.process(scan, Prior())
             watches.append(watch.seconds)
             bad += mapped.status is not Status.OK
     stage_ms = {
-        stage: 1e3 * np.array([seconds.get(stage, (0.0, 0.0)) for seconds in watches[warm_up:]]) for stage in _STAGES
+        stage: 1e3 * np.array([seconds.get(stage, (0.0, 0.0)) for seconds in watches[warm_up:]]) for stage in stages
     }
     return _Pass(np.sum(list(stage_ms.values()), axis=0), stage_ms, bad)
 
@@ -140,14 +155,14 @@ def run_kiss(scans: Sequence[Scan], warm_up: int) -> _Pass:
     return _Pass(1e3 * np.array(seconds[warm_up:]))
 
 
-def compare(name: str, scans: Sequence[Scan], rounds: int, warm_up: int) -> None:
+def compare(name: str, scans: Sequence[Scan], methods: Sequence[str], rounds: int, warm_up: int) -> None:
     """Run all in turn, and print what they took."""
-    for config in _OURS.values():  # loops are compiled when they are first called on a machine
-        run_ours(scans[:8], config, 0)
-    ours: dict[str, list[_Pass]] = {label: [] for label in _OURS}
-    kiss: dict[str, list[_Pass]] = {label: [] for label in _OURS}
-    for _, (label, config) in itertools.product(range(rounds), _OURS.items()):
-        ours[label].append(run_ours(scans, config, warm_up))
+    for method in methods:  # loops are compiled when they are first called on a machine
+        run_ours(scans[:8], method, 0)
+    ours: dict[str, list[_Pass]] = {method: [] for method in methods}
+    kiss: dict[str, list[_Pass]] = {method: [] for method in methods}
+    for _, label in itertools.product(range(rounds), methods):
+        ours[label].append(run_ours(scans, label, warm_up))
         kiss[label].append(run_kiss(scans, warm_up))
     points = np.median([len(scan) for scan in scans])
     print(f"\n{name}: {len(scans)} scans of {points:,.0f} points, {rounds} rounds; milliseconds a scan\n")
@@ -155,7 +170,7 @@ def compare(name: str, scans: Sequence[Scan], rounds: int, warm_up: int) -> None
     print_row(["---"] * 8)
     for label, passes in ours.items():
         beside = [_ratio(passes, kiss[label], kind) for kind in range(2)]
-        print_row([f"ours, {label}", *_times([one.total_ms for one in passes]), *beside])
+        print_row([label, *_times([one.total_ms for one in passes]), *beside])
     everything = [one.total_ms for passes in kiss.values() for one in passes]
     print_row(["KISS-ICP", *_times(everything), "1", "1"])
     for label, passes in ours.items():
@@ -166,7 +181,7 @@ def _print_stages(label: str, passes: Sequence[_Pass]) -> None:
     print(f"\nStages, {label} ({passes[-1].bad} scans degraded or lost):\n")
     print_row(["stage", "wall median", "wall p95", "CPU median", "CPU p95"])
     print_row(["---"] * 5)
-    for stage in _STAGES:
+    for stage in _STAGES[label]:
         print_row([stage, *_times([one.stage_ms[stage] for one in passes])[:4]])
 
 
@@ -188,6 +203,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
+    parser.add_argument("--methods", nargs="+", choices=_MAPPERS, default=["surfels"])
     parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--warm-up", type=int, default=5)
@@ -198,11 +214,12 @@ def main() -> None:
     for source in arguments.sources:
         recording = open_recording(source)
         scans = list(in_order(recording.scans(0, arguments.scans)))
-        compare(recording.name, scans, arguments.rounds, arguments.warm_up)
+        compare(recording.name, scans, arguments.methods, arguments.rounds, arguments.warm_up)
     for wanted in arguments.simulate:
         sensor, world, motion = wanted.split(":")
         simulation = make_simulation(world, motion, sensor, arguments.scans, arguments.seed)
-        compare(f"{sensor}, {world}, {motion}", list(simulation.scans()), arguments.rounds, arguments.warm_up)
+        scans, name = list(simulation.scans()), f"{sensor}, {world}, {motion}"
+        compare(name, scans, arguments.methods, arguments.rounds, arguments.warm_up)
 
 
 if __name__ == "__main__":
