@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
+from lidarslam.core.geometry import exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
@@ -16,7 +16,7 @@ from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
 from mapping.loam.feature_map import FeatureMap
 from mapping.loam.features import Features, extract_features
-from mapping.loam.registration import FeatureMaps, LoamRegistration, register
+from mapping.loam.registration import FeatureMaps, register
 from mapping.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
 from mapping.scene_scale import MIN_POINTS, SceneScale
 from mapping.tracking.fit import Fit
@@ -24,6 +24,8 @@ from mapping.tracking.mapped_scan import MappedScan
 
 # Lost scans in a row after which the map begins anew.
 _GIVE_UP_AFTER = 20
+# The velocity of a lost sensor fades by this factor a scan.
+_FADING = 0.7
 
 
 class LoamMapper(Stateful):
@@ -33,12 +35,14 @@ class LoamMapper(Stateful):
     _edges: FeatureMap
     _planes: FeatureMap
     _last: MotionState | None
+    _last_middle_s: float
     _lost_in_a_row: int
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
         self._scale = SceneScale(config)
         self._last = None
+        self._last_middle_s = 0.0  # from its stamp to the middle of its sweep
         self._begin_maps()
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
@@ -46,21 +50,22 @@ class LoamMapper(Stateful):
         spacing_m = self._scale.update(np.einsum("ij,ij->i", scan.points, scan.points))
         features = extract_features(scan, self._config.min_range_m, self._config.max_range_m, spacing_m)
         last = self._last or MotionState(scan.stamp, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
-        predicted = _predict(scan.stamp, prior, last)
+        predicted, middle_s = _predict(scan.stamp, prior, last), _middle_of(scan)
         if len(features) < MIN_POINTS:
             mapped = self._lose(predicted, None, f"only {len(features)} features within range")
         elif not len(self._edges) + len(self._planes):
             mapped = MappedScan(predicted, predicted.T_world_lidar, False, Status.OK, added=True)
         else:
-            mapped = self._track(features, spacing_m, prior, predicted, last)
+            mapped = self._track(features, spacing_m, middle_s, prior, predicted, last)
         if mapped.added:
-            self._insert(features, spacing_m, mapped.state.T_world_lidar, predicted.velocity)
-        self._last = mapped.state
+            self._insert(features, spacing_m, mapped.state)
+        self._last, self._last_middle_s = mapped.state, middle_s
         return mapped
 
     def _track(
-        self, features: Features, spacing_m: float, prior: Prior, predicted: MotionState, last: MotionState
-    ) -> MappedScan:
+        self, features: Features, spacing_m: float, middle_s: float, prior: Prior, predicted: MotionState,
+        last: MotionState,
+    ) -> MappedScan:  # fmt: skip
         """Register compensated features from the predicted pose, and judge the pose by its fit."""
         edges, planes = (sweep.compensated(predicted.velocity) for sweep in (features.edges, features.planes))
         covariance = prior.motion_covariance(self._config)
@@ -76,8 +81,11 @@ class LoamMapper(Stateful):
         if is_added and names:
             status, message = Status.DEGRADED, f"degenerate along {', '.join(names)}: the prediction was kept"
         self._lost_in_a_row = 0
+        covariance = UNKNOWN_VELOCITY.copy()
+        covariance[:6, :6] = registration.covariance
+        state = replace(predicted, T_world_lidar=registration.T_world_lidar, covariance=covariance)
         return MappedScan(
-            state=_moved(predicted, registration, prior, last),
+            state=state if prior.velocity is not None else self._with_mean_velocity(state, middle_s, last),
             T_world_predicted=predicted.T_world_lidar,
             registered=True,
             status=status,
@@ -87,6 +95,20 @@ class LoamMapper(Stateful):
             added=is_added,
         )
 
+    def _with_mean_velocity(self, state: MotionState, middle_s: float, last: MotionState) -> MotionState:
+        """The state with the mean velocity between the middles of two sweeps.
+
+        A wrong velocity displaces the pose at the stamp, and hardly that of the middle. Velocities of poses at the
+        stamps would oscillate where these are far from the middles.
+        """
+        interval_s = state.stamp + middle_s - last.stamp - self._last_middle_s
+        if interval_s <= 0.0:
+            return state
+        T_world_middle = state.T_world_lidar @ exp(middle_s * state.velocity)
+        T_world_before = last.T_world_lidar @ exp(self._last_middle_s * last.velocity)
+        velocity = body_velocity(inverse(T_world_before) @ T_world_middle, interval_s)
+        return replace(state, T_world_lidar=T_world_middle @ exp(-middle_s * velocity), velocity=velocity)
+
     def _lose(self, predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
         """A scan without a registration stays at its prediction; after many a new map begins with it."""
         self._lost_in_a_row += 1
@@ -94,7 +116,7 @@ class LoamMapper(Stateful):
         if begins:
             self._begin_maps()
             reason += "; a new map begins here"
-        lost = replace(predicted, covariance=LOST_MOTION)
+        lost = replace(predicted, velocity=_FADING * predicted.velocity, covariance=LOST_MOTION)
         T_predicted = predicted.T_world_lidar
         return MappedScan(lost, T_predicted, False, Status.LOST, reason, fit, added=begins, is_connected=False)
 
@@ -102,10 +124,10 @@ class LoamMapper(Stateful):
         self._edges, self._planes = (FeatureMap(self._config.radius_m) for _ in range(2))
         self._lost_in_a_row = 0
 
-    def _insert(self, features: Features, spacing_m: float, T_world_lidar: FloatArray, velocity: FloatArray) -> None:
+    def _insert(self, features: Features, spacing_m: float, state: MotionState) -> None:
         for sweep, feature_map in ((features.edges, self._edges), (features.planes, self._planes)):
-            points = transform_points(T_world_lidar, sweep.compensated(velocity))
-            feature_map.insert(points, T_world_lidar[:3, 3], spacing_m)
+            points = transform_points(state.T_world_lidar, sweep.compensated(state.velocity))
+            feature_map.insert(points, state.T_world_lidar[:3, 3], spacing_m)
 
 
 def _predict(stamp: float, prior: Prior, last: MotionState) -> MotionState:
@@ -115,11 +137,7 @@ def _predict(stamp: float, prior: Prior, last: MotionState) -> MotionState:
     return MotionState(stamp, last.T_world_lidar @ motion, velocity, UNKNOWN_VELOCITY)
 
 
-def _moved(predicted: MotionState, registration: LoamRegistration, prior: Prior, last: MotionState) -> MotionState:
-    """The registered state; its velocity is the odometry's, else the mean since the last scan."""
-    T_world_lidar, velocity, interval_s = registration.T_world_lidar, predicted.velocity, predicted.stamp - last.stamp
-    if prior.velocity is None and interval_s > 0.0:
-        velocity = body_velocity(inverse(last.T_world_lidar) @ T_world_lidar, interval_s)
-    covariance = UNKNOWN_VELOCITY.copy()
-    covariance[:6, :6] = registration.covariance
-    return MotionState(predicted.stamp, T_world_lidar, velocity, covariance)
+def _middle_of(scan: Scan) -> float:
+    """Seconds from the stamp to the middle of the sweep; 0 where the points are compensated."""
+    times = scan.time_offsets
+    return 0.0 if times is None or not len(times) else 0.5 * float(times.min() + times.max())
