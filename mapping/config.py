@@ -36,13 +36,11 @@ class MappingConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: MappingName = Field(
-        "surfels", description="surfels, loam (the mapping of LOAM) or off (the odometry alone)"
-    )
+    method: MappingName = Field("surfels", description="surfels, loam (LOAM's mapping) or off (the odometry alone)")
     cell_m: float | None = Field(
         None,
         ge=0.01,
-        description="edge of the finest surfel cells, null: the scene's median range / 30; loam: planar leaf size",
+        description="edge of the finest surfel cells, spacing of LOAM's maps; null: a thirtieth of the scene's median range",
     )
     radius_m: float = Field(100.0, ge=1.0, description="radius of the local map around the sensor")
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")
@@ -54,17 +52,17 @@ class MappingConfig(BaseModel):
     prior_rotation_deg: float = Field(
         3.0,
         gt=0.0,
-        description="surfels only: standard deviation of an odometry's rotation about an axis, where it gives none",
+        description="standard deviation of an odometry's rotation about each axis, where it gives none",
     )
     prior_translation_m: float = Field(
         0.15,
         gt=0.0,
-        description="surfels only: standard deviation of an odometry's translation along an axis, where it gives none",
+        description="standard deviation of an odometry's translation along each axis, where it gives none",
     )
     prior_caution: float = Field(
         10.0,
         gt=0.0,
-        description="surfels only: factor on an odometry's standard deviations; its errors are correlated in time",
+        description="factor on the standard deviations of an odometry: its errors are correlated in time",
     )
     tracking: TrackingConfig = TrackingConfig()
 
