@@ -40,7 +40,7 @@ class MappingConfig(BaseModel):
     cell_m: float | None = Field(
         None,
         ge=0.01,
-        description="edge of the finest surfel cells, spacing of LOAM's maps; null: a thirtieth of the scene's median range",
+        description="edge of the finest surfel cells, spacing of LOAM's maps; null: a thirtieth of the median range",
     )
     radius_m: float = Field(100.0, ge=1.0, description="radius of the local map around the sensor")
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")

@@ -1,4 +1,4 @@
-"""Scan-to-map mapping, the second half of LOAM (Zhang and Singh, RSS 2014), with any odometry or none.
+"""Scan-to-map mapping by continuous-time surfel registration, with any odometry or none.
 
 Each scan is predicted from the last motion and the odometry, registered to the local map, judged by its fit, and
 inserted into the map. `mapping.tracking` has the cases in which the registration fails.

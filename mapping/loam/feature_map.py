@@ -62,31 +62,32 @@ class FeatureMap(Stateful):
             nearby = np.flatnonzero(squared.numpy()[:, -1] < _FARTHEST_M**2)
             neighbours = found.numpy()[nearby]
         means, variances, axes = (np.empty((len(nearby), 3)) for _ in range(3))
-        write_principal_axes(self.points, neighbours, axis, means, variances, axes)
-        return Neighbourhoods(nearby, self.points[neighbours], means, variances, axes)
+        farthest_m = np.empty(len(nearby))
+        write_principal_axes(self.points, neighbours, axis, means, variances, axes, farthest_m)
+        return Neighbourhoods(nearby, means, variances, axes, farthest_m)
 
     def _index(self) -> o3d.core.nns.NearestNeighborSearch:
         if self._search is None:
-            self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(self.points))
+            self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(self.points), o3d.core.int32)
             self._search.knn_index()
         return self._search
 
     def _after_restore(self) -> None:
         self._keys = point_keys(self.points, self._spacing_m)
         self._search = None
-        if (np.diff(self._keys) <= 0).any():
-            raise ValueError("the points are not in the order of their voxels")
+        if not np.isfinite(self.points).all() or (np.diff(self._keys) <= 0).any():
+            raise ValueError("the points are not finite, or not in the order of their voxels")
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbourhoods:
-    """The nearest neighbours in a map of K points."""
+    """The five nearest neighbours in a map of K points."""
 
     index: NDArray[np.intp]  # (K,) of the point
-    neighbours: FloatArray  # (K, 5, 3) in the world
-    means: FloatArray  # (K, 3)
-    variances: FloatArray  # (K, 3) along the principal axes, ascending
+    means: FloatArray  # (K, 3) of the neighbours, in the world
+    variances: FloatArray  # (K, 3) along their principal axes, ascending
     axes: FloatArray  # (K, 3) unit, one of the principal axes
+    farthest_m: FloatArray  # (K,) largest distance of a neighbour from the plane across that axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +108,16 @@ def match_lines(points: FloatArray, edges: FeatureMap) -> Correspondences:
     across = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     normals = np.stack([across, np.cross(along, across)], axis=1).reshape(-1, 3)
-    tilt = np.sqrt(np.maximum(variances[:, 1], 0.0) / (_NEIGHBOURS * variances[:, 2]))
+    # The variance of a line's slope: that of the residuals, of which two are spent on the fit, per scatter along it.
+    tilt = np.sqrt(np.maximum(variances[:, 1], 0.0) / ((_NEIGHBOURS - 2) * variances[:, 2]))
     return Correspondences(index.repeat(2), means.repeat(2, axis=0), normals, tilt.repeat(2))
 
 
 def match_planes(points: FloatArray, planes: FeatureMap) -> Correspondences:
-    """Match planar points (N, 3) of the world to planes: neighbours that are all close to one."""
+    """Match planar points (N, 3) of the world to planes: neighbours that are all close to one, and not on a line."""
     near = planes.neighbourhoods(points, axis=0)
-    distances = np.einsum("kij,kj->ki", near.neighbours - near.means[:, None], near.axes)
     spread = near.variances[:, 1] > _PLANE_RATIO * near.variances[:, 2]
-    fit = np.flatnonzero(spread & (np.abs(distances) < _PLANE_M).all(axis=1))
-    tilt = np.sqrt(np.maximum(near.variances[fit, 0], 0.0) / (_NEIGHBOURS * near.variances[fit, 1]))
+    fit = np.flatnonzero(spread & (near.farthest_m < _PLANE_M))
+    # As of lines; three residuals are spent on the fit of a plane, and its shorter extent decides.
+    tilt = np.sqrt(np.maximum(near.variances[fit, 0], 0.0) / ((_NEIGHBOURS - 3) * near.variances[fit, 1]))
     return Correspondences(near.index[fit], near.means[fit], near.axes[fit], tilt)

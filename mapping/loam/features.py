@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
@@ -23,6 +24,8 @@ class Features:
 
     edges: Sweep
     planes: Sweep
+    spacing_m: float  # of either, at least
+    middle_s: float  # time from the stamp to the middle of the sweep; 0 where the points are compensated
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
@@ -45,10 +48,16 @@ def extract_features(scan: Scan, min_range_m: float, max_range_m: float, spacing
     noise_m2 = float(np.median(known)) if len(known) else 0.0
     classify(points, ranges, rings, curvature, max(_CURVATURE_M2, _ABOVE_NOISE * noise_m2), _CURVATURE_M2, kinds)
     usable = (ranges > min_range_m) & (ranges < max_range_m)
-    sweeps = []
-    for kind in (EDGE, PLANE):
-        found = np.flatnonzero(usable & (kinds == kind))
-        chosen = order.take(found.take(one_per_cell(points.take(found, axis=0), spacing_m)))
-        times = None if scan.time_offsets is None else scan.time_offsets.take(chosen)
-        sweeps.append(Sweep(scan.points.take(chosen, axis=0), times))
-    return Features(*sweeps)
+    edges, planes = (
+        _thinned(scan, order.take(np.flatnonzero(usable & (kinds == kind))), spacing_m) for kind in (EDGE, PLANE)
+    )
+    times = scan.time_offsets
+    middle_s = 0.0 if times is None or not len(times) else 0.5 * float(times.min() + times.max())
+    return Features(edges, planes, spacing_m, middle_s)
+
+
+def _thinned(scan: Scan, chosen: NDArray[np.intp], spacing_m: float) -> Sweep:
+    """The chosen points of a scan, one a voxel."""
+    kept = chosen.take(one_per_cell(scan.points.take(chosen, axis=0), spacing_m))
+    times = None if scan.time_offsets is None else scan.time_offsets.take(kept)
+    return Sweep(scan.points.take(kept, axis=0), times)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarslam.core.geometry import exp, inverse, transform_points
+from lidarslam.core.geometry import adjoint, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
@@ -22,6 +22,8 @@ from mapping.scene_scale import MIN_POINTS, SceneScale
 from mapping.tracking.fit import Fit
 from mapping.tracking.mapped_scan import MappedScan
 
+# Neighbours in a sparser map are too far apart for a line or plane.
+_MOST_SPACING_M = 0.4
 # Lost scans in a row after which the map begins anew.
 _GIVE_UP_AFTER = 20
 # The velocity of a lost sensor fades by this factor a scan.
@@ -37,61 +39,61 @@ class LoamMapper(Stateful):
     _last: MotionState | None
     _last_middle_s: float
     _lost_in_a_row: int
+    _is_adrift: bool
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
         self._scale = SceneScale(config)
         self._last = None
         self._last_middle_s = 0.0  # from its stamp to the middle of its sweep
+        self._is_adrift = False  # whether the map is a new one, at an unknown pose in the one before
         self._begin_maps()
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
-        spacing_m = self._scale.update(np.einsum("ij,ij->i", scan.points, scan.points))
+        cell_m = self._scale.update(np.einsum("ij,ij->i", scan.points, scan.points))
+        spacing_m = min(cell_m, _MOST_SPACING_M)
         features = extract_features(scan, self._config.min_range_m, self._config.max_range_m, spacing_m)
         last = self._last or MotionState(scan.stamp, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
-        predicted, middle_s = _predict(scan.stamp, prior, last), _middle_of(scan)
+        predicted = _predict(scan.stamp, prior, last, self._config)
         if len(features) < MIN_POINTS:
-            mapped = self._lose(predicted, None, f"only {len(features)} features within range")
+            mapped = _lost(predicted, None, f"only {len(features)} features within range")
         elif not len(self._edges) + len(self._planes):
             mapped = MappedScan(predicted, predicted.T_world_lidar, False, Status.OK, added=True)
+            self._insert(features, predicted)
         else:
-            mapped = self._track(features, spacing_m, middle_s, prior, predicted, last)
-        if mapped.added:
-            self._insert(features, spacing_m, mapped.state)
-        self._last, self._last_middle_s = mapped.state, middle_s
+            mapped = self._track(features, prior, predicted, last)
+        self._last, self._last_middle_s = mapped.state, features.middle_s
         return mapped
 
-    def _track(
-        self, features: Features, spacing_m: float, middle_s: float, prior: Prior, predicted: MotionState,
-        last: MotionState,
-    ) -> MappedScan:  # fmt: skip
-        """Register compensated features from the predicted pose, and judge the pose by its fit."""
-        edges, planes = (sweep.compensated(predicted.velocity) for sweep in (features.edges, features.planes))
-        covariance = prior.motion_covariance(self._config)
-        maps = FeatureMaps(self._edges, self._planes)
-        registration = register(edges, planes, predicted.T_world_lidar, covariance, maps, spacing_m)
+    def _track(self, features: Features, prior: Prior, predicted: MotionState, last: MotionState) -> MappedScan:
+        """Register compensated features from the predicted pose, judge the pose by its fit, insert."""
+        registration = register(features, predicted, FeatureMaps(self._edges, self._planes))
         if registration is None:
-            return self._lose(predicted, None, "too few features correspond to the map")
+            return self._lose(features, predicted, None, "too few features correspond to the map")
         fit, names = registration.fit, registration.degeneracy.names
         status, message = fit.status(self._config.tracking), fit.explain(self._config.tracking)
         if status is Status.LOST:
-            return self._lose(predicted, fit, message)
-        is_added = status is Status.OK
-        if is_added and names:
-            status, message = Status.DEGRADED, f"degenerate along {', '.join(names)}: the prediction was kept"
+            return self._lose(features, predicted, fit, message)
         self._lost_in_a_row = 0
         covariance = UNKNOWN_VELOCITY.copy()
         covariance[:6, :6] = registration.covariance
         state = replace(predicted, T_world_lidar=registration.T_world_lidar, covariance=covariance)
+        if prior.velocity is None:
+            state = self._with_mean_velocity(state, features.middle_s, last)
+        is_added = status is Status.OK
+        if is_added:
+            self._insert(features, state)
+            message = _reservation(names, self._is_adrift)
         return MappedScan(
-            state=state if prior.velocity is not None else self._with_mean_velocity(state, middle_s, last),
+            state=state,
             T_world_predicted=predicted.T_world_lidar,
             registered=True,
-            status=status,
+            status=Status.DEGRADED if message else Status.OK,
             message=message,
             fit=fit,
             degenerate=names,
+            iterations=registration.iterations,
             added=is_added,
         )
 
@@ -109,35 +111,42 @@ class LoamMapper(Stateful):
         velocity = body_velocity(inverse(T_world_before) @ T_world_middle, interval_s)
         return replace(state, T_world_lidar=T_world_middle @ exp(-middle_s * velocity), velocity=velocity)
 
-    def _lose(self, predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
-        """A scan without a registration stays at its prediction; after many a new map begins with it."""
+    def _lose(self, features: Features, predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
+        """A scan without a registration stays at its prediction; after many in a row a new map begins with it."""
         self._lost_in_a_row += 1
-        begins = self._lost_in_a_row >= _GIVE_UP_AFTER
-        if begins:
-            self._begin_maps()
-            reason += "; a new map begins here"
-        lost = replace(predicted, velocity=_FADING * predicted.velocity, covariance=LOST_MOTION)
-        T_predicted = predicted.T_world_lidar
-        return MappedScan(lost, T_predicted, False, Status.LOST, reason, fit, added=begins, is_connected=False)
+        if self._lost_in_a_row < _GIVE_UP_AFTER:
+            return _lost(predicted, fit, reason)
+        self._begin_maps()
+        self._insert(features, predicted)
+        self._is_adrift = True
+        return _lost(predicted, fit, f"{reason}; a new map begins here")
 
     def _begin_maps(self) -> None:
         self._edges, self._planes = (FeatureMap(self._config.radius_m) for _ in range(2))
         self._lost_in_a_row = 0
 
-    def _insert(self, features: Features, spacing_m: float, state: MotionState) -> None:
+    def _insert(self, features: Features, state: MotionState) -> None:
         for sweep, feature_map in ((features.edges, self._edges), (features.planes, self._planes)):
             points = transform_points(state.T_world_lidar, sweep.compensated(state.velocity))
-            feature_map.insert(points, state.T_world_lidar[:3, 3], spacing_m)
+            feature_map.insert(points, state.T_world_lidar[:3, 3], features.spacing_m)
 
 
-def _predict(stamp: float, prior: Prior, last: MotionState) -> MotionState:
+def _predict(stamp: float, prior: Prior, last: MotionState, config: MappingConfig) -> MotionState:
     """The odometry's motion and velocity; the last velocity where it has none."""
     velocity = last.velocity if prior.velocity is None else prior.velocity
     motion = exp(last.velocity * (stamp - last.stamp)) if prior.T_prev_curr is None else prior.T_prev_curr
-    return MotionState(stamp, last.T_world_lidar @ motion, velocity, UNKNOWN_VELOCITY)
+    F, covariance = adjoint(inverse(motion)), UNKNOWN_VELOCITY.copy()
+    covariance[:6, :6] = F @ last.covariance[:6, :6] @ F.T + prior.motion_covariance(config)
+    return MotionState(stamp, last.T_world_lidar @ motion, velocity, covariance)
 
 
-def _middle_of(scan: Scan) -> float:
-    """Seconds from the stamp to the middle of the sweep; 0 where the points are compensated."""
-    times = scan.time_offsets
-    return 0.0 if times is None or not len(times) else 0.5 * float(times.min() + times.max())
+def _reservation(degenerate: tuple[str, ...], is_adrift: bool) -> str:
+    """Why a scan that fits is degraded nevertheless; empty where it is not."""
+    if is_adrift:
+        return "in a new map; its pose in the map before is unknown"
+    return f"degenerate along {', '.join(degenerate)}: the prediction was kept" if degenerate else ""
+
+
+def _lost(predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
+    state = replace(predicted, velocity=_FADING * predicted.velocity, covariance=LOST_MOTION)
+    return MappedScan(state, predicted.T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)

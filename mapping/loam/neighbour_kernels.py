@@ -1,4 +1,4 @@
-"""Principal axes of the neighbours of features in a map, compiled."""
+"""Lines and planes through the neighbours of features in a map, compiled."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +11,22 @@ from mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenv
 @compiled
 def write_principal_axes(
     points: FloatArray, neighbours: NDArray[np.int32], which: int, means: FloatArray, variances: FloatArray,
-    axes: FloatArray,
+    axes: FloatArray, farthest_m: FloatArray,
 ) -> None:  # fmt: skip
-    """Write the means (K, 3), variances (K, 3), ascending, and one principal axis (K, 3) of neighbours (K, L).
+    """Write the mean, the variances and one principal axis of each of K sets of neighbours.
 
     Args:
-        points: (N, 3) that the neighbours are indices of.
-        neighbours: indices.
+        points: (N, 3).
+        neighbours: (K, L) indices of points.
         which: principal axis, 0 of the smallest variance.
-        means, variances, axes: written.
+        means: (K, 3) written.
+        variances: (K, 3) written, ascending.
+        axes: (K, 3) written, unit.
+        farthest_m: (K,) written, largest distance of a neighbour from the plane through the mean across the axis.
     """
-    scatter = np.empty(6)
+    scatter, share = np.empty(6), 1.0 / neighbours.shape[1]
     for k in range(len(neighbours)):
-        share = 1.0 / neighbours.shape[1]
-        means[k] = 0.0
-        scatter[:] = 0.0
+        means[k], scatter[:], farthest_m[k] = 0.0, 0.0, 0.0
         for n in neighbours[k]:
             for axis in range(3):
                 means[k, axis] += share * points[n, axis]
@@ -35,3 +36,8 @@ def write_principal_axes(
                 scatter[entry] += share * (points[n, i] - means[k, i]) * (points[n, j] - means[k, j])
         write_eigenvalues(scatter, variances[k])
         write_eigenvector(scatter, variances[k, which], axes[k])
+        for n in neighbours[k]:
+            distance = 0.0
+            for axis in range(3):
+                distance += (points[n, axis] - means[k, axis]) * axes[k, axis]
+            farthest_m[k] = max(farthest_m[k], abs(distance))

@@ -9,6 +9,8 @@ from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, or
 from mapping.degeneracy import find_degeneracy
 from mapping.gauss_newton import NormalEquations, gauss_newton, point_to_plane_jacobian
 from mapping.loam.feature_map import FeatureMap, match_lines, match_planes
+from mapping.loam.features import Features
+from mapping.prediction import MotionState
 from mapping.tracking.fit import Fit
 
 # Iterations, and the displacement of a point at the mean range that ends them.
@@ -40,25 +42,24 @@ class LoamRegistration:
     covariance: FloatArray  # (6, 6) of the pose's error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first
     degeneracy: Degeneracy  # directions along which the prediction was kept
     fit: Fit
+    iterations: int  # of Gauss-Newton
 
 
-def register(
-    edges: FloatArray, planes: FloatArray, T_predicted: FloatArray, covariance: FloatArray, maps: FeatureMaps,
-    spacing_m: float,
-) -> LoamRegistration | None:  # fmt: skip
+def register(features: Features, predicted: MotionState, maps: FeatureMaps) -> LoamRegistration | None:
     """Register features to the maps by Gauss-Newton; None where there are too few correspondences.
 
     Along directions that the correspondences at the prediction do not constrain, the prediction is kept: solution
     remapping of Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems" (ICRA 2016).
 
     Args:
-        edges, planes: (N, 3) and (M, 3), compensated, in the LiDAR frame.
-        T_predicted: (4, 4) predicted pose.
-        covariance: (6, 6) of the prediction, which becomes that of the pose along degenerate directions.
+        features: of the sweep, as measured.
+        predicted: start, and velocity that the sweep is compensated with; its covariance becomes that of the result
+            along degenerate directions.
         maps: local map.
-        spacing_m: of its points.
     """
-    problem = _Problem(edges, planes, maps, spacing_m, T_predicted)
+    T_predicted = predicted.T_world_lidar
+    edges, planes = (sweep.compensated(predicted.velocity) for sweep in (features.edges, features.planes))
+    problem = _Problem(edges, planes, maps, features.spacing_m, T_predicted)
     if not problem.is_constrained:
         return None
     degeneracy = problem.degeneracy()
@@ -67,18 +68,18 @@ def register(
         solution = gauss_newton(
             problem.linearise, T_predicted, T_predicted, held, _ITERATIONS, problem.lever_m, _CONVERGED_M
         )
-    except np.linalg.LinAlgError:  # all correspondences on one line
+        if solution is None:
+            return None
+        information = solution[1]
+        if len(degeneracy):
+            along = degeneracy.part_along()
+            observed, known = np.eye(6) - along, np.linalg.inv(predicted.covariance[:6, :6])
+            information = observed.T @ (information - held) @ observed + along.T @ known @ along
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    except np.linalg.LinAlgError:  # the correspondences constrain less than they did at the prediction
         return None
-    if solution is None:
-        return None
-    fit = Fit.of(
-        np.abs(problem.residuals), problem.normals, problem.ranges, max(len(edges) + len(planes), 1), spacing_m
-    )
-    along = degeneracy.part_along()
-    observed = np.eye(6) - along
-    information = observed.T @ (solution[1] - held) @ observed + along.T @ np.linalg.inv(covariance) @ along
-    pose_covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    return LoamRegistration(orthonormalize(solution[0]), pose_covariance, degeneracy, fit)
+    T_world_lidar = orthonormalize(solution[0])
+    return LoamRegistration(T_world_lidar, covariance, degeneracy, problem.fit(T_world_lidar), problem.iterations)
 
 
 class _Problem:
@@ -88,51 +89,62 @@ class _Problem:
         self, edges: FloatArray, planes: FloatArray, maps: FeatureMaps, spacing_m: float, T_world_lidar: FloatArray
     ) -> None:
         self._edges, self._planes, self._maps, self._spacing_m = edges, planes, maps, spacing_m
+        self.iterations = 0
         self._match(T_world_lidar)
         self._evaluate(T_world_lidar)
 
     @property
     def is_constrained(self) -> bool:
         """Whether there are enough correspondences for a pose."""
-        return int(np.count_nonzero(self.weights)) >= _FEWEST_CORRESPONDENCES
+        return int(np.count_nonzero(self._weights[self._first])) >= _FEWEST_CORRESPONDENCES
 
     def degeneracy(self) -> Degeneracy:
         """Directions of motion that the correspondences do not constrain."""
-        return find_degeneracy(self.jacobian, self.weights, self._tilt, self.lever_m)
+        return find_degeneracy(self._jacobian, self._weights, self._tilt, self.lever_m)
+
+    def fit(self, T_world_lidar: FloatArray) -> Fit:
+        """Fit of the features at a pose; that of an edge is by its distance from the line."""
+        self._evaluate(T_world_lidar)
+        first, features = self._first, len(self._edges) + len(self._planes)
+        return Fit.of(self._distances[first], self._normals[first], self._ranges[first], features, self._spacing_m)
 
     def linearise(self, T_world_lidar: FloatArray) -> NormalEquations | None:
         """Normal equations at a pose; None where there are too few correspondences.
 
         These are found anew where the features have moved by a share of the map's spacing since they were found.
         """
+        self.iterations += 1
         if displacement_m(log(inverse(self._T_matched) @ T_world_lidar), self.lever_m) > _SAME * self._spacing_m:
             self._match(T_world_lidar)
         self._evaluate(T_world_lidar)
         if not self.is_constrained:
             return None
-        return NormalEquations.of(self.jacobian, self.residuals, self.weights / (_CORRELATION * _NOISE_M**2))
+        return NormalEquations.of(self._jacobian, self._residuals, self._weights / (_CORRELATION * _NOISE_M**2))
 
     def _match(self, T_world_lidar: FloatArray) -> None:
         """Find the correspondences: lines first, two residuals each, then planes."""
         lines = match_lines(transform_points(T_world_lidar, self._edges), self._maps.edges)
         planes = match_planes(transform_points(T_world_lidar, self._planes), self._maps.planes)
+        self._across_lines = len(lines.index)
         self._features = np.concatenate([self._edges[lines.index], self._planes[planes.index]])
         self._points = np.concatenate([lines.points, planes.points])
-        self.normals = np.concatenate([lines.normals, planes.normals])
+        self._normals = np.concatenate([lines.normals, planes.normals])
         self._tilt = np.concatenate([lines.tilt, planes.tilt])
-        self._across_lines = len(lines.index)
-        self.ranges = np.sqrt(np.einsum("ij,ij->i", self._features, self._features))
-        self.lever_m = float(np.sqrt(np.mean(self.ranges**2))) if len(self.ranges) else 0.0
+        # The first residual of each feature.
+        self._first = np.concatenate([np.arange(0, len(lines.index), 2), np.arange(len(lines.index), len(self._tilt))])
+        self._ranges = np.sqrt(np.einsum("ij,ij->i", self._features, self._features))
+        self.lever_m = float(np.sqrt(np.mean(self._ranges**2))) if len(self._ranges) else 0.0
         self._T_matched = T_world_lidar
 
     def _evaluate(self, T_world_lidar: FloatArray) -> None:
-        """Residuals, their Jacobian and weights at a pose."""
-        world = transform_points(T_world_lidar, self._features)
-        self.residuals = np.einsum("ij,ij->i", world - self._points, self.normals)
-        self.jacobian = point_to_plane_jacobian(self._features, self.normals @ T_world_lidar[:3, :3])
-        # A residual with a plane counts less when the feature is near: its weight is by the distance per root range.
-        sizes = np.abs(self.residuals) / np.sqrt(self.ranges)
-        across = self.residuals[: self._across_lines]
-        sizes[: self._across_lines] = np.hypot(across[0::2], across[1::2]).repeat(2)
+        """Residuals, their Jacobian, distances from lines and planes, and weights at a pose."""
+        world, lines = transform_points(T_world_lidar, self._features), slice(0, self._across_lines)
+        self._residuals = np.einsum("ij,ij->i", world - self._points, self._normals)
+        self._jacobian = point_to_plane_jacobian(self._features, self._normals @ T_world_lidar[:3, :3])
+        self._distances = np.abs(self._residuals)
+        self._distances[lines] = np.hypot(self._residuals[lines][0::2], self._residuals[lines][1::2]).repeat(2)
+        # Planes count by the distance per root of the range: near ones less.
+        sizes = self._distances / np.sqrt(self._ranges)
+        sizes[lines] = self._distances[lines]
         weights = 1.0 - _WEIGHT_SLOPE * sizes
-        self.weights = np.where(weights > _LEAST_WEIGHT, weights, 0.0) ** 2
+        self._weights = np.where(weights > _LEAST_WEIGHT, weights, 0.0) ** 2
