@@ -25,7 +25,8 @@ def ring_order(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         Indices (N,) of the points, and the ring (N,) of each of these, ascending.
     """
     if scan.rings is not None:
-        order = np.argsort(scan.rings, kind="stable")
+        times = np.zeros(len(scan)) if scan.time_offsets is None else scan.time_offsets
+        order = np.lexsort((times, scan.rings))
         return order, scan.rings[order].astype(np.intp)
     rings = _stored_rings(scan.points)
     if rings is not None:
