@@ -1,6 +1,6 @@
 """Registration of edge and planar features to their maps (Zhang and Singh, "LOAM", RSS 2014, section VI)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,9 +69,9 @@ def register(
         return None
     if solution is None:
         return None
-    fit = Fit.of(
-        np.abs(problem.residuals), problem.normals, problem.ranges, max(len(edges) + len(planes), 1), spacing_m
-    )
+    points = len(edges) + len(planes)
+    fit = Fit.of(np.abs(problem.residuals), problem.normals, problem.ranges, points, spacing_m)
+    fit = replace(fit, matched=problem.matched, overlap=problem.matched / points)  # an edge has two residuals
     along = degeneracy.part_along()
     observed = np.eye(6) - along
     information = observed.T @ (solution[1] - held) @ observed + along.T @ np.linalg.inv(covariance) @ along
@@ -114,6 +114,7 @@ class _Problem:
         lines, planes = match_lines(world[0], self._maps.edges), match_planes(world[1], self._maps.planes)
         points = np.concatenate([self._edges[lines.index], self._planes[planes.index]])
         across, apart = _residuals(world[0], lines), _residuals(world[1], planes)
+        self.matched = len(across) // 2 + len(apart)  # features
         self.residuals = np.concatenate([across, apart])
         self.normals = np.concatenate([lines.normals, planes.normals])
         self.tilt = np.concatenate([lines.tilt, planes.tilt])
