@@ -22,7 +22,7 @@ from mapping.scene_scale import MIN_POINTS, SceneScale
 from mapping.tracking.fit import Fit
 from mapping.tracking.mapped_scan import MappedScan
 
-# Lost scans in a row after which the map begins anew.
+# Lost scans in a row after which the map begins anew. Those of a covered sensor do not count.
 _GIVE_UP_AFTER = 20
 
 
@@ -48,7 +48,7 @@ class LoamMapper(Stateful):
         last = self._last or MotionState(scan.stamp, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
         predicted = _predict(scan.stamp, prior, last)
         if len(features) < MIN_POINTS:
-            mapped = self._lose(predicted, None, f"only {len(features)} features within range")
+            mapped = _lost(predicted, None, f"only {len(features)} features within range")
         elif not len(self._edges) + len(self._planes):
             mapped = MappedScan(predicted, predicted.T_world_lidar, False, Status.OK, added=True)
         else:
@@ -88,15 +88,13 @@ class LoamMapper(Stateful):
         )
 
     def _lose(self, predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
-        """A scan without a registration stays at its prediction; after many a new map begins with it."""
+        """A scan without a registration; after many a new map begins with it."""
         self._lost_in_a_row += 1
         begins = self._lost_in_a_row >= _GIVE_UP_AFTER
         if begins:
             self._begin_maps()
             reason += "; a new map begins here"
-        lost = replace(predicted, covariance=LOST_MOTION)
-        T_predicted = predicted.T_world_lidar
-        return MappedScan(lost, T_predicted, False, Status.LOST, reason, fit, added=begins, is_connected=False)
+        return replace(_lost(predicted, fit, reason), added=begins)
 
     def _begin_maps(self) -> None:
         self._edges, self._planes = (FeatureMap(self._config.radius_m) for _ in range(2))
@@ -113,6 +111,12 @@ def _predict(stamp: float, prior: Prior, last: MotionState) -> MotionState:
     velocity = last.velocity if prior.velocity is None else prior.velocity
     motion = exp(last.velocity * (stamp - last.stamp)) if prior.T_prev_curr is None else prior.T_prev_curr
     return MotionState(stamp, last.T_world_lidar @ motion, velocity, UNKNOWN_VELOCITY)
+
+
+def _lost(predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
+    """A scan without a registration stays at its prediction."""
+    lost = replace(predicted, covariance=LOST_MOTION)
+    return MappedScan(lost, predicted.T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)
 
 
 def _moved(predicted: MotionState, registration: LoamRegistration, prior: Prior, last: MotionState) -> MotionState:
