@@ -92,9 +92,9 @@ class Room:
         return Scan.from_raw(self._measured(T_room_lidar_at, directions, stamp + offsets), stamp, offsets)
 
     def ring_sweep(
-        self, T_room_lidar_at: Callable[[FloatArray], FloatArray], stamp: float, rings: int = 32, columns: int = 720
+        self, T_room_lidar_at: Callable[[FloatArray], FloatArray], stamp: float, rings: int = 32, columns: int = 480
     ) -> Scan:
-        """A rolling sweep of a scanner with rings, clockwise from behind, stamped in its middle, column after column."""
+        """A sweep of a scanner with rings, column after column, clockwise from behind, stamped in its middle."""
         offsets = ((np.arange(columns) + 0.5) / columns - 0.5).repeat(rings)
         elevation, azimuth = np.tile(np.deg2rad(np.linspace(-28.0, 28.0, rings)), columns), -2.0 * np.pi * offsets
         rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
