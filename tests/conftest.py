@@ -89,9 +89,26 @@ class Room:
         """
         directions, fraction = self.directions(seed=round(1e3 * stamp))
         offsets = (fraction - stamp_at) * self.period_s
-        T = T_room_lidar_at(stamp + offsets)
+        return Scan.from_raw(self._measured(T_room_lidar_at, directions, stamp + offsets), stamp, offsets)
+
+    def ring_sweep(
+        self, T_room_lidar_at: Callable[[FloatArray], FloatArray], stamp: float, rings: int = 32, columns: int = 480
+    ) -> Scan:
+        """A sweep of a scanner with rings, column after column, clockwise from behind, stamped in its middle."""
+        offsets = ((np.arange(columns) + 0.5) / columns - 0.5).repeat(rings)
+        elevation, azimuth = np.tile(np.deg2rad(np.linspace(-28.0, 28.0, rings)), columns), -2.0 * np.pi * offsets
+        rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        times = self.period_s * offsets
+        points = self._measured(T_room_lidar_at, np.stack(rays, axis=-1), stamp + times)
+        return Scan.from_raw(points, stamp, times, np.tile(np.arange(rings), columns))
+
+    def _measured(
+        self, T_room_lidar_at: Callable[[FloatArray], FloatArray], directions: FloatArray, times: FloatArray
+    ) -> FloatArray:
+        """Points (N, 3) along directions (N, 3) of the LiDAR frame, each from the pose at its own time (N,)."""
+        T = T_room_lidar_at(times)
         ranges = self.cast(T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], directions))
-        return Scan.from_raw(directions * ranges[:, None], stamp, offsets)
+        return directions * ranges[:, None]
 
 
 @pytest.fixture(scope="session")

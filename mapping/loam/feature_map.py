@@ -104,12 +104,12 @@ def match_lines(points: FloatArray, edges: FeatureMap) -> Correspondences:
     """Match edge points (N, 3) of the world to lines: neighbours spread along one direction."""
     near = edges.neighbourhoods(points, axis=2)
     fit = np.flatnonzero(near.variances[:, 2] > _LINE_RATIO * near.variances[:, 1])
-    along, variances, index, means = near.axes[fit], near.variances[fit], near.index[fit], near.means[fit]
+    along, index, means = near.axes[fit], near.index[fit], near.means[fit]
     across = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     normals = np.stack([across, np.cross(along, across)], axis=1).reshape(-1, 3)
-    # The variance of a line's slope: that of the residuals, of which two are spent on the fit, per scatter along it.
-    tilt = np.sqrt(np.maximum(variances[:, 1], 0.0) / ((_NEIGHBOURS - 2) * variances[:, 2]))
+    # Two residuals are spent on the fit.
+    tilt = _tilt(near.variances[fit, 1], near.variances[fit, 2], _NEIGHBOURS - 2)
     return Correspondences(index.repeat(2), means.repeat(2, axis=0), normals, tilt.repeat(2))
 
 
@@ -118,6 +118,11 @@ def match_planes(points: FloatArray, planes: FeatureMap) -> Correspondences:
     near = planes.neighbourhoods(points, axis=0)
     spread = near.variances[:, 1] > _PLANE_RATIO * near.variances[:, 2]
     fit = np.flatnonzero(spread & (near.farthest_m < _PLANE_M))
-    # As of lines; three residuals are spent on the fit of a plane, and its shorter extent decides.
-    tilt = np.sqrt(np.maximum(near.variances[fit, 0], 0.0) / ((_NEIGHBOURS - 3) * near.variances[fit, 1]))
+    # Three residuals are spent on the fit; the shorter extent decides.
+    tilt = _tilt(near.variances[fit, 0], near.variances[fit, 1], _NEIGHBOURS - 3)
     return Correspondences(near.index[fit], near.means[fit], near.axes[fit], tilt)
+
+
+def _tilt(across: FloatArray, along: FloatArray, free: int) -> FloatArray:
+    """Standard deviation (M,) of directions fitted to points with variances (M,) across and along them."""
+    return np.asarray(np.sqrt(np.maximum(across, 0.0) / (free * along)), dtype=np.float64)

@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, orthonormalize, transform_points
 from mapping.degeneracy import find_degeneracy
-from mapping.gauss_newton import NormalEquations, gauss_newton, point_to_plane_jacobian
+from mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
 from mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from mapping.loam.features import Features
 from mapping.prediction import MotionState
@@ -17,6 +17,9 @@ from mapping.tracking.fit import Fit
 _ITERATIONS, _CONVERGED_M = 10, 0.005
 # Correspondences are kept over a displacement of this share of the spacing of the map.
 _SAME = 0.1
+# Tilt of a line or plane at which it counts a quarter: across the corner of a floor and a wall, or with noise as large
+# as their spacing, five points make planes of any direction, and these move with the rings.
+_TILT = 0.2
 _FEWEST_CORRESPONDENCES = 50
 # The weight of a residual falls by this for each metre, and vanishes below the least.
 _WEIGHT_SLOPE, _LEAST_WEIGHT = 0.9, 0.1
@@ -130,6 +133,7 @@ class _Problem:
         self._points = np.concatenate([lines.points, planes.points])
         self._normals = np.concatenate([lines.normals, planes.normals])
         self._tilt = np.concatenate([lines.tilt, planes.tilt])
+        self._quality = geman_mcclure(self._tilt, _TILT**2)
         # The first residual of each feature.
         self._first = np.concatenate([np.arange(0, len(lines.index), 2), np.arange(len(lines.index), len(self._tilt))])
         self._ranges = np.sqrt(np.einsum("ij,ij->i", self._features, self._features))
@@ -147,4 +151,4 @@ class _Problem:
         sizes = self._distances / np.sqrt(self._ranges)
         sizes[lines] = self._distances[lines]
         weights = 1.0 - _WEIGHT_SLOPE * sizes
-        self._weights = np.where(weights > _LEAST_WEIGHT, weights, 0.0) ** 2
+        self._weights = self._quality * np.where(weights > _LEAST_WEIGHT, weights, 0.0) ** 2

@@ -18,14 +18,15 @@ _ROW_RAD = np.deg2rad(0.5)
 def ring_order(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Sort the points of a sweep by ring, and within a ring in the order of measurement.
 
-    The rings are those of the recording, with points as stored. Where it has none, they are found in a cloud that is
-    stored ring after ring, as KITTI's, and else from the peaks of the elevations, with points by time or azimuth.
+    The rings are those of the recording. Where it has none, they are found in a cloud that is stored ring after ring,
+    as KITTI's, and else from the peaks of the elevations. Points without times are taken as stored, or by azimuth.
 
     Returns:
         Indices (N,) of the points, and the ring (N,) of each of these, ascending.
     """
     if scan.rings is not None:
-        order = np.argsort(scan.rings.astype(np.int16), kind="stable")  # a radix sort, eight times as fast as int32
+        by_ring = (scan.rings,) if scan.time_offsets is None else (scan.time_offsets, scan.rings)
+        order = np.lexsort(by_ring)
         return order, scan.rings[order].astype(np.intp)
     rings = _stored_rings(scan.points)
     if rings is not None:

@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion, Sway
 from lidarslam.simulation.recorder import Simulation
@@ -65,3 +67,9 @@ def _l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
     flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
     parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
     return np.concatenate(parts)
+
+
+@pytest.fixture(scope="session")
+def ring_scans(room: Any, drive: Callable[[FloatArray], FloatArray], room_truth: Trajectory) -> list[Scan]:
+    """Twenty rolling sweeps along the drive by a scanner with rings."""
+    return [room.ring_sweep(drive, float(stamp)) for stamp in room_truth.stamps]

@@ -1,0 +1,96 @@
+"""LOAM's mapping from the command line: a run, a pose graph, a comparison."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum, write_tum
+from mapping.loam.features import Features, extract_features
+
+SCANS = 8
+FIELDS = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8"), ("ring", "u2")])
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[[FloatArray], FloatArray]) -> Path:
+    """Sweeps of a scanner with rings."""
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    folder.mkdir()
+    stamps = 0.1 * np.arange(1, SCANS + 1)
+    for index, stamp in enumerate(stamps):
+        scan = room.ring_sweep(drive, float(stamp))
+        table = np.empty(len(scan), dtype=FIELDS)
+        table["x"], table["y"], table["z"] = scan.points.T
+        table["time"], table["ring"] = scan.time_offsets, scan.rings
+        np.save(folder / f"{index:06d}.npy", table)
+    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", Trajectory(stamps, drive(stamps)))
+    return folder
+
+
+def lidarslam(*arguments: object) -> str:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def position_errors(run: Path, source: Path) -> FloatArray:
+    """Distances (N,) of the run's positions from the truth, whose world is the first scan's frame."""
+    truth, found = read_tum(source / "ground_truth.tum"), read_tum(run / "trajectory.tum")
+    T = inverse(inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar) @ found.T_world_lidar
+    return np.asarray(np.linalg.norm(T[:, :3, 3], axis=1))
+
+
+@pytest.mark.parametrize("more", [[], ["--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2"]])
+def test_a_run_with_loam(source: Path, tmp_path: Path, more: list[str]) -> None:
+    out = tmp_path / "run"
+    lidarslam("run", source, "--out", out, "--odometry", "constant-velocity", "--mapping", "loam", *more)
+    assert position_errors(out, source).max() < 0.03
+    assert "method: loam" in (out / "config.yaml").read_text()
+    with (out / "scans.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["ok"] * SCANS
+    assert all(0 < int(row["points_used"]) < int(row["points"]) for row in rows[1:])
+    assert (out / "map.ply").stat().st_size > 10_000
+    assert (out / "pose_graph.g2o").exists() == bool(more)
+
+
+def test_a_comparison_with_loam(source: Path, tmp_path: Path) -> None:
+    lidarslam("compare", source, "--out", tmp_path / "out", "--methods", "constant-velocity+loam")
+    (method,) = json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"].items()
+    assert method[0] == "constant-velocity+loam"
+    assert (method[1]["status"], method[1]["lost_scans"]) == ("ok", 0)
+    assert method[1]["metrics"]["trajectory"]["ate_rmse_m"] < 0.02
+
+
+def test_an_interrupted_run_comes_to_the_same_results(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["--odometry", "constant-velocity", "--mapping", "loam", "--set", "checkpoints.every_scans=3"]
+    whole, out, left = tmp_path / "whole", tmp_path / "run", 5
+    lidarslam("run", source, "--out", whole, *arguments)
+
+    def interrupted(*given: Any) -> Features:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return extract_features(*given)
+
+    monkeypatch.setattr("mapping.loam.mapper.extract_features", interrupted)
+    command = ["run", str(source), "--out", str(out), *arguments]
+    assert CliRunner().invoke(main, command).exit_code == 1
+    assert (out / "unfinished" / "state.npz").exists()
+    monkeypatch.undo()
+    lidarslam("run", source, "--out", out, *arguments, "--resume")
+    for name in ("trajectory.tum", "odometry.tum", "map.ply"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name

@@ -1,0 +1,348 @@
+"""Rings of a sweep, and its edge and planar features: curvature, reliability and choice."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from mapping.loam.feature_kernels import EDGE, PLANE, classify, write_curvatures
+from mapping.loam.features import extract_features
+from mapping.loam.rings import ring_order
+
+Scanner = Callable[..., Scan]
+FINE_M = 0.001  # voxels of single points
+
+
+def on_sphere(azimuth: FloatArray, elevation: FloatArray, ranges: FloatArray | float = 5.0) -> FloatArray:
+    """Points (N, 3) in these directions, radians."""
+    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.stack(rays, axis=-1) * np.reshape(ranges, (-1, 1))
+
+
+def stored_by_ring(start_deg: float, way: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.intp]]:
+    """A cloud as KITTI's, 40 rings from the top, each once round, a fifth of its points missing; and the rings (N,)."""
+    azimuth = np.deg2rad(start_deg) + way * 2.0 * np.pi * (np.arange(500) + 0.5) / 500
+    rings = np.arange(40).repeat(500)
+    elevation = np.deg2rad(2.0 - 0.6 * rings + rng.uniform(-0.1, 0.1, len(rings)))
+    points = on_sphere(np.tile(azimuth, 40), elevation, rng.uniform(4.0, 20.0, len(rings)))
+    kept = np.flatnonzero(rng.uniform(size=len(rings)) > 0.2)
+    return points[kept], rings[kept]
+
+
+def test_rings_of_the_recording_are_kept(rng: np.random.Generator) -> None:
+    rings = rng.integers(0, 7, 500).astype(np.int32)
+    order, found = ring_order(Scan(rng.normal(size=(500, 3)), 0.0, rings=rings))
+    np.testing.assert_array_equal(found, np.sort(rings))
+    np.testing.assert_array_equal(found, rings[order])
+    for ring in range(7):
+        np.testing.assert_array_equal(order[found == ring], np.flatnonzero(rings == ring))
+
+
+def test_points_of_a_ring_are_in_the_order_of_time(room: Any, drive: Any, rng: np.random.Generator) -> None:
+    """However they are stored."""
+    scan = room.ring_sweep(drive, 0.1, rings=8, columns=100)
+    shuffled = scan.select(rng.permutation(len(scan)))
+    (order, rings), (again, same) = ring_order(scan), ring_order(shuffled)
+    np.testing.assert_array_equal(rings, same)
+    np.testing.assert_array_equal(scan.points[order], shuffled.points[again])
+
+
+@pytest.mark.parametrize("start_deg", [0.0, 180.0], ids=["ahead", "behind"])
+@pytest.mark.parametrize("way", [1, -1], ids=["counter-clockwise", "clockwise"])
+def test_rings_stored_one_after_the_other_are_found(start_deg: float, way: int, rng: np.random.Generator) -> None:
+    points, rings = stored_by_ring(start_deg, way, rng)
+    order, found = ring_order(Scan(points, 0.0))
+    np.testing.assert_array_equal(order, np.arange(len(points)))
+    np.testing.assert_array_equal(found, rings)
+
+
+@pytest.mark.parametrize("sensor", ["vlp-16", "hdl-32e", "os1-64", "xt32"])
+def test_rings_of_a_cloud_in_firing_order_are_found(scan_room: Scanner, sensor: str) -> None:
+    scan = scan_room(sensor)
+    assert scan.rings is not None
+    order, found = ring_order(replace(scan, rings=None))
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(scan)))
+    assert (np.diff(found) >= 0).all()
+    true = scan.rings[order]
+    # Numbered from below; the drivers number some from above.
+    np.testing.assert_array_equal(found, true if true[0] == 0 else true.max() - true)
+    azimuth = np.arctan2(scan.points[order, 1], scan.points[order, 0])
+    assert (np.diff(azimuth)[np.diff(found) == 0] >= 0.0).all()
+
+
+def test_a_shuffled_cloud_has_the_same_rings(scan_room: Scanner, rng: np.random.Generator) -> None:
+    scan = replace(scan_room("vlp-16"), rings=None)
+    shuffled = scan.select(rng.permutation(len(scan)))
+    (order, rings), (again, same) = ring_order(scan), ring_order(shuffled)
+    np.testing.assert_array_equal(rings, same)
+    np.testing.assert_array_equal(scan.points[order], shuffled.points[again])
+
+
+def test_elevations_without_peaks_are_divided_into_rows(rng: np.random.Generator) -> None:
+    """Three peaks are not enough: rows of half a degree."""
+    azimuth, which = rng.uniform(-np.pi, np.pi, 900), rng.integers(0, 3, 900)
+    for elevations_deg, expected in (([-1.3, -1.2, 0.2], [0, 1, 2]), ([-1.1, -0.9, 0.2], [0, 0, 1])):
+        order, rings = ring_order(Scan(on_sphere(azimuth, np.deg2rad(elevations_deg)[which]), 0.0))
+        np.testing.assert_array_equal(np.sort(order), np.arange(900))
+        np.testing.assert_array_equal(np.unique(rings, return_inverse=True)[1], np.array(expected)[which[order]])
+
+
+def test_rings_of_an_unordered_cloud_are_narrow(room_scans: list[Scan]) -> None:
+    scan = room_scans[0]
+    order, rings = ring_order(scan)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(scan)))
+    assert (np.diff(rings) >= 0).all()
+    x, y, z = scan.points[order].T
+    elevation = np.rad2deg(np.arctan2(z, np.hypot(x, y)))
+    assert max(np.ptp(elevation[rings == ring]) for ring in np.unique(rings)) < 1.0
+
+
+@pytest.mark.parametrize("count", range(13))
+@pytest.mark.parametrize("has_rings", [True, False])
+def test_scans_of_few_points(count: int, has_rings: bool, rng: np.random.Generator) -> None:
+    rings = rng.integers(0, 2, count).astype(np.int32) if has_rings else None
+    scan = Scan(rng.normal(size=(count, 3)), 0.0, np.zeros(count), rings)
+    order, found = ring_order(scan)
+    np.testing.assert_array_equal(np.sort(order), np.arange(count))
+    assert found.shape == (count,)
+    features = extract_features(scan, 0.0, 100.0, 0.1)
+    if count <= 10:
+        assert len(features) == 0, "a curvature needs ten neighbours"
+
+
+@pytest.mark.parametrize("has_rings", [True, False])
+def test_a_rosette_has_features(scan_room: Scanner, has_rings: bool) -> None:
+    scan = scan_room("livox")
+    features = extract_features(scan if has_rings else replace(scan, rings=None), 0.5, 100.0, 0.1)
+    assert len(features) > 100
+
+
+def curvatures(points: FloatArray, rings: NDArray[np.intp] | None = None) -> FloatArray:
+    found = np.full(len(points), 7.0)
+    write_curvatures(points, np.zeros(len(points), dtype=np.intp) if rings is None else rings, found)
+    return found
+
+
+def test_the_curvature_of_a_straight_line_is_zero() -> None:
+    line = np.linspace([3.0, -2.0, 1.0], [4.8, -2.0, 3.4], 30)
+    np.testing.assert_array_equal(np.isnan(curvatures(line)), np.arange(30) // 5 % 5 == 0)
+    np.testing.assert_allclose(curvatures(line)[5:25], 0.0, atol=1e-24)
+
+
+@pytest.mark.parametrize("angle_deg", [30.0, 90.0, 150.0])
+def test_the_curvature_of_a_corner(angle_deg: float) -> None:
+    """The sides' sums are 15 steps of 5 cm along either."""
+    angle, steps = np.deg2rad(angle_deg), 0.05 * np.arange(1, 11)[:, None]
+    sides = np.array([[1.0, 0.0, 0.0], [np.cos(angle), np.sin(angle), 0.0]])
+    corner = np.array([2.0, 1.0, -1.0])
+    points = np.concatenate([corner + steps[::-1] * sides[0], [corner], corner + steps * sides[1]])
+    found = curvatures(points)
+    assert found[10] == pytest.approx((15 * 0.05) ** 2 * (2.0 + 2.0 * np.cos(angle)), rel=1e-9)
+    # Four steps off the corner the fifth neighbour on one side lies on the other: out of line by one step of each.
+    assert found[14] == pytest.approx(0.05**2 * (2.0 + 2.0 * np.cos(angle)), rel=1e-9)
+    assert np.nanargmax(found) == 10
+
+
+def test_the_curvature_of_a_circle() -> None:
+    turn = np.deg2rad(0.5)
+    points = on_sphere(turn * np.arange(40), np.zeros(40), 8.0)
+    expected = (2.0 * 8.0 * (1.0 - np.cos(turn * np.arange(1, 6))).sum()) ** 2
+    np.testing.assert_allclose(curvatures(points)[5:35], expected, rtol=1e-6)
+
+
+def test_a_curvature_is_of_one_ring() -> None:
+    points = np.linspace([5.0, 0.0, 0.0], [5.0, 39.0, 0.0], 40)
+    found = curvatures(points, np.arange(40) // 20)
+    np.testing.assert_array_equal(np.isnan(found), ~np.isin(np.arange(40) % 20, np.arange(5, 15)))
+
+
+def kinds_of(points: FloatArray, rings: NDArray[np.intp] | None = None) -> NDArray[np.int8]:
+    """Whether points (N, 3), ring after ring, are edges, planar or neither, by the published thresholds."""
+    rings = np.zeros(len(points), dtype=np.intp) if rings is None else rings
+    kinds = np.full(len(points), 9, dtype=np.int8)
+    classify(points, np.linalg.norm(points, axis=1), rings, curvatures(points, rings), 0.1, 0.1, kinds)
+    return kinds
+
+
+def wall_at(x: FloatArray | float, azimuth_deg: FloatArray) -> FloatArray:
+    """One ring's points (N, 3) on walls across the x axis at these distances."""
+    azimuth = np.deg2rad(azimuth_deg)
+    return np.column_stack([x * np.ones(len(azimuth)), x * np.tan(azimuth), np.zeros(len(azimuth))])
+
+
+AZIMUTH_DEG = np.arange(-30.0, 30.0, 0.2) + 0.1  # 300 of them
+
+
+def test_a_flat_wall_is_planar() -> None:
+    expected = np.where((np.arange(300) < 5) | (np.arange(300) >= 295), 0, PLANE)
+    np.testing.assert_array_equal(kinds_of(wall_at(5.0, AZIMUTH_DEG)), expected)
+
+
+def test_the_corner_of_two_walls_is_one_edge() -> None:
+    """Walls along the diagonals meet straight ahead at a right angle."""
+    azimuth = np.deg2rad(np.arange(-20.0, 26.2, 0.4))
+    ranges = 4.0 * np.sin(np.pi / 4) / np.sin(np.pi - np.pi / 4 - np.abs(azimuth))
+    kinds = kinds_of(on_sphere(azimuth, np.zeros(len(azimuth)), ranges))
+    assert np.flatnonzero(kinds == EDGE).tolist() == [50]
+    assert (kinds[5:40] == PLANE).all()
+    assert (kinds[61:110] == PLANE).all()
+
+
+def test_the_edge_of_a_near_surface_is_an_edge_and_what_it_may_hide_is_none() -> None:
+    """A board at 5 m before a wall at 10 m, in the middle 50 points of a ring."""
+    is_near = np.abs(np.arange(300) - 149.5) < 25.0
+    kinds = kinds_of(wall_at(np.where(is_near, 5.0, 10.0), AZIMUTH_DEG))
+    near, far = np.flatnonzero(is_near), np.flatnonzero(~is_near)
+    assert set(np.flatnonzero(kinds == EDGE)) == {near[0], near[-1]}
+    hidden = [*range(near[0] - 6, near[0]), *range(near[-1] + 1, near[-1] + 7)]
+    assert (kinds[hidden] == 0).all()
+    assert (kinds[np.setdiff1d(far[5:-5], hidden)] == PLANE).all()
+    assert (kinds[near[5:-5]] == PLANE).all()
+
+
+def test_a_surface_nearly_parallel_to_the_beam_has_no_features() -> None:
+    """A wall beside the sensor's way: neighbours 0.2 degrees apart are 1.4 % of the range apart at 14.3 degrees."""
+    incidence = np.deg2rad(np.arange(60.0, 8.0, -0.2))
+    points = on_sphere(incidence, np.zeros(len(incidence)), 1.0 / np.sin(incidence))
+    kinds = kinds_of(points)
+    assert (kinds[incidence < np.deg2rad(13.9)] == 0).all()
+    steep = np.flatnonzero(incidence > np.deg2rad(14.7))
+    assert (kinds[steep[5:]] == PLANE).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_are_the_sharpest_points_and_no_neighbours(seed: int) -> None:
+    """At most twenty in each sixth of a ring; closer than six points only across a gap."""
+    rng = np.random.default_rng(seed)
+    rings = np.arange(3).repeat(3000)
+    azimuth = np.tile(2.0 * np.pi * np.arange(3000) / 3000, 3)
+    ranges = 6.0 + 0.05 * rng.standard_normal(9000)
+    ranges[rng.uniform(size=9000) < 0.02] -= 0.27  # less than what may hide something
+    points = on_sphere(azimuth, 0.02 * rings, ranges)
+    kinds, sharpness = kinds_of(points, rings), curvatures(points, rings)
+    for first in range(0, 9000, 500):
+        edges = first + np.flatnonzero(kinds[first : first + 500] == EDGE)
+        assert len(edges) == 20
+        # No planar point, and no point that may yet become an edge, is sharper than the least of them.
+        assert sharpness[edges].min() > 0.1
+        assert sharpness[first : first + 500][kinds[first : first + 500] == PLANE].max() < 0.1
+    edges = np.flatnonzero(kinds == EDGE)
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) ** 2
+    beside = [(a, b) for a, b in pairwise(edges) if b - a <= 5]
+    assert beside, "some are neighbours across a gap"
+    assert all(steps[a:b].max() > 0.05 for a, b in beside)
+
+
+def test_the_sharpest_of_neighbours_is_chosen(rng: np.random.Generator) -> None:
+    """A sharp point is an edge, or has a sharper edge within five points, or one of the sector before."""
+    azimuth = np.deg2rad(np.arange(0.0, 360.0, 0.2))
+    points = on_sphere(azimuth, np.zeros(1800), 5.0 + 0.015 * rng.standard_normal(1800))
+    kinds, sharpness = kinds_of(points), curvatures(points)
+    edges = np.flatnonzero(kinds == EDGE)
+    assert len(edges) > 20
+    assert (np.diff(edges) > 5).all()
+    for i in np.setdiff1d(np.flatnonzero(sharpness > 0.1), edges):
+        rivals = edges[np.abs(edges - i) <= 5]
+        assert any(sharpness[rival] >= sharpness[i] or rival // 300 < i // 300 for rival in rivals)
+
+
+def distance_to_edges(room: Any, points: FloatArray) -> FloatArray:
+    """Distances (N,) of points (N, 3) of the room's surfaces from the nearest edge: of walls, of pillars, of both."""
+    away = [np.abs(np.abs(points) - room.half_size)]
+    walls = np.sort(away[0], axis=1)
+    distance = np.hypot(walls[:, 0], walls[:, 1])
+    for x, y, half in room.pillars:
+        sides = np.abs(np.abs(points[:, :2] - [x, y]) - half)
+        on_side = np.abs(points[:, :2] - [x, y]).max(axis=1) < half + 0.3
+        upright = np.hypot(sides[:, 0], sides[:, 1])
+        foot = np.hypot(sides.min(axis=1), away[0][:, 2])
+        distance = np.where(on_side, np.minimum(distance, np.minimum(upright, foot)), distance)
+    return distance
+
+
+@pytest.mark.parametrize(("sigma_m", "false_edges"), [(0.0, 0.01), (0.02, 0.04)])
+def test_edges_of_a_room_are_its_edges(
+    room: Any, drive: Callable[[FloatArray], FloatArray], rng: np.random.Generator, sigma_m: float, false_edges: float
+) -> None:
+    T = drive(np.array([0.5]))[0]
+    scan = room.ring_sweep(lambda time: np.broadcast_to(T, (*np.shape(time), 4, 4)), 0.5)
+    away = np.linalg.norm(scan.points, axis=1, keepdims=True)
+    scan = replace(scan, points=scan.points * (1.0 + sigma_m * rng.standard_normal(away.shape) / away))
+    features = extract_features(scan, 0.5, 100.0, FINE_M)
+    in_room = features.edges.points @ T[:3, :3].T + T[:3, 3]
+    off = distance_to_edges(room, in_room) > 0.15
+    assert np.count_nonzero(off) < false_edges * len(scan)
+    assert np.count_nonzero(~off) > 150
+    assert len(features.planes) > 0.5 * len(scan)
+
+
+def noisy_wall(rng: np.random.Generator) -> Scan:
+    """A wall at 5 m in 16 rings, with 2 cm of noise."""
+    points = np.concatenate([wall_at(5.0, AZIMUTH_DEG) + np.array([0.0, 0.0, 0.1 * ring]) for ring in range(16)])
+    points *= 1.0 + 0.02 * rng.standard_normal((len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    return Scan(points, 0.0, np.tile(np.linspace(-0.05, 0.05, 300), 16), np.arange(16, dtype=np.int32).repeat(300))
+
+
+def test_noise_of_a_flat_wall_is_no_edge(rng: np.random.Generator) -> None:
+    scan = noisy_wall(rng)
+    features = extract_features(scan, 0.5, 100.0, FINE_M)
+    assert 0 < len(features.edges) < 0.04 * len(scan)
+    assert len(features.planes) > 0.7 * len(scan)
+
+
+def rows_of(features: FloatArray, scan: Scan) -> NDArray[np.intp]:
+    """Indices (M,) of the scan's points that features (M, 3) are."""
+    rows = {tuple(point): index for index, point in enumerate(scan.points)}
+    return np.array([rows[tuple(point)] for point in features], dtype=np.intp)
+
+
+def test_features_are_points_as_measured_with_their_times(ring_scans: list[Scan]) -> None:
+    scan = ring_scans[0]
+    assert scan.time_offsets is not None
+    features = extract_features(scan, 0.5, 100.0, 0.1)
+    for sweep in (features.edges, features.planes):
+        assert sweep.times is not None
+        np.testing.assert_array_equal(sweep.times, scan.time_offsets[rows_of(sweep.points, scan)])
+    untimed = extract_features(replace(scan, time_offsets=None), 0.5, 100.0, 0.1)
+    assert untimed.edges.times is None
+    np.testing.assert_array_equal(untimed.planes.points, features.planes.points)
+
+
+def test_no_point_is_both_an_edge_and_planar(ring_scans: list[Scan]) -> None:
+    features = extract_features(ring_scans[0], 0.5, 100.0, 0.1)
+    edges, planes = (rows_of(sweep.points, ring_scans[0]) for sweep in (features.edges, features.planes))
+    assert len(edges)
+    assert not np.intersect1d(edges, planes).size
+    assert len(features) == len(edges) + len(planes)
+
+
+def test_features_lie_within_the_range_limits(ring_scans: list[Scan]) -> None:
+    scan = ring_scans[0]
+    all_of, some = extract_features(scan, 0.5, 100.0, FINE_M), extract_features(scan, 4.0, 7.0, FINE_M)
+    for every, limited in ((all_of.edges, some.edges), (all_of.planes, some.planes)):
+        ranges = np.linalg.norm(limited.points, axis=1)
+        assert ((ranges > 4.0) & (ranges < 7.0)).all()
+        before = np.linalg.norm(every.points, axis=1)
+        within = every.points[(before > 4.0) & (before < 7.0)]
+        assert len(within) < len(every)
+        assert np.isin(rows_of(within, scan), rows_of(limited.points, scan)).all()
+
+
+def test_one_feature_a_voxel_is_kept(ring_scans: list[Scan]) -> None:
+    features = extract_features(ring_scans[0], 0.5, 100.0, 0.5)
+    for sweep in (features.edges, features.planes):
+        voxels = np.floor(sweep.points / 0.5)
+        assert len(np.unique(voxels, axis=0)) == len(voxels)
+    assert len(features) < 0.5 * len(extract_features(ring_scans[0], 0.5, 100.0, 0.1))
+
+
+def test_features_are_the_same_each_time(ring_scans: list[Scan]) -> None:
+    first, second = (extract_features(ring_scans[3], 0.5, 100.0, 0.2) for _ in range(2))
+    for name in ("edges", "planes"):
+        np.testing.assert_array_equal(getattr(first, name).points, getattr(second, name).points)
