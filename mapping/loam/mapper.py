@@ -22,7 +22,7 @@ from mapping.scene_scale import MIN_POINTS, SceneScale
 from mapping.tracking.fit import Fit
 from mapping.tracking.mapped_scan import MappedScan
 
-# Neighbours in a sparser map are too far apart for a line or plane.
+# Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
 _MOST_SPACING_M = 0.4
 # Lost scans in a row after which the map begins anew.
 _GIVE_UP_AFTER = 20
@@ -52,7 +52,7 @@ class LoamMapper(Stateful):
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
         cell_m = self._scale.update(np.einsum("ij,ij->i", scan.points, scan.points))
-        spacing_m = min(cell_m, _MOST_SPACING_M)
+        spacing_m = self._config.cell_m or min(cell_m, _MOST_SPACING_M)
         features = extract_features(scan, self._config.min_range_m, self._config.max_range_m, spacing_m)
         last = self._last or MotionState(scan.stamp, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
         predicted = _predict(scan.stamp, prior, last, self._config)
