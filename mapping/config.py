@@ -32,7 +32,7 @@ class _EarlierSwitch(BaseModel):
 
 
 class MappingConfig(BaseModel):
-    """Scan-to-map registration; LOAM's mapping ignores the settings marked "surfels only"."""
+    """Scan-to-map registration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -45,7 +45,9 @@ class MappingConfig(BaseModel):
     radius_m: float = Field(100.0, ge=1.0, description="radius of the local map around the sensor")
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")
     max_range_m: float = Field(100.0, gt=0.0, description="farther points are ignored")
-    keypoints: int = Field(3000, ge=100, description="surfels only: points of a scan that are registered, at most")
+    keypoints: int = Field(
+        3000, ge=100, description="points of a scan that are registered, at most; LOAM: planar points"
+    )
     continuous_time: bool = Field(
         True, description="surfels only: estimate the velocity during the sweep together with its pose"
     )

@@ -68,7 +68,8 @@ class LoamMapper(Stateful):
 
     def _track(self, features: Features, prior: Prior, predicted: MotionState, last: MotionState) -> MappedScan:
         """Register compensated features from the predicted pose, judge the pose by its fit, insert."""
-        registration = register(features, predicted, FeatureMaps(self._edges, self._planes))
+        maps = FeatureMaps(self._edges, self._planes)
+        registration = register(features, predicted, maps, self._config.keypoints)
         if registration is None:
             return self._lose(features, predicted, None, "too few features correspond to the map")
         fit, names = registration.fit, registration.degeneracy.names

@@ -48,7 +48,9 @@ class LoamRegistration:
     iterations: int  # of Gauss-Newton
 
 
-def register(features: Features, predicted: MotionState, maps: FeatureMaps) -> LoamRegistration | None:
+def register(
+    features: Features, predicted: MotionState, maps: FeatureMaps, most_planes: int
+) -> LoamRegistration | None:
     """Register features to the maps by Gauss-Newton; None where there are too few correspondences.
 
     Along directions that the correspondences at the prediction do not constrain, the prediction is kept: solution
@@ -59,9 +61,12 @@ def register(features: Features, predicted: MotionState, maps: FeatureMaps) -> L
         predicted: start, and velocity that the sweep is compensated with; its covariance becomes that of the result
             along degenerate directions.
         maps: local map.
+        most_planes: planar features that are registered, at most, evenly chosen.
     """
     T_predicted = predicted.T_world_lidar
-    edges, planes = (sweep.compensated(predicted.velocity) for sweep in (features.edges, features.planes))
+    count = len(features.planes)
+    chosen = np.linspace(0, count - 1, min(count, most_planes)).astype(np.intp)
+    edges, planes = (sweep.compensated(predicted.velocity) for sweep in (features.edges, features.planes.take(chosen)))
     problem = _Problem(edges, planes, maps, features.spacing_m, T_predicted)
     if not problem.is_constrained:
         return None

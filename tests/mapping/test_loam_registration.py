@@ -38,7 +38,7 @@ def register(
     both = UNKNOWN_VELOCITY.copy()
     both[:6, :6] = covariance
     predicted = MotionState(0.0, T_predicted, np.zeros(6), both)
-    return registration.register(Features(Sweep(edges), Sweep(planes), spacing_m, 0.0), predicted, maps)
+    return registration.register(Features(Sweep(edges), Sweep(planes), spacing_m, 0.0), predicted, maps, 10_000)
 
 
 def rows(points: FloatArray) -> list[tuple[float, ...]]:
