@@ -46,7 +46,7 @@ class MappingConfig(BaseModel):
     min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")
     max_range_m: float = Field(100.0, gt=0.0, description="farther points are ignored")
     keypoints: int = Field(
-        3000, ge=100, description="points of a scan that are registered, at most; LOAM: planar points"
+        3000, ge=100, description="points of a scan that are registered, at most (LOAM: planar ones)"
     )
     continuous_time: bool = Field(
         True, description="surfels only: estimate the velocity during the sweep together with its pose"
