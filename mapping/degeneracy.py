@@ -9,6 +9,8 @@ from lidarslam.core.geometry import FloatArray
 # uncertainty explains does not count.
 _LEAST_SHARE = 0.0005
 _NOISE_FACTOR = 1.25
+# Information of the prediction along degenerate directions: that of a tenth of a millimetre.
+DEGENERATE_INFORMATION = 1e8
 
 
 def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray, lever_m: float) -> Degeneracy:

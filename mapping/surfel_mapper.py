@@ -14,15 +14,13 @@ from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.deskew import body_velocity
-from mapping.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
+from mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from mapping.surfels.sampling import SampledScan, Sampler
 from mapping.surfels.surfel_map import SurfelMap
 from mapping.tracking.fit import Fit
 from mapping.tracking.mapped_scan import MappedScan
 from mapping.tracking.tracker import Tracker
 
-# The velocity of a lost sensor fades by this factor a scan.
-_FADING = 0.7
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
@@ -128,7 +126,7 @@ class SurfelMapper(Stateful):
         if self._tracker.lose(surfel_map, has_points=fit is not None):
             self._map = self._new_map(scan, MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION))
             reason += "; a new map begins here"
-        lost = MotionState(scan.stamp, T_world_lidar, _FADING * velocity, LOST_MOTION)
+        lost = MotionState(scan.stamp, T_world_lidar, FADING * velocity, LOST_MOTION)
         return MappedScan(lost, T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)
 
     def _new_map(self, scan: SampledScan, state: MotionState) -> SurfelMap:

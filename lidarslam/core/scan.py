@@ -41,6 +41,13 @@ class Scan:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def middle_offset_s(self) -> float:
+        """Seconds from the stamp to the middle of the sweep; 0 where points have no times."""
+        if self.time_offsets is None or not len(self):
+            return 0.0
+        return float(0.5 * (self.time_offsets.min() + self.time_offsets.max()))
+
     @classmethod
     def from_raw(
         cls,

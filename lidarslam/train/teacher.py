@@ -11,7 +11,6 @@ from lidarslam.core.tracking import Status
 from mapping.config import MappingConfig
 from mapping.prediction import Prior
 from mapping.surfel_mapper import SurfelMapper
-from odometry.images.sweep_images import middle_offset_s
 from odometry.training.preparation import PreparedRecording
 
 
@@ -27,7 +26,7 @@ class MapTeacher:
         """Register the next scan."""
         mapped = self._mapper.process(scan, Prior())
         state = mapped.state
-        self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * middle_offset_s(scan)))
+        self._T_world_middle.append(state.T_world_lidar @ exp(state.velocity * scan.middle_offset_s))
         # When the first scan is registered its velocity is not known, and so not where the middle of its sweep lies.
         self._is_ok.append(mapped.status is Status.OK and len(self._T_world_middle) > 1)
 

@@ -51,9 +51,7 @@ def extract_features(scan: Scan, min_range_m: float, max_range_m: float, spacing
     edges, planes = (
         _thinned(scan, order.take(np.flatnonzero(usable & (kinds == kind))), spacing_m) for kind in (EDGE, PLANE)
     )
-    times = scan.time_offsets
-    middle_s = 0.0 if times is None or not len(times) else 0.5 * float(times.min() + times.max())
-    return Features(edges, planes, spacing_m, middle_s)
+    return Features(edges, planes, spacing_m, scan.middle_offset_s)
 
 
 def _thinned(scan: Scan, chosen: NDArray[np.intp], spacing_m: float) -> Sweep:

@@ -17,17 +17,15 @@ from mapping.deskew import body_velocity
 from mapping.loam.feature_map import FeatureMap
 from mapping.loam.features import Features, extract_features
 from mapping.loam.registration import FeatureMaps, register
-from mapping.prediction import LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
+from mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
 from mapping.scene_scale import MIN_POINTS, SceneScale
 from mapping.tracking.fit import Fit
 from mapping.tracking.mapped_scan import MappedScan
+from mapping.tracking.pose_status import reservation
+from mapping.tracking.tracking_state import GIVE_UP_AFTER
 
 # Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
 _MOST_SPACING_M = 0.4
-# Lost scans in a row after which the map begins anew.
-_GIVE_UP_AFTER = 20
-# The velocity of a lost sensor fades by this factor a scan.
-_FADING = 0.7
 
 
 class LoamMapper(Stateful):
@@ -85,7 +83,7 @@ class LoamMapper(Stateful):
         is_added = status is Status.OK
         if is_added:
             self._insert(features, state)
-            message = _reservation(names, self._is_adrift)
+            message = reservation(names, self._is_adrift)
         return MappedScan(
             state=state,
             T_world_predicted=predicted.T_world_lidar,
@@ -115,7 +113,7 @@ class LoamMapper(Stateful):
     def _lose(self, features: Features, predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
         """A scan without a registration stays at its prediction; after many in a row a new map begins with it."""
         self._lost_in_a_row += 1
-        if self._lost_in_a_row < _GIVE_UP_AFTER:
+        if self._lost_in_a_row < GIVE_UP_AFTER:
             return _lost(predicted, fit, reason)
         self._begin_maps()
         self._insert(features, predicted)
@@ -141,13 +139,6 @@ def _predict(stamp: float, prior: Prior, last: MotionState, config: MappingConfi
     return MotionState(stamp, last.T_world_lidar @ motion, velocity, covariance)
 
 
-def _reservation(degenerate: tuple[str, ...], is_adrift: bool) -> str:
-    """Why a scan that fits is degraded nevertheless; empty where it is not."""
-    if is_adrift:
-        return "in a new map; its pose in the map before is unknown"
-    return f"degenerate along {', '.join(degenerate)}: the prediction was kept" if degenerate else ""
-
-
 def _lost(predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:
-    state = replace(predicted, velocity=_FADING * predicted.velocity, covariance=LOST_MOTION)
+    state = replace(predicted, velocity=FADING * predicted.velocity, covariance=LOST_MOTION)
     return MappedScan(state, predicted.T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, orthonormalize, transform_points
-from mapping.degeneracy import find_degeneracy
+from mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
 from mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
 from mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from mapping.loam.features import Features
@@ -25,8 +25,6 @@ _FEWEST_CORRESPONDENCES = 50
 _WEIGHT_SLOPE, _LEAST_WEIGHT = 0.9, 0.1
 # Standard deviation of a residual, and how many residuals count as one, as their errors are correlated.
 _NOISE_M, _CORRELATION = 0.05, 25.0
-# Information of the prediction along degenerate directions: that of a tenth of a millimetre.
-_DEGENERATE_INFORMATION = 1e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +69,7 @@ def register(
     if not problem.is_constrained:
         return None
     degeneracy = problem.degeneracy()
-    held = _DEGENERATE_INFORMATION * degeneracy.projector()
+    held = DEGENERATE_INFORMATION * degeneracy.projector()
     try:
         solution = gauss_newton(
             problem.linearise, T_predicted, T_predicted, held, _ITERATIONS, problem.lever_m, _CONVERGED_M

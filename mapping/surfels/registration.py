@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from mapping.degeneracy import find_degeneracy
+from mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
 from mapping.deskew import Sweep, body_velocity
 from mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
 from mapping.prediction import MotionState, Prediction
@@ -29,8 +29,6 @@ _RANGE_NOISE_M = 0.02
 _SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
 # Residuals beyond this, in cells, are outliers.
 _GATE = 6.0
-# Information of the prediction along degenerate directions: that of a tenth of a millimetre.
-_DEGENERATE_INFORMATION = 1e8
 # Errors of neighbouring points are correlated: so many count as one. From true errors on simulated recordings.
 _CORRELATION = 25.0
 # A velocity that differs by less than this over the interval needs no second compensation.
@@ -174,7 +172,7 @@ def _solve(
     """
     J, r = system.jacobian, system.residuals
     degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
-    held = _DEGENERATE_INFORMATION * degeneracy.projector()
+    held = DEGENERATE_INFORMATION * degeneracy.projector()
     prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
     error = np.concatenate([log(inverse(prediction.T_world_lidar) @ T_world_lidar), velocity - prediction.velocity])
     JW = J * (system.weights / _CORRELATION)[:, None]

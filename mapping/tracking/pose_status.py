@@ -36,8 +36,18 @@ def judge(
         message = "the scene is repetitive: another motion since the last scan fits nearly as well"
     elif unexpected:
         message = "registered, but neither odometry nor last motion predicted this pose"
-    elif adrift:
-        message = "in a new map; its pose in the map before is unknown"
-    elif names := attempt.registration.degeneracy.names:
-        message = f"degenerate along {', '.join(names)}: the prediction was kept"
+    else:
+        message = reservation(attempt.registration.degeneracy.names, adrift)
     return (Status.DEGRADED if message else Status.OK), message
+
+
+def reservation(degenerate: tuple[str, ...], adrift: bool) -> str:
+    """Why a scan that fits the map near its prediction is degraded nevertheless; empty where it is not.
+
+    Args:
+        degenerate: names of the directions along which the prediction was kept.
+        adrift: whether the map is a new one, at an unknown pose in the one before.
+    """
+    if adrift:
+        return "in a new map; its pose in the map before is unknown"
+    return f"degenerate along {', '.join(degenerate)}: the prediction was kept" if degenerate else ""

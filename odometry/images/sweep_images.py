@@ -111,7 +111,7 @@ def _images(projection: Projection, grid: ImageGrid, scan: Scan, is_fine: bool =
     offsets = np.zeros(projection.index.shape, dtype=np.float32)
     if scan.time_offsets is not None:
         seen = projection.index >= 0
-        offsets[seen] = scan.time_offsets[projection.index[seen]] - middle_offset_s(scan)
+        offsets[seen] = scan.time_offsets[projection.index[seen]] - scan.middle_offset_s
     normals = surface_normals(projection.image, FINE_PATCHES if is_fine else PATCHES)
     return SweepImages(projection.image[:3], normals, offsets, grid.elevation_low, grid.elevation_high)
 
@@ -134,10 +134,3 @@ def _shown(points: Points, grid: ImageGrid, rows: int) -> NDArray[np.bool_]:
     """(rows, W) which pixels have a point, in an image of so many rows."""
     fine = ImageGrid(rows, grid.columns, grid.elevation_low, grid.elevation_high)
     return project(points, [fine])[0].index >= 0
-
-
-def middle_offset_s(scan: Scan) -> float:
-    """Seconds from a scan's stamp to the middle of its sweep; 0 where points have no times."""
-    if scan.time_offsets is None or not len(scan):
-        return 0.0
-    return float(0.5 * (scan.time_offsets.min() + scan.time_offsets.max()))

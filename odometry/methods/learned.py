@@ -19,7 +19,7 @@ from odometry.alignment.degeneracy import find_degeneracy, joined_information, r
 from odometry.alignment.search import align_best
 from odometry.alignment.sweep_motion import StampInterpolator, SweepPair
 from odometry.config import ImageConfig
-from odometry.images.sweep_images import Imager, ScanImages, middle_offset_s
+from odometry.images.sweep_images import Imager, ScanImages
 from odometry.interface import Motion
 from odometry.network.candidates import Candidate, Described, Search
 
@@ -84,7 +84,7 @@ class LearnedOdometry(Stateful):
         """The motion since the last scan that had points."""
         if not len(scan):
             return Motion(np.eye(4), 0, "the scan is empty")
-        images, middle, last = self._imager.images(scan), scan.stamp + middle_offset_s(scan), self._last
+        images, middle, last = self._imager.images(scan), scan.stamp + scan.middle_offset_s, self._last
         shown = images.network
         if last is None or self._described is None or middle <= last.middle:
             self._described = self._search.describe(shown.points, shown.normals)

@@ -18,7 +18,7 @@ from odometry.alignment.alignment import Alignment, Effort, InitialEstimate
 from odometry.alignment.search import DOUBTFUL, align_best, try_instead
 from odometry.alignment.sweep_motion import SweepMotion, SweepPair
 from odometry.config import ImageConfig
-from odometry.images.sweep_images import Imager, SweepImages, middle_offset_s
+from odometry.images.sweep_images import Imager, SweepImages
 
 # Initial estimates of the turn from one scan to the next, degrees. Alignment converges over half a step.
 _TURNS_DEG = (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0)
@@ -57,7 +57,7 @@ def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:
     for scan in scans:
         made = imager.images(scan)
         images.append(made.network)
-        middles.append(scan.stamp + middle_offset_s(scan))
+        middles.append(scan.stamp + scan.middle_offset_s)
         if previous is not None:
             interval_s = max(middles[-1] - middles[-2], _SHORTEST_S)
             best = _aligned(T_last, SweepPair(made.alignment, previous, interval_s, last))

@@ -15,7 +15,6 @@ from lidarslam.simulation.worlds.registry import build_world
 from lidarslam.train.data import Stretch, draw_weights
 from lidarslam.train.teacher import MapTeacher
 from odometry.config import ImageConfig
-from odometry.images.sweep_images import middle_offset_s
 from odometry.training.preparation import prepare
 
 SCANS = 14
@@ -37,7 +36,7 @@ def test_the_map_teaches_the_true_motions_between_the_middles_of_sweeps(drive):
     for scan in scans:
         teacher.follow(scan)
     taught = teacher.relabelled(prepare(iter(scans), ImageConfig()))
-    middles = np.array([scan.stamp + middle_offset_s(scan) for scan in scans[:-1]])
+    middles = np.array([scan.stamp + scan.middle_offset_s for scan in scans[:-1]])
     poses = truth.at(middles, 0.1)
     expected = inverse(poses[:-1]) @ poses[1:]
     sure = taught.valid.numpy()[: SCANS - 2]

@@ -255,7 +255,7 @@ def test_a_covered_sensor_begins_no_new_map(
 def test_a_scan_in_between_counts_the_lost_ones_anew(
     settled: LoamMapper, ring_scans: list[Scan], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mapping.loam.mapper._GIVE_UP_AFTER", 3)
+    monkeypatch.setattr("mapping.loam.mapper.GIVE_UP_AFTER", 3)
     for _ in range(2):
         for _ in range(2):
             assert "new map" not in settled.process(elsewhere(ring_scans[4]), Prior(np.eye(4), VELOCITY)).message
@@ -320,7 +320,7 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
 
 def test_a_mapper_goes_on(ring_scans: list[Scan], through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch) -> None:
     """Among the scans are two of another place, so that the map is begun anew, and an empty one."""
-    monkeypatch.setattr("mapping.loam.mapper._GIVE_UP_AFTER", 2)
+    monkeypatch.setattr("mapping.loam.mapper.GIVE_UP_AFTER", 2)
     scans = [scan.select(np.flatnonzero(scan.rings % 2)) for scan in ring_scans[:10] if scan.rings is not None]
     scans[4:6] = [elsewhere(scan) for scan in scans[4:6]]
     scans[7] = empty(scans[7].stamp)

@@ -8,7 +8,7 @@ import pytest
 
 from lidarslam.core.scan import Scan
 from odometry.config import ImageConfig
-from odometry.images.sweep_images import Imager, SweepImages, middle_offset_s
+from odometry.images.sweep_images import Imager, SweepImages
 
 CONFIG = ImageConfig(rows=16, columns=360)
 TWIST = (0.0, 0.0, 0.5, 1.0, 0.0, 0.0)
@@ -43,26 +43,26 @@ def test_offsets_are_from_the_middle_of_the_sweep_wherever_the_stamp_is(box_room
     scan = box_room.scans(1, TWIST)[0]
     assert scan.time_offsets is not None
     stamped = Scan(scan.points, scan.stamp, scan.time_offsets - stamp_at * 0.1)
-    assert middle_offset_s(stamped) == pytest.approx(0.05 - stamp_at * 0.1, abs=1e-8)
+    assert stamped.middle_offset_s == pytest.approx(0.05 - stamp_at * 0.1, abs=1e-8)
     np.testing.assert_allclose(images_of(stamped).offsets, box_room.sweeps(1, TWIST)[0].offsets, atol=1e-7)
 
 
 def test_the_middle_of_a_sweep_is_between_its_ends_however_its_points_are_spread():
     scan = Scan(np.ones((4, 3)), 5.0, np.array([0.02, 0.09, 0.0, 0.01]))
-    assert middle_offset_s(scan) == pytest.approx(0.045)
+    assert scan.middle_offset_s == pytest.approx(0.045)
 
 
 def test_scans_without_times_have_no_offsets(box_room):
     scan = box_room.scans(1, TWIST)[0]
     untimed = Scan(scan.points, scan.stamp)
-    assert middle_offset_s(untimed) == 0.0
+    assert untimed.middle_offset_s == 0.0
     images = images_of(untimed)
     assert not images.offsets.any()
     assert np.array_equal(images.points, box_room.sweeps(1, TWIST)[0].points)
 
 
 def test_an_empty_scan_is_an_empty_image():
-    assert middle_offset_s(EMPTY) == 0.0
+    assert EMPTY.middle_offset_s == 0.0
     images = images_of(EMPTY)
     assert images.points.shape == (3, 16, 360)
     assert images.offsets.shape == (16, 360)
