@@ -38,9 +38,9 @@ from odometry_accuracy import SIGMAS, estimated_motions, shares_within_sigmas, s
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.tracking import Status
+from lidarslam.odometry.config import OdometryConfig
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.simulation.worlds.registry import WORLDS
-from odometry.config import OdometryConfig
 
 _MAPPED = [name for name, config in METHODS.items() if config.mapping.enabled]
 _DEFAULT = [name for name in DEFAULT_METHODS if name in _MAPPED]

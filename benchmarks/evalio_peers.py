@@ -254,8 +254,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _print(source: Path, peer: str, count: int | None, step: int) -> None:
     """One row of the table."""
-    from evaluation.trajectory.metrics import evaluate_trajectory
     from lidarslam.datasets.registry import open_recording
+    from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
     from lidarslam.pipeline.scan_stream import in_order
 
     recording = open_recording(source)

@@ -20,14 +20,14 @@ import numpy as np
 from mapping_accuracy import METHODS, Recorded, pipeline_results, print_row, read, true_trajectory
 from odometry_accuracy import estimated_motions, rms, shares_within_sigmas, squared_errors
 
-from evaluation.trajectory.association import Association
-from evaluation.trajectory.drift import segment_errors
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.association import Association
+from lidarslam.evaluation.trajectory.drift import segment_errors
+from lidarslam.odometry.config import LearnedConfig, OdometryConfig
+from lidarslam.odometry.interface import Motion
 from lidarslam.pipeline.scan_stream import in_order
-from odometry.config import LearnedConfig, OdometryConfig
-from odometry.interface import Motion
 
 LENGTHS_M = (20.0, 30.0, 40.0, 50.0, 60.0)
 _SCANS_OF_A_START = 50

@@ -12,14 +12,14 @@ from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.config import KeyframeConfig, LoopConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap, means_points, voxel_size_for
+from lidarslam.mapping.loops.candidates import KeyframeDatabase
+from lidarslam.mapping.loops.refinement import DenseSubmap
+from lidarslam.mapping.pose_graph.edges import drift_covariance
+from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.simulation.recorder import Simulation
-from mapping.config import KeyframeConfig, LoopConfig
-from mapping.global_map.global_map import GlobalMap, means_points, voxel_size_for
-from mapping.loops.candidates import KeyframeDatabase
-from mapping.loops.refinement import DenseSubmap
-from mapping.pose_graph.edges import drift_covariance
-from mapping.pose_graph.keyframes import KeyframeSelector
 
 _LAPS, _EVERY = 1.34, 3
 

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 
 class _KittiFiles:

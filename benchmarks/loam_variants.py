@@ -23,10 +23,10 @@ from mapping_accuracy import add_simulation_arguments, localise, print_row, reco
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray
-from mapping.config import MappingConfig
-from mapping.loam import features
-from mapping.loam.feature_map import FeatureMap
-from odometry.config import OdometryConfig
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.loam import features
+from lidarslam.mapping.loam.feature_map import FeatureMap
+from lidarslam.odometry.config import OdometryConfig
 
 _VARIANTS = {
     "ours": (False, False),

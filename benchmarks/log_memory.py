@@ -24,6 +24,8 @@ from mapping_memory import resident_mb
 from lidarslam.config.settings import CheckpointConfig, Config, load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map import global_map
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
@@ -32,8 +34,6 @@ from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
-from mapping.global_map import global_map
-from odometry.methods.external import ExternalOdometry
 
 _POINTS = 300
 

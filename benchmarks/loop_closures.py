@@ -25,10 +25,17 @@ import numpy as np
 from mapping_accuracy import print_row
 from numpy.typing import NDArray
 
-from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.mapping.config import LoopConfig, PoseGraphConfig
+from lidarslam.mapping.deskew import body_velocity
+from lidarslam.mapping.global_map.global_map import voxel_size_for
+from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.mapping.pose_graph.correction import Corrected
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.simulation.motion.carriers import CARRIERS, MOUNTS, mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
@@ -36,13 +43,6 @@ from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.world import Boxes, Route, World
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
-from mapping.config import LoopConfig, PoseGraphConfig
-from mapping.deskew import body_velocity
-from mapping.global_map.global_map import voxel_size_for
-from mapping.loops.closure import LoopClosure
-from mapping.pose_graph.correction import Corrected
-from mapping.pose_graph.graph_scan import GraphScan
-from mapping.pose_graph.slam_graph import SlamGraph
 
 ROOMS = "rooms"
 FALSE_M, FALSE_DEG = 0.5, 3.0

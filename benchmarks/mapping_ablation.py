@@ -28,7 +28,7 @@ from mapping_accuracy import (
 )
 
 from lidarslam.config.settings import Config
-from mapping.config import MappingConfig
+from lidarslam.mapping.config import MappingConfig
 
 _PARTS: dict[str, MappingConfig] = {
     "surfels, continuous time (default)": MappingConfig(),

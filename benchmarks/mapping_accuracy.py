@@ -23,7 +23,6 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.trajectory.metrics import TrajectoryErrors, evaluate_trajectory
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
@@ -31,6 +30,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.metrics import TrajectoryErrors, evaluate_trajectory
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.odometry.config import KissConfig, OdometryConfig
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
@@ -40,9 +43,6 @@ from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import SENSORS, find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
-from mapping.config import MappingConfig
-from odometry.config import KissConfig, OdometryConfig
-from odometry.registry import make_odometry
 
 # How far outside the truth's own stamps a scan may lie for the truth to be extrapolated to it.
 BEYOND_TRUTH_S = 0.2

@@ -25,6 +25,9 @@ from mapping_accuracy import make_simulation, print_row, without_odometry
 
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
@@ -38,9 +41,6 @@ from lidarslam.simulation.sensors.table import SENSORS
 from lidarslam.simulation.worlds.registry import WORLDS
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
-from mapping.config import MappingConfig
-from mapping.surfel_mapper import SurfelMapper
-from odometry.registry import make_odometry
 
 
 @dataclass(frozen=True)

@@ -42,16 +42,16 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping import surfel_mapper
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.loam import mapper as loam_mapper
+from lidarslam.mapping.loam.feature_map import FeatureMap
+from lidarslam.mapping.loam.mapper import LoamMapper
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.surfels import sampling
+from lidarslam.mapping.tracking import attempts
 from lidarslam.pipeline.scan_stream import in_order
-from mapping import surfel_mapper
-from mapping.config import MappingConfig
-from mapping.loam import mapper as loam_mapper
-from mapping.loam.feature_map import FeatureMap
-from mapping.loam.mapper import LoamMapper
-from mapping.prediction import Prior
-from mapping.surfel_mapper import SurfelMapper
-from mapping.surfels import sampling
-from mapping.tracking import attempts
 
 # Method -> its mapper, and stage -> what is timed for it: the object that holds the function, and its name there.
 _MAPPERS: dict[str, type[SurfelMapper | LoamMapper]] = {"surfels": SurfelMapper, "loam": LoamMapper}

@@ -17,17 +17,17 @@ import torch
 from mapping_accuracy import simulate
 
 from lidarslam.core.scan import Scan
-from odometry.alignment.alignment import InitialEstimate, align
-from odometry.alignment.sweep_motion import SweepPair
-from odometry.config import ImageConfig, LearnedConfig, NetworkConfig, OdometryConfig
-from odometry.images.sweep_images import Imager, SweepImages
-from odometry.network.candidates import Described, Search
-from odometry.network.checkpoint import load_checkpoint, network_of
-from odometry.network.exported import onnx_search, read_exported
-from odometry.network.networks import make_network
-from odometry.network.shipped import default_weights, shipped_folder
-from odometry.network.torch_graphs import torch_search
-from odometry.registry import make_odometry
+from lidarslam.odometry.alignment.alignment import InitialEstimate, align
+from lidarslam.odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.config import ImageConfig, LearnedConfig, NetworkConfig, OdometryConfig
+from lidarslam.odometry.images.sweep_images import Imager, SweepImages
+from lidarslam.odometry.network.candidates import Described, Search
+from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
+from lidarslam.odometry.network.exported import onnx_search, read_exported
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.shipped import default_weights, shipped_folder
+from lidarslam.odometry.network.torch_graphs import torch_search
+from lidarslam.odometry.registry import make_odometry
 
 SCANS = 12
 

@@ -31,9 +31,9 @@ from scipy.stats import chi2
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
-from odometry.config import LearnedConfig, OdometryConfig
-from odometry.interface import Motion
-from odometry.registry import make_odometry
+from lidarslam.odometry.config import LearnedConfig, OdometryConfig
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.registry import make_odometry
 
 # Numbers of standard deviations, and the share of errors that should lie within each.
 SIGMAS = (1, 2, 3)

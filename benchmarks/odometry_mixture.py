@@ -22,10 +22,10 @@ from odometry_accuracy import EXPECTED_SHARES, SIGMAS, network_alone, rms, share
 
 from lidarslam.core.geometry import FloatArray, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
+from lidarslam.odometry.config import LearnedConfig, OdometryConfig
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.mixture import Excerpt, mixture
-from odometry.config import LearnedConfig, OdometryConfig
-from odometry.registry import make_odometry
 
 # What a motion should be better than: degrees, metres, and part of the step.
 _GOOD_DEG, _GOOD_M, _GOOD_SHARE = 0.3, 0.02, 0.03

@@ -11,13 +11,13 @@ from keyframe_pairs import Keyframes
 from loop_closures import is_false
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
-from mapping.config import LoopConfig
-from mapping.loops.bird_eye_view import BirdEyeView, align, compare
-from mapping.loops.closure import LoopClosure
-from mapping.loops.refinement import DenseSubmap, refine
-from mapping.loops.registration import register
-from mapping.loops.verification import verify
-from mapping.tracking.birds_eye_map import BirdsEyeMap
+from lidarslam.mapping.config import LoopConfig
+from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.mapping.loops.refinement import DenseSubmap, refine
+from lidarslam.mapping.loops.registration import register
+from lidarslam.mapping.loops.verification import verify
+from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 
 Calls = dict[str, Callable[[], Any]]
 Rows = Iterator[list[str]]

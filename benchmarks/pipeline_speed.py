@@ -26,11 +26,11 @@ from lidarslam.compare.methods import parse_method
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
-from odometry.registry import make_odometry
 
 _KISS = "KISS-ICP's own loop"
 _FEW = 8

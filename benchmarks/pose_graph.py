@@ -23,13 +23,13 @@ from mapping_accuracy import print_row
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.core.trajectory_io import read_kitti_poses
-from mapping.loops.closure import RelativePose
-from mapping.pose_graph.correction import corrected
-from mapping.pose_graph.optimizer import Optimised, optimise, relax
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.correction import corrected
+from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise, relax
 
 SCAN_S = 0.1
 # KISS-ICP's drift on KITTI 00, 0.53 % and 0.0019 degrees a metre, mostly over some 300 m, as a random walk.

@@ -33,13 +33,13 @@ from click.testing import CliRunner
 from evalio_peers import PEERS, PeerError, run_peer
 from mapping_accuracy import print_row
 
-from evaluation.trajectory.association import associate
-from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.cli import main as lidarslam
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.pipeline.scan_stream import in_order
 
 # Methods that `lidarslam run` has, and the options that choose them.

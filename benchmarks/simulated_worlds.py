@@ -10,8 +10,8 @@ import argparse
 
 from mapping_accuracy import add_simulation_arguments, print_row, run_kiss, simulate
 
+from lidarslam.odometry.config import KissConfig
 from lidarslam.simulation.worlds.registry import WORLDS
-from odometry.config import KissConfig
 
 
 def run_one(world: str, motion: str, sensor: str, scans: int, seed: int, speed_mps: float | None) -> str:

@@ -37,11 +37,14 @@ from simulated_faults import (
     straight_drive,
 )
 
-from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.moved_points import seen_through
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
@@ -50,9 +53,6 @@ from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
-from mapping.config import GlobalMapConfig
-from mapping.global_map.moved_points import seen_through
-from odometry.registry import make_odometry
 
 _POLLUTED_M = 0.2
 # The first scans after a fault may still be on their way back.

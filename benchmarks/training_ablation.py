@@ -15,14 +15,14 @@ from pathlib import Path
 import torch
 from mapping_accuracy import print_row
 
+from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
+from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
+from lidarslam.odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.training.training import validate
 from lidarslam.simulation.recording.mixture import Ingredients, ingredients_of
 from lidarslam.train.data import prepared, simulated
 from lidarslam.train.settings import TrainConfig
 from lidarslam.train.train import TrainRequest, execute
-from odometry.network.checkpoint import load_checkpoint, network_of
-from odometry.training.config import SimulatedConfig, TrainingConfig
-from odometry.training.preparation import PreparedRecording
-from odometry.training.training import validate
 
 _WORLDS = ("street", "office", "tunnel", "park")
 _SENSORS = ("vlp-16", "hdl-64e", "os1-128", "os1-64", "hdl-32e")

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.core.state import Shape
-from mapping.config import MappingConfig
+from lidarslam.mapping.config import MappingConfig
 
 # Least standard deviations of any pose, rotation first.
 LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)

@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Stateful
-from mapping.config import MappingConfig
+from lidarslam.mapping.config import MappingConfig
 
 # Fewer points make no pose, and no scale.
 MIN_POINTS = 60

@@ -12,14 +12,14 @@ from lidarslam.core.geometry import displacement_m, inverse, log, transform_poin
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig
-from mapping.deskew import body_velocity
-from mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
-from mapping.surfels.sampling import SampledScan, Sampler
-from mapping.surfels.surfel_map import SurfelMap
-from mapping.tracking.fit import Fit
-from mapping.tracking.mapped_scan import MappedScan
-from mapping.tracking.tracker import Tracker
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import body_velocity
+from lidarslam.mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
+from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.tracker import Tracker
 
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2

@@ -2,8 +2,8 @@
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
-from odometry.config import LearnedConfig, OdometryConfig
-from odometry.interface import Odometry
+from lidarslam.odometry.config import LearnedConfig, OdometryConfig
+from lidarslam.odometry.interface import Odometry
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
@@ -21,33 +21,33 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
     if (config.method == "external") != (prior is not None):
         raise ConfigError("a prior trajectory and odometry.method=external go together; give both or neither")
     if prior is not None:
-        from odometry.methods.external import ExternalOdometry
+        from lidarslam.odometry.methods.external import ExternalOdometry
 
         return ExternalOdometry(prior)
     if config.method == "learned":
         return _make_learned(config.learned)
     if config.method == "kiss-icp":
-        from odometry.methods.kiss import KissOdometry
+        from lidarslam.odometry.methods.kiss import KissOdometry
 
         return KissOdometry(config.kiss_icp)
-    from odometry.methods.constant_velocity import ConstantVelocity
+    from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
 
     return ConstantVelocity()
 
 
 def _make_learned(config: LearnedConfig) -> Odometry:
     """With ONNX Runtime, which starts at once; with torch for a file of weights, or on an accelerator."""
-    from odometry.methods.learned import LearnedOdometry
+    from lidarslam.odometry.methods.learned import LearnedOdometry
 
     if config.device == "cpu" and (config.weights is None or config.weights.is_dir()):
-        from odometry.network.exported import onnx_search, read_exported
-        from odometry.network.shipped import shipped_folder
+        from lidarslam.odometry.network.exported import onnx_search, read_exported
+        from lidarslam.odometry.network.shipped import shipped_folder
 
         exported = read_exported(config.weights or shipped_folder())
         return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config.alignment)
-    from odometry.network.checkpoint import load_checkpoint, network_of
-    from odometry.network.shipped import default_weights
-    from odometry.network.torch_graphs import torch_search
+    from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
+    from lidarslam.odometry.network.shipped import default_weights
+    from lidarslam.odometry.network.torch_graphs import torch_search
 
     checkpoint = load_checkpoint(config.weights or default_weights())
     try:

@@ -13,17 +13,18 @@ from typing import NamedTuple
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
-PACKAGES = ("lidarslam", "odometry", "mapping", "evaluation")
+# Folders of the top level that are subpackages of lidarslam by a link beside its other folders.
+LINKED = ("odometry", "mapping", "evaluation")
 
 # The longest matching prefix holds: what the modules below it may import of our own.
 MAY_IMPORT = {
     "lidarslam.core": ("lidarslam.core",),
     "lidarslam.datasets": ("lidarslam.core", "lidarslam.datasets"),
     "lidarslam.simulation": ("lidarslam.core", "lidarslam.datasets", "lidarslam.simulation"),
-    "odometry": ("lidarslam.core", "odometry"),
-    "mapping": ("lidarslam.core", "mapping"),
-    "evaluation": ("lidarslam.core", "evaluation"),
-    "lidarslam": PACKAGES,
+    "lidarslam.odometry": ("lidarslam.core", "lidarslam.odometry"),
+    "lidarslam.mapping": ("lidarslam.core", "lidarslam.mapping"),
+    "lidarslam.evaluation": ("lidarslam.core", "lidarslam.evaluation"),
+    "lidarslam": ("lidarslam",),
 }
 # The way down is cli -> commands -> run -> pipeline -> libraries: nobody looks up it.
 RUN = (
@@ -42,18 +43,18 @@ CORE_MAY_IMPORT = {"numpy", "scipy", "typing_extensions", *sys.stdlib_module_nam
 CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}}
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
-    "kiss_icp": ("odometry.methods.kiss*",),
-    "gtsam": ("mapping.pose_graph.optimizer",),
+    "kiss_icp": ("lidarslam.odometry.methods.kiss*",),
+    "gtsam": ("lidarslam.mapping.pose_graph.optimizer",),
     "rerun": ("lidarslam.viewer.rerun_*",),
     "click": ("lidarslam.cli", "lidarslam.commands.*"),
     "laspy": ("lidarslam.evaluate.reference_cloud",),
     "pye57": ("lidarslam.evaluate.reference_cloud",),
-    "jinja2": ("evaluation.report.report",),
-    "plotly": ("evaluation.report.*",),
-    "safetensors": ("odometry.network.tensor_file",),
+    "jinja2": ("lidarslam.evaluation.report.report",),
+    "plotly": ("lidarslam.evaluation.report.*",),
+    "safetensors": ("lidarslam.odometry.network.tensor_file",),
     "numba": ("lidarslam.core.compiled",),
-    "onnx": ("odometry.network.export",),
-    "onnxscript": ("odometry.network.export",),
+    "onnx": ("lidarslam.odometry.network.export",),
+    "onnxscript": ("lidarslam.odometry.network.export",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
@@ -84,8 +85,9 @@ Modules = Mapping[str, Module]
 def parse_sources(root: Path) -> dict[str, Module]:
     """Every module of the packages, by its dotted name."""
     modules = {}
-    for path in sorted(path for package in PACKAGES for path in (root / package).rglob("*.py")):
+    for path in sorted(path for package in ("lidarslam", *LINKED) for path in (root / package).rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
+        parts = ("lidarslam", *parts) if parts[0] in LINKED else parts
         is_package = parts[-1] == "__init__"
         name = ".".join(parts[:-1] if is_package else parts)
         text = path.read_text(encoding="utf-8")
@@ -142,7 +144,7 @@ def _is_import_call(call: ast.Call) -> bool:
 
 
 def is_ours(target: str) -> bool:
-    return target.partition(".")[0] in PACKAGES
+    return target.partition(".")[0] == "lidarslam"
 
 
 def layer_breaches(modules: Modules) -> list[str]:
@@ -229,7 +231,8 @@ def name_breaches(modules: Modules) -> list[str]:
 def size_breaches(modules: Modules) -> list[str]:
     """Files too long to be read at once, and folders with too many entries to be overlooked."""
     long = [f"{module.name} has {module.lines} lines" for module in modules.values() if module.lines > MOST_LINES]
-    entries = Counter(name.rpartition(".")[0] for name in modules if "." in name)
+    linked = {f"lidarslam.{package}" for package in LINKED}
+    entries = Counter(name.rpartition(".")[0] for name in modules if "." in name and name not in linked)
     packages = [module.name for module in modules.values() if module.is_package]
     counts = {name: entries[name] + 1 for name in packages}  # with its __init__
     return long + [f"{name} has {count} entries" for name, count in counts.items() if count > MOST_ENTRIES]
@@ -279,7 +282,7 @@ def test_the_sources_keep_the_rule(rule, sources):
 
 
 def test_all_sources_are_looked_at(sources):
-    assert set(PACKAGES) | {"lidarslam.core", "lidarslam.datasets"} <= set(sources)
+    assert {"lidarslam", "lidarslam.core", *(f"lidarslam.{package}" for package in LINKED)} <= set(sources)
     assert sources["lidarslam.core"].is_package
     found = set(imports_of(sources["lidarslam.core.trajectory"], sources))
     assert Import("lidarslam.core.geometry", True) in found
@@ -300,18 +303,18 @@ def test_light_modules_load_nothing_heavy(sources):
     [
         (
             layer_breaches,
-            {"odometry__learned": "import mapping.mapper"},
-            "odometry.learned imports mapping.mapper",
+            {"lidarslam__odometry__learned": "import lidarslam.mapping.mapper"},
+            "lidarslam.odometry.learned imports lidarslam.mapping.mapper",
         ),
         (
             layer_breaches,
-            {"mapping__mapper": "from lidarslam import run"},
-            "mapping.mapper imports lidarslam",
+            {"lidarslam__mapping__mapper": "from lidarslam import run"},
+            "lidarslam.mapping.mapper imports lidarslam",
         ),
         (
             layer_breaches,
-            {"lidarslam__core__scan": "import evaluation.drift"},
-            "lidarslam.core.scan imports evaluation.drift",
+            {"lidarslam__core__scan": "import lidarslam.evaluation.drift"},
+            "lidarslam.core.scan imports lidarslam.evaluation.drift",
         ),
         (
             layer_breaches,
@@ -331,8 +334,8 @@ def test_light_modules_load_nothing_heavy(sources):
         ),
         (
             layer_breaches,
-            {"evaluation__report": "def f():\n  from lidarslam.datasets.registry import open_recording"},
-            "evaluation.report imports lidarslam.datasets.registry",
+            {"lidarslam__evaluation__report": "def f():\n  from lidarslam.datasets.registry import open_recording"},
+            "lidarslam.evaluation.report imports lidarslam.datasets.registry",
         ),
         (
             layer_breaches,
@@ -345,15 +348,23 @@ def test_light_modules_load_nothing_heavy(sources):
             "lidarslam.core.scan imports torch",
         ),
         (foreign_breaches, {"lidarslam__core__scan": "import numba"}, "lidarslam.core.scan imports numba"),
-        (foreign_breaches, {"mapping__mapper": "import numba"}, "mapping.mapper imports numba"),
+        (foreign_breaches, {"lidarslam__mapping__mapper": "import numba"}, "lidarslam.mapping.mapper imports numba"),
         (
             foreign_breaches,
-            {"mapping__mapper": "from gtsam import Pose3"},
-            "mapping.mapper imports gtsam",
+            {"lidarslam__mapping__mapper": "from gtsam import Pose3"},
+            "lidarslam.mapping.mapper imports gtsam",
         ),
-        (foreign_breaches, {"odometry__learned": "import kiss_icp.metrics"}, "odometry.learned imports kiss_icp"),
+        (
+            foreign_breaches,
+            {"lidarslam__odometry__learned": "import kiss_icp.metrics"},
+            "lidarslam.odometry.learned imports kiss_icp",
+        ),
         (foreign_breaches, {"lidarslam__run": "class A:\n  import click"}, "lidarslam.run imports click"),
-        (foreign_breaches, {"evaluation__map_metrics": "import laspy"}, "evaluation.map_metrics imports laspy"),
+        (
+            foreign_breaches,
+            {"lidarslam__evaluation__map_metrics": "import laspy"},
+            "lidarslam.evaluation.map_metrics imports laspy",
+        ),
         (
             foreign_breaches,
             {"lidarslam__simulation__record": "from rosbags import rosbag1"},
@@ -367,50 +378,54 @@ def test_light_modules_load_nothing_heavy(sources):
         (
             cycle_breaches,
             {
-                "mapping__a": "import mapping.b",
-                "mapping__b": "from mapping import c",
-                "mapping__c": "def f():\n  import mapping.a",
+                "lidarslam__mapping__a": "import lidarslam.mapping.b",
+                "lidarslam__mapping__b": "from lidarslam.mapping import c",
+                "lidarslam__mapping__c": "def f():\n  import lidarslam.mapping.a",
             },
-            "mapping.a -> mapping.b -> mapping.c -> mapping.a",
+            "lidarslam.mapping.a -> lidarslam.mapping.b -> lidarslam.mapping.c -> lidarslam.mapping.a",
         ),
         (
             weight_breaches,
-            {"mapping__config": "import open3d as o3d"},
-            "mapping.config loads open3d through mapping.config",
+            {"lidarslam__mapping__config": "import open3d as o3d"},
+            "lidarslam.mapping.config loads open3d through lidarslam.mapping.config",
         ),
         (
             weight_breaches,
             {
-                "odometry__config": "from odometry import network",
-                "odometry__network": "try:\n  import torch\nfinally: ...",
+                "lidarslam__odometry__config": "from lidarslam.odometry import network",
+                "lidarslam__odometry__network": "try:\n  import torch\nfinally: ...",
             },
-            "odometry.config loads torch through odometry.network",
+            "lidarslam.odometry.config loads torch through lidarslam.odometry.network",
         ),
         (
             weight_breaches,
             {"lidarslam__cli": "import lidarslam.commands.run", "lidarslam__commands__run": "import torch"},
             "lidarslam.cli loads torch through lidarslam.commands.run",
         ),
-        (root_breaches, {"mapping": '"""Maps."""\nfrom mapping import a', "mapping__a": ""}, "mapping"),
-        (root_breaches, {"mapping": "", "mapping__a": ""}, "mapping"),
-        (name_breaches, {"odometry__utils": ""}, "odometry.utils"),
+        (
+            root_breaches,
+            {"lidarslam__mapping": '"""Maps."""\nfrom lidarslam.mapping import a', "lidarslam__mapping__a": ""},
+            "lidarslam.mapping",
+        ),
+        (root_breaches, {"lidarslam__mapping": "", "lidarslam__mapping__a": ""}, "lidarslam.mapping"),
+        (name_breaches, {"lidarslam__odometry__utils": ""}, "lidarslam.odometry.utils"),
         (
             folder_breaches,
             {
-                "mapping": "",
-                "mapping__loops": "",
-                "mapping__loops__a": "import mapping.graph.a",
-                "mapping__loops__b": "",
-                "mapping__graph__a": "",
-                "mapping__graph__b": "import mapping.loops.b",
+                "lidarslam__mapping": "",
+                "lidarslam__mapping__loops": "",
+                "lidarslam__mapping__loops__a": "import lidarslam.mapping.graph.a",
+                "lidarslam__mapping__loops__b": "",
+                "lidarslam__mapping__graph__a": "",
+                "lidarslam__mapping__graph__b": "import lidarslam.mapping.loops.b",
             },
-            "mapping.graph -> mapping.loops -> mapping.graph",
+            "lidarslam.mapping.graph -> lidarslam.mapping.loops -> lidarslam.mapping.graph",
         ),
-        (size_breaches, {"mapping__a": "\n" * 251}, "mapping.a has 251 lines"),
+        (size_breaches, {"lidarslam__mapping__a": "\n" * 251}, "lidarslam.mapping.a has 251 lines"),
         (
             size_breaches,
-            {"mapping": "", **{f"mapping__{letter}": "" for letter in "abcdefghijklmno"}},
-            "mapping has 16 entries",
+            {"lidarslam__mapping": "", **{f"lidarslam__mapping__{letter}": "" for letter in "abcdefghijklmno"}},
+            "lidarslam.mapping has 16 entries",
         ),
     ],
 )
@@ -429,12 +444,12 @@ def test_what_is_allowed_is_not_told():
         lidarslam__commands__run="import lidarslam.commands.options\ndef f():\n  import lidarslam.run",
         lidarslam__commands='"""Docstring."""',
         lidarslam__commands__terminal="import click",
-        lidarslam__run="from mapping.pose_graph import optimizer\nimport lidarslam.viewer.rerun_viewer",
+        lidarslam__run="from lidarslam.mapping.pose_graph import optimizer\nimport lidarslam.viewer.rerun_viewer",
         lidarslam__viewer__rerun_viewer="import rerun.blueprint",
-        mapping='"""Docstring."""',
-        mapping__pose_graph__optimizer="import gtsam\nfrom lidarslam.core.geometry import exp",
-        mapping__config="import pydantic\ndef f():\n  import open3d",
-        odometry__methods__kiss_worker="import kiss_icp.kiss_icp",
+        lidarslam__mapping='"""Docstring."""',
+        lidarslam__mapping__pose_graph__optimizer="import gtsam\nfrom lidarslam.core.geometry import exp",
+        lidarslam__mapping__config="import pydantic\ndef f():\n  import open3d",
+        lidarslam__odometry__methods__kiss_worker="import kiss_icp.kiss_icp",
         lidarslam__datasets__bag_file="import rosbags.rosbag1",
         lidarslam__simulation__writers__rosbag="import rosbags.rosbag2",
     )

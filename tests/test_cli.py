@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -21,13 +22,13 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.mapping.config import MappingName
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
+from lidarslam.odometry.network.networks import make_network
 from lidarslam.run.merge.merge import MergeOutcome
 from lidarslam.run.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary import WrittenMap
-from mapping.config import MappingName
-from odometry.config import ImageConfig, NetworkConfig
-from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.networks import make_network
 
 
 def lidarslam(*arguments: object) -> Result:
@@ -316,3 +317,19 @@ def test_view_says_where_the_browser_is_served(
     lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
     assert lines[0] == "http://127.0.0.1:9090/?url=there"
     assert lines[1].startswith("serving this machine until Ctrl-C; ")
+
+
+def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path: Path, recording: Path) -> None:
+    """A ROS overlay, for example, puts its packages in front of ours."""
+    for name in ("odometry", "mapping", "evaluation"):
+        (tmp_path / "overlay" / name).mkdir(parents=True)
+        (tmp_path / "overlay" / name / "__init__.py").write_text("raise ImportError('the wrong package')")
+    done = subprocess.run(
+        [sys.executable, "-m", "lidarslam", "run", str(recording), "--out", str(tmp_path / "run"), "--stop", "2"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path / "overlay")},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -10,8 +10,8 @@ from pydantic.fields import FieldInfo
 
 from lidarslam.config.settings import Config, dump_yaml, load_config, reader_settings
 from lidarslam.core.errors import ConfigError
+from lidarslam.mapping.config import MappingConfig, MappingName
 from lidarslam.train.settings import TrainConfig, load_train_config
-from mapping.config import MappingConfig, MappingName
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

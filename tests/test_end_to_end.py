@@ -334,8 +334,8 @@ def test_kitti_raw_is_deskewed_as_by_kiss_icp(real_data: Path, tmp_path: Path) -
     from kiss_icp.config import load_config as kiss_config
     from kiss_icp.kiss_icp import KissICP
 
-    from evaluation.trajectory.metrics import evaluate_trajectory
     from lidarslam.datasets.registry import open_recording
+    from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
     drive = real_data / "kitti_raw_0005" / "2011_09_26" / "2011_09_26_drive_0005_sync"
     recording = open_recording(drive)

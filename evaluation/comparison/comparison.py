@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.comparison.table import Table
-from evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.comparison.table import Table
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
 
 MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
 """`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with what there was. The last four:

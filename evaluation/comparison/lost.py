@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evaluation.comparison.comparison import MethodResult
+from lidarslam.evaluation.comparison.comparison import MethodResult
 
 # Runs of lost scans with a shorter tracked gap between them are one interval.
 _MERGED_GAP_S = 1.0

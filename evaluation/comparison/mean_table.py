@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison
-from evaluation.comparison.quantities import Quantity
-from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.quantities import Quantity
+from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
 
 
 @dataclass(frozen=True)

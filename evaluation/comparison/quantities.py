@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from evaluation.comparison.comparison import MethodResult
-from evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.core.errors import ConfigError
+from lidarslam.evaluation.comparison.comparison import MethodResult
+from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from evaluation.map.global_registration import candidate_poses
-from evaluation.map.voxel_thinning import thin
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.evaluation.map.global_registration import candidate_poses
+from lidarslam.evaluation.map.voxel_thinning import thin
 
 GLOBAL = "global"
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.map.voxel_thinning import thin
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.map.voxel_thinning import thin
 
 DEFAULT_RADIUS_M = 0.3
 DEFAULT_SPACING_M = 0.05

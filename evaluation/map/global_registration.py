@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from evaluation.map.voxel_thinning import thin
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.map.voxel_thinning import thin
 
 # Cells across the target; features of both sizes propose a pose.
 _CELLS_ACROSS = (80, 160)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from evaluation.map.voxel_thinning import thin
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.map.voxel_thinning import thin
 
 F_SCORE_THRESHOLDS_M = (0.1, 0.2, 0.5)
 SUBT_TOLERANCES_M = (1.0,)

@@ -11,16 +11,16 @@ from itertools import groupby
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 
-from evaluation.comparison.comparison import Comparison, SequenceComparison
-from evaluation.comparison.table import Table, number_text, printable
-from evaluation.report.figures.drift import length_figure, speed_figure
-from evaluation.report.figures.errors import deviation_figure, error_figure
-from evaluation.report.figures.figure import Figure, Styles, method_styles
-from evaluation.report.figures.maps import entropy_figure, map_figure
-from evaluation.report.figures.resources import resources_figure
-from evaluation.report.figures.tracking import tracking_figure
-from evaluation.report.figures.trajectories import trajectory_figure
-from evaluation.report.tables import published_table, sequence_tables
+from lidarslam.evaluation.comparison.comparison import Comparison, SequenceComparison
+from lidarslam.evaluation.comparison.table import Table, number_text, printable
+from lidarslam.evaluation.report.figures.drift import length_figure, speed_figure
+from lidarslam.evaluation.report.figures.errors import deviation_figure, error_figure
+from lidarslam.evaluation.report.figures.figure import Figure, Styles, method_styles
+from lidarslam.evaluation.report.figures.maps import entropy_figure, map_figure
+from lidarslam.evaluation.report.figures.resources import resources_figure
+from lidarslam.evaluation.report.figures.tracking import tracking_figure
+from lidarslam.evaluation.report.figures.trajectories import trajectory_figure
+from lidarslam.evaluation.report.tables import published_table, sequence_tables
 
 _TEMPLATES = "templates"
 _MARKDOWN_SPECIAL = re.compile(r"([\\`*_\[\]|~#$])")
@@ -108,7 +108,7 @@ def _settings(comparison: Comparison) -> list[tuple[str, str]]:
 
 def _environment() -> Environment:
     environment = Environment(
-        loader=PackageLoader("evaluation.report", _TEMPLATES),
+        loader=PackageLoader("lidarslam.evaluation.report", _TEMPLATES),
         autoescape=lambda name: name is not None and name.endswith(".html.j2"),
         finalize=lambda value: printable(value) if type(value) is str else value,
         undefined=StrictUndefined,
@@ -142,4 +142,4 @@ def _fence(text: str) -> str:
 
 
 def _file(name: str) -> str:
-    return (files("evaluation.report") / _TEMPLATES / name).read_text(encoding="utf-8")
+    return (files("lidarslam.evaluation.report") / _TEMPLATES / name).read_text(encoding="utf-8")

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
-from evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
-from evaluation.comparison.lost import lost_intervals
-from evaluation.comparison.quantities import QUANTITIES, Quantity
-from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
-from evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
+from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.lost import lost_intervals
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, Quantity
+from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
+from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
 _SUMMARY = (
     "ate_rmse_m",

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.trajectory.association import Association
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.evaluation.trajectory.association import Association
 
 KITTI_LENGTHS_M = (100, 200, 300, 400, 500, 600, 700, 800)
 SHORT_LENGTHS_M = (5, 10, 25, 40, 60, 100)

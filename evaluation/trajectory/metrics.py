@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from evaluation.trajectory.alignment import AlignmentMethod, align
-from evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
-from evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align
+from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
+from lidarslam.evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
 
 # An estimate that stood still is off by the whole spread of the reference, one of another place by more.
 _UNRELATED_SHARE = 0.5

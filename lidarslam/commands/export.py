@@ -17,9 +17,9 @@ def export(weights: Path | None, out: Path) -> None:
     `lidarslam run --weights DIR` starts faster with the folder than with the weights file, as it does not import torch.
     docs/odometry.md lists inputs and outputs of the graphs.
     """
-    from odometry.network.checkpoint import load_checkpoint
-    from odometry.network.export import export_onnx
-    from odometry.network.shipped import default_weights
+    from lidarslam.odometry.network.checkpoint import load_checkpoint
+    from lidarslam.odometry.network.export import export_onnx
+    from lidarslam.odometry.network.shipped import default_weights
 
     for path in export_onnx(load_checkpoint(weights or default_weights()), out):
         say(f"written to {path}")

@@ -8,14 +8,14 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from evaluation.comparison.mean_table import TablePlan
-from evaluation.comparison.quantities import find_quantity
-from evaluation.comparison.table import TableCell, TableRow
 from lidarslam.compare.methods import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
+from lidarslam.evaluation.comparison.mean_table import TablePlan
+from lidarslam.evaluation.comparison.quantities import find_quantity
+from lidarslam.evaluation.comparison.table import TableCell, TableRow
 from lidarslam.simulation.recording.folder import README, REFERENCE_MAP
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest

@@ -4,8 +4,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-from evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
-from evaluation.comparison.mean_table import mean_table
 from lidarslam.compare.method_run import COMMAND, finished_before, run_method
 from lidarslam.compare.metrics import measure
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
@@ -13,6 +11,8 @@ from lidarslam.compare.request import CompareRequest
 from lidarslam.compare.text import format_result
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
+from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.mean_table import mean_table
 from lidarslam.run.machine import machine, versions
 from lidarslam.run.request import RunRequest
 from lidarslam.storage.directory import RunDirectory
@@ -58,7 +58,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
     Raises:
         LidarSlamError: the sources, the configuration or the output directory are not usable.
     """
-    from evaluation.report.report import render_html, render_markdown
+    from lidarslam.evaluation.report.report import render_html, render_markdown
 
     recordings, missing = make_plan(request)
     try:

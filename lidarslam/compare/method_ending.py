@@ -5,9 +5,9 @@ import signal
 from pathlib import Path
 from typing import Any, cast
 
-from evaluation.comparison.comparison import MethodStatus
 from lidarslam.compare.method_process import LOST
 from lidarslam.compare.supervised import Ending, Limits
+from lidarslam.evaluation.comparison.comparison import MethodStatus
 from lidarslam.storage.directory import SUMMARY
 
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}

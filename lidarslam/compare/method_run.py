@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from evaluation.comparison.comparison import WHOLE, MethodResult
 from lidarslam.compare.method_ending import judge, read_summary
 from lidarslam.compare.method_process import encode
 from lidarslam.compare.supervised import Limits, supervise
@@ -14,6 +13,7 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import remove_partial_files
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory

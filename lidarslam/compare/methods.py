@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import get_args
 
 from lidarslam.core.errors import ConfigError
-from mapping.config import MappingName
-from odometry.config import OdometryName
+from lidarslam.mapping.config import MappingName
+from lidarslam.odometry.config import OdometryName
 
 # Name for the user -> name of the odometry in the configuration.
 _BASES = {"learned": "learned", "kiss-icp": "kiss-icp", "constant-velocity": "constant-velocity", "prior": "external"}

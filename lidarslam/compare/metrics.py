@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from evaluation.comparison.comparison import MethodResult, SequenceComparison
-from evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory
@@ -13,6 +11,8 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.evaluate.inputs import read_estimate
 from lidarslam.evaluate.map_evaluation import evaluate_map
 from lidarslam.evaluate.reference_map import ReferenceMap, find_reference_map, load_reference_map
+from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 GROUND_TRUTH = "ground truth"
 

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from evaluation.comparison.comparison import MissingRecording
 from lidarslam.compare.method_run import PROCESS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.comparison.comparison import MissingRecording
 from lidarslam.run.request import RunRequest
 from lidarslam.storage import directory as files
 

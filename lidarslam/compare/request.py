@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from evaluation.comparison.mean_table import TablePlan
 from lidarslam.compare.methods import Method
 from lidarslam.compare.supervised import Limits
+from lidarslam.evaluation.comparison.mean_table import TablePlan
 
 
 class Simulated(BaseModel):

@@ -4,11 +4,11 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
-from evaluation.comparison.quantities import QUANTITIES
-from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
-from evaluation.trajectory.drift import SHORT_LENGTHS_M
 from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD
+from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.comparison.quantities import QUANTITIES
+from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
+from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
 
 _BEST = "*"
 # Columns without a value are left out.

@@ -16,9 +16,9 @@ from pydantic_core import ErrorDetails
 from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
+from lidarslam.odometry.config import OdometryConfig
 from lidarslam.storage.directory import RUN_SECTION
-from mapping.config import GlobalMapConfig, MappingConfig, PoseGraphConfig
-from odometry.config import OdometryConfig
 
 # The switch of earlier versions that mapping.method replaces.
 _MAPPING_SWITCH = "mapping.enabled"

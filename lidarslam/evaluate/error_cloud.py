@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.map.metrics import MapComparison
-from evaluation.report.error_colours import error_colours
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import replacing
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.map.metrics import MapComparison
+from lidarslam.evaluation.report.error_colours import error_colours
 from lidarslam.simulation.writers.ply import write_ply
 
 _SUFFIXES = (".ply", ".rrd")

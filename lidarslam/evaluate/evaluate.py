@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from evaluation.map.entropy import MapEntropy, map_entropy
-from evaluation.report.error_colours import DEFAULT_CLIP_M
-from evaluation.trajectory.alignment import AlignmentMethod
-from evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S
-from evaluation.trajectory.metrics import TrajectoryMetrics, disagreement, evaluate_trajectory, metrics_json
 from lidarslam.core.errors import InputError
 from lidarslam.evaluate.error_cloud import check_error_files, write_errors
 from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
 from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map
 from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
+from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
+from lidarslam.evaluation.report.error_colours import DEFAULT_CLIP_M
+from lidarslam.evaluation.trajectory.alignment import AlignmentMethod
+from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, disagreement, evaluate_trajectory, metrics_json
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 

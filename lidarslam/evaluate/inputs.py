@@ -15,10 +15,10 @@ from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
 from lidarslam.evaluate.reference_cloud import read_cloud
+from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.storage import directory as files
 from lidarslam.storage.finished_run import read_trajectory
 from lidarslam.storage.unfinished import require_whole
-from mapping.config import GlobalMapConfig
 
 # KITTI's LiDAR turns ten times a second; only speeds depend on it.
 _KITTI_PERIOD_S = 0.1

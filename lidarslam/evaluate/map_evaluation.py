@@ -6,19 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluation.comparison.comparison import MapErrors
-from evaluation.map.alignment import GLOBAL, MapAlignment, align_map
-from evaluation.map.entropy import MapEntropy, map_entropy
-from evaluation.map.metrics import DEFAULT_SPACING_M, F_SCORE_THRESHOLDS_M, MapComparison, compare_maps
-from evaluation.trajectory.alignment import align
-from evaluation.trajectory.association import associate
-from evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse, is_rigid, orthonormalize, transform_points
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import parse_numbers
 from lidarslam.evaluate.inputs import Estimate
 from lidarslam.evaluate.reference_map import ReferenceMap
+from lidarslam.evaluation.comparison.comparison import MapErrors
+from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
+from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
+from lidarslam.evaluation.map.metrics import DEFAULT_SPACING_M, F_SCORE_THRESHOLDS_M, MapComparison, compare_maps
+from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
 _DRAWN_POINTS = 200_000
 

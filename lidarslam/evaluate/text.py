@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Mapping
 
-from evaluation.map.entropy import MapEntropy
-from evaluation.trajectory.drift import Drift
-from evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.evaluate.evaluate import Evaluation
 from lidarslam.evaluate.map_evaluation import MapEvaluation
+from lidarslam.evaluation.map.entropy import MapEntropy
+from lidarslam.evaluation.trajectory.drift import Drift
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
 _LABEL = 18
 _ALIGNED = {"se3": "after SE(3) alignment", "first_pose": "first poses aligned", "none": "not aligned"}

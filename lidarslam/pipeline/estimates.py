@@ -9,9 +9,9 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape
 from lidarslam.core.tracking import Status
-from mapping.deskew import body_velocity, deskew
-from mapping.pose_graph.graph_scan import GraphScan
-from odometry.interface import Motion
+from lidarslam.mapping.deskew import body_velocity, deskew
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.odometry.interface import Motion
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
 

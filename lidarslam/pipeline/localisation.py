@@ -10,12 +10,12 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
-from mapping.prediction import Prior
-from mapping.surfel_mapper import SurfelMapper
-from mapping.tracking.mapped_scan import MappedScan
-from odometry.interface import Motion
-from odometry.methods.consistency import Consistency, ConsistencyCheck
 
 
 class Localiser(Protocol):
@@ -136,7 +136,7 @@ def make_localiser(config: Config) -> Localiser:
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())
     if config.mapping.method == "loam":
-        from mapping.loam.mapper import LoamMapper  # loads Open3D
+        from lidarslam.mapping.loam.mapper import LoamMapper  # loads Open3D
 
         return ScanToMap(LoamMapper(config.mapping))
     return ScanToMap(SurfelMapper(config.mapping))

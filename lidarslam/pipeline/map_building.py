@@ -9,11 +9,11 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.global_map.moved_points import Views
+from lidarslam.mapping.slides.slides import SlideCheck
 from lidarslam.pipeline.estimates import Localised, SweepMotion
-from mapping.config import GlobalMapConfig
-from mapping.global_map.global_map import GlobalMap, voxel_size_for
-from mapping.global_map.moved_points import Views
-from mapping.slides.slides import SlideCheck
 
 
 @dataclass(frozen=True, eq=False)

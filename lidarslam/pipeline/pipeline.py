@@ -17,15 +17,15 @@ from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.background_worker import BackgroundWorker
 from lidarslam.pipeline.estimates import Estimated, ScanResult, graph_scan
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
-from mapping.config import GlobalMapConfig
-from odometry.interface import Odometry
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 # Scans that may wait for the map, which now and then takes as long as several scans, and calls that may wait for the
 # graph, which takes as long for a loop closure as for all scans up to the next keyframe.

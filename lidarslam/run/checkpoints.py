@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import Scan
+from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.resuming import scans_left
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RERUN
 from lidarslam.storage.state_file import write_state
 from lidarslam.storage.unfinished import Unfinished
-from odometry.interface import Odometry
 
 if TYPE_CHECKING:
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
 

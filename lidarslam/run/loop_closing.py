@@ -10,14 +10,14 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state import Saved
+from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.viewer.viewer import Viewer
-from mapping.global_map.global_map import GlobalMap
-from mapping.loops.closure import LoopClosure, RelativePose
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
-    from mapping.pose_graph.correction import Corrected
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.correction import Corrected
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def begin_graph(config: Config, directory: Path | None = None, file: Path | None
     """A pose graph, when the configuration asks for one; its submaps lie in the directory, or in the file."""
     if not config.pose_graph.enabled:
         return None
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
     local_radius_m = config.mapping.radius_m if config.mapping.enabled else 0.0
     return SlamGraph(config.pose_graph, directory, file, local_radius_m)

@@ -2,23 +2,23 @@
 
 from dataclasses import dataclass
 
-from evaluation.map.entropy import sampled_map_entropy
-from evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory_io import format_kitti, format_tum
+from lidarslam.evaluation.map.entropy import sampled_map_entropy
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
+from lidarslam.mapping.pose_graph.g2o import format_g2o
+from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
-from mapping.config import GlobalMapConfig
-from mapping.global_map.global_map import GlobalMap, PointCloud
-from mapping.global_map.map_io import write_cloud
-from mapping.global_map.moved_points import PlacedViews, seen_through
-from mapping.pose_graph.g2o import format_g2o
-from mapping.slides.slides import find_contradictions
 
 
 @dataclass(frozen=True)

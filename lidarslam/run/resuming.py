@@ -15,10 +15,10 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.datasets.recording import Recording
+from lidarslam.odometry.interface import Odometry
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.unfinished import About
-from odometry.interface import Odometry
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
     config = request.config
     tree = config.model_dump(mode="json", exclude=_WITHOUT_EFFECT)
     if config.odometry.method == "learned":
-        from odometry.network.shipped import default_weights
+        from lidarslam.odometry.network.shipped import default_weights
 
         tree["odometry"]["learned"]["weights"] = _digest(config.odometry.learned.weights or default_weights())
     run = describe_run(request) | {"prior": None if request.prior is None else _digest(request.prior)}

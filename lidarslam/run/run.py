@@ -9,6 +9,8 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.registry import open_recording
+from lidarslam.odometry.interface import Odometry
+from lidarslam.odometry.registry import make_odometry
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest
 from lidarslam.run.results import RunOutcome, final_map, write_results
@@ -18,11 +20,9 @@ from lidarslam.run.tracking import Progress, track
 from lidarslam.storage.directory import RERUN, RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
-from odometry.interface import Odometry
-from odometry.registry import make_odometry
 
 if TYPE_CHECKING:
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 
 def execute(request: RunRequest, progress: Progress) -> RunOutcome:

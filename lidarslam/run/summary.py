@@ -12,11 +12,11 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import count
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import SCANS_CSV
-from mapping.slides.slides import Contradiction
 
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3

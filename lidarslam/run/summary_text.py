@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.core.plain_text import count
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
 from lidarslam.storage.directory import SCANS_CSV, SUMMARY

@@ -15,6 +15,10 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
+from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.global_map.moved_points import Views
+from lidarslam.mapping.slides.slides import PairTests
+from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
@@ -24,13 +28,9 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
-from mapping.global_map.global_map import GlobalMap
-from mapping.global_map.moved_points import Views
-from mapping.slides.slides import PairTests
-from odometry.interface import Odometry
 
 if TYPE_CHECKING:
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 T = TypeVar("T")
 Progress = Callable[[int, int, ScanResult], None]

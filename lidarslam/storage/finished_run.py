@@ -18,9 +18,9 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_table import coordinates
+from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.unfinished import require_whole
-from mapping.global_map.global_map import PointCloud
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
 # In .ply and in .pcd files.

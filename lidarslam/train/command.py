@@ -7,10 +7,10 @@ from typing import Any
 from lidarslam.config.settings import SOURCES_SECTION, reader_settings
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError
+from lidarslam.odometry.network.shipped import default_weights
 from lidarslam.train.directory import CONFIG, is_training
 from lidarslam.train.settings import LOSSES, load_train_config
 from lidarslam.train.train import TrainRequest, execute
-from odometry.network.shipped import default_weights
 
 
 def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: Any) -> bool:

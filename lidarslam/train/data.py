@@ -13,12 +13,12 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
+from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
+from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
+from lidarslam.odometry.training.preparation import PreparedRecording, prepare
 from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.simulation.recording.mixture import MIXED_WORLDS, SENSOR_WEIGHTS, ingredients_of, mixture
 from lidarslam.train.teacher import MapTeacher
-from odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
-from odometry.training.config import SimulatedConfig, TrainingConfig
-from odometry.training.preparation import PreparedRecording, prepare
 
 # Scans that are held in memory as full images at a time; a longer recording becomes several.
 PIECE = 500

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
-from odometry.training.training import Validation
 
 
 class TrainingLog:

@@ -12,19 +12,19 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lidarslam.core.errors import ConfigError
+from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
+from lidarslam.odometry.network.pair_network import PairNetwork
+from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.pairs import Pairs
+from lidarslam.odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.training.training import Validation, learning_rate, loss_of, validate
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.train import directory as files
 from lidarslam.train.devices import Devices
 from lidarslam.train.log import TrainingLog
 from lidarslam.train.state import Progress, save_state
 from lidarslam.train.text import format_step, format_validation
-from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.pair_network import PairNetwork
-from odometry.training.augmentation import PairBatch
-from odometry.training.config import TrainingConfig
-from odometry.training.pairs import Pairs
-from odometry.training.preparation import PreparedRecording
-from odometry.training.training import Validation, learning_rate, loss_of, validate
 
 # Steps between lines of the log, and between validations.
 LOG_EVERY, VALIDATE_EVERY = 50, 500

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from lidarslam.config.settings import SOURCES_SECTION, dump_yaml, load_model
 from lidarslam.datasets.config import ReaderConfig
-from odometry.training.config import SimulatedConfig, TrainingConfig
+from lidarslam.odometry.training.config import SimulatedConfig, TrainingConfig
 
 # What `--losses` stands for, as settings.
 LOSSES = {

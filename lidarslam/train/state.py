@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarslam.core.errors import InputError
-from odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
+from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
 
 _KIND = Kind("the state of a training", version=1)
 _NETWORK, _OPTIMIZER = "network/", "optimizer/"

@@ -8,10 +8,10 @@ import torch
 from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig
-from mapping.prediction import Prior
-from mapping.surfel_mapper import SurfelMapper
-from odometry.training.preparation import PreparedRecording
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.odometry.training.preparation import PreparedRecording
 
 
 class MapTeacher:

@@ -14,6 +14,10 @@ from torch import nn
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer
+from lidarslam.odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.training import Validation, make_optimizer
 from lidarslam.run.progress import show_count
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.train import directory as files
@@ -23,10 +27,6 @@ from lidarslam.train.loop import Recordings, TrainingLoop
 from lidarslam.train.settings import TrainConfig, dump_train_yaml
 from lidarslam.train.state import Progress, load_state
 from lidarslam.train.text import format_outcome
-from odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
-from odometry.network.networks import make_network
-from odometry.training.config import TrainingConfig
-from odometry.training.training import Validation, make_optimizer
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.report.error_colours import viridis
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.report.error_colours import viridis
 
 _BACKGROUND = (255, 255, 255)
 # How far away the camera stands, in diameters of the cloud: near enough for perspective.

@@ -11,14 +11,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from evaluation.map.metrics import CloudErrors, MapComparison
-from evaluation.report.error_colours import error_colours
 from lidarslam.config.settings import ViewerConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
+from lidarslam.evaluation.map.metrics import CloudErrors, MapComparison
+from lidarslam.evaluation.report.error_colours import error_colours
 from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.rerun_program import GRPC_PORT, LOCAL, WEB_PORT, is_taken, open_window, page_served

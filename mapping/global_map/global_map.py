@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state import State, Stateful
-from mapping.global_map import kernels
-from mapping.surfels.voxel_hash import key_cells, point_keys
+from lidarslam.mapping.global_map import kernels
+from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys
 
 # Columns of the sums kept for every voxel.
 _POSITION, _VIEW, _COUNT = slice(0, 3), slice(3, 6), 6

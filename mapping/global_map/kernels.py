@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.cell_kernels import cell_of, key_of
+from lidarslam.mapping.surfels.cell_kernels import cell_of, key_of
 
 Keys = NDArray[np.int64]
 Sums = NDArray[np.float32]

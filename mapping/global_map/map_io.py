@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import OutputError
-from mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.global_map import PointCloud
 
 _POINTS_AT_A_TIME = 1_000_000
 

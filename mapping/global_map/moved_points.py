@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Shape, Stateful
-from mapping.global_map.visibility_kernels import NO_GAPS, TWO_PI, draw, judge
+from lidarslam.mapping.global_map.visibility_kernels import NO_GAPS, TWO_PI, draw, judge
 
 _ROWS, _COLUMNS = 16, 360
 # Elevations of the first scan's points between these quantiles make the rows, so that strays do not stretch them.

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
-from mapping.loam.neighbour_kernels import write_principal_axes
-from mapping.surfels.voxel_hash import point_keys
+from lidarslam.mapping.loam.neighbour_kernels import write_principal_axes
+from lidarslam.mapping.surfels.voxel_hash import point_keys
 
 # Neighbours that a line or plane is fitted to, and the largest distance of the farthest of them.
 _NEIGHBOURS, _FARTHEST_M = 5, 1.0

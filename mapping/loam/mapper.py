@@ -12,17 +12,17 @@ from lidarslam.core.geometry import adjoint, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig
-from mapping.deskew import body_velocity
-from mapping.loam.feature_map import FeatureMap
-from mapping.loam.features import Features, extract_features
-from mapping.loam.registration import FeatureMaps, register
-from mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
-from mapping.scene_scale import MIN_POINTS, SceneScale
-from mapping.tracking.fit import Fit
-from mapping.tracking.mapped_scan import MappedScan
-from mapping.tracking.pose_status import reservation
-from mapping.tracking.tracking_state import GIVE_UP_AFTER
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import body_velocity
+from lidarslam.mapping.loam.feature_map import FeatureMap
+from lidarslam.mapping.loam.features import Features, extract_features
+from lidarslam.mapping.loam.registration import FeatureMaps, register
+from lidarslam.mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
+from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.pose_status import reservation
+from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER
 
 # Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
 _MOST_SPACING_M = 0.4

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 
 
 @compiled

@@ -6,12 +6,12 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, orthonormalize, transform_points
-from mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
-from mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
-from mapping.loam.feature_map import FeatureMap, match_lines, match_planes
-from mapping.loam.features import Features
-from mapping.prediction import MotionState
-from mapping.tracking.fit import Fit
+from lidarslam.mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
+from lidarslam.mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.loam.feature_map import FeatureMap, match_lines, match_planes
+from lidarslam.mapping.loam.features import Features
+from lidarslam.mapping.prediction import MotionState
+from lidarslam.mapping.tracking.fit import Fit
 
 # Iterations, and the displacement of a point at the mean range that ends them.
 _ITERATIONS, _CONVERGED_M = 10, 0.005

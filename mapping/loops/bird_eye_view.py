@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
-from mapping.loops.sparse_submap import PLANE, SparseSubmap
-from mapping.tracking.birds_eye_map import height_shift
+from lidarslam.mapping.loops.sparse_submap import PLANE, SparseSubmap
+from lidarslam.mapping.tracking.birds_eye_map import height_shift
 
 _DIRECTIONS = 60  # over half a turn
 _BINS = 64

@@ -11,10 +11,10 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Stateful
-from mapping.config import LoopConfig
-from mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
-from mapping.loops.closure import CHI_SQUARED_99, LoopClosure
-from mapping.loops.verification import MIN_INLIERS, Verification, verify
+from lidarslam.mapping.config import LoopConfig
+from lidarslam.mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
+from lidarslam.mapping.loops.verification import MIN_INLIERS, Verification, verify
 
 # Way after a closure before the next is looked for: another would repeat it.
 _SPACING_M = 2.0

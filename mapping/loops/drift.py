@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
-from mapping.loops.closure import RelativePose
+from lidarslam.mapping.loops.closure import RelativePose
 
 # However short the way, poses next to each other are no better than this; radians and metres.
 _LEAST_ROTATION = np.deg2rad(0.1)

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
-from mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
-from mapping.loops.sparse_submap import LINE, SparseSubmap
+from lidarslam.mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.loops.sparse_submap import LINE, SparseSubmap
 
 # Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.
 _LEVELS = ((12.0, 4.0, 4, 8), (6.0, 2.0, 2, 6), (4.0, 1.0, 1, 4), (3.0, 0.5, 1, 8))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
-from mapping.loops.closure import LoopClosure
+from lidarslam.mapping.loops.closure import LoopClosure
 
 # Part of the radius of the local map within which the way must have stayed: surfaces around the keyframe are held too.
 _PART_OF_RADIUS = 0.6

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
-from mapping.degeneracy import find_degeneracy
-from mapping.gauss_newton import NormalEquations
-from mapping.loops.registration import (
+from lidarslam.mapping.degeneracy import find_degeneracy
+from lidarslam.mapping.gauss_newton import NormalEquations
+from lidarslam.mapping.loops.registration import (
     CORRELATION,
     GUESS_SIGMAS,
     LINE_NOISE_M,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, interpolate, inverse
-from mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 
 # Over a shorter way the sensor stood still, and scans are counted instead.
 _STILL_M = 0.01

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
-from mapping.loops.closure import RelativePose
-from mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 
 # Drift of scan-to-map registration between keyframes, one standard deviation: a floor, and growth with the way.
 # Compared with true errors of simulated recordings.

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
-from mapping.loops.closure import RelativePose
+from lidarslam.mapping.loops.closure import RelativePose
 
 _UPPER = np.triu_indices(6)
 _TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
 from lidarslam.core.state import Stateful
-from mapping.config import KeyframeConfig
-from mapping.surfels.voxel_hash import key_steps, point_keys
+from lidarslam.mapping.config import KeyframeConfig
+from lidarslam.mapping.surfels.voxel_hash import key_steps, point_keys
 
 # The spacing follows the scene: the median range over this, within these limits.
 _RANGES_APART, _LEAST_M, _MOST_M = 4.0, 0.5, 4.0

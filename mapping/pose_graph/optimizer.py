@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from mapping.loops.closure import RelativePose
-from mapping.pose_graph.edges import first_connected
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.edges import first_connected
 
 # Standard deviations of a pose that is held, radians and metres: firm beside every edge, but no singular system.
 _HELD = np.array([np.deg2rad(0.01)] * 3 + [0.001] * 3)

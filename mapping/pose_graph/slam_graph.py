@@ -19,18 +19,18 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.state import Stateful
-from mapping.config import PoseGraphConfig
-from mapping.global_map.global_map import GlobalMap, means_points
-from mapping.loops.closure import LoopClosure, RelativePose
-from mapping.loops.detection import LoopDetector
-from mapping.loops.refinement import DenseSubmap, refine
-from mapping.loops.revisits import as_registered
-from mapping.pose_graph.correction import Corrected, corrected, recordings_of
-from mapping.pose_graph.edges import MotionSinceKeyframe, drift_covariance, first_connected, trajectory_edges
-from mapping.pose_graph.graph_scan import GraphScan
-from mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
-from mapping.pose_graph.optimizer import optimise, relax
-from mapping.pose_graph.submap_store import SubmapStore
+from lidarslam.mapping.config import PoseGraphConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap, means_points
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.loops.detection import LoopDetector
+from lidarslam.mapping.loops.refinement import DenseSubmap, refine
+from lidarslam.mapping.loops.revisits import as_registered
+from lidarslam.mapping.pose_graph.correction import Corrected, corrected, recordings_of
+from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, drift_covariance, first_connected, trajectory_edges
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
+from lidarslam.mapping.pose_graph.optimizer import optimise, relax
+from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 
 # A closure is refined on submaps united with so many on either side: one alone is as sparse as the sensor, and over a
 # longer way drift bends them.

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.state import Saved, State, Stateful
-from mapping.global_map.global_map import COLUMNS, VoxelMeans
+from lidarslam.mapping.global_map.global_map import COLUMNS, VoxelMeans
 
 
 class SubmapStore(Stateful):

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state import Shape
-from mapping.slides.kernels import COLUMNS, ROWS, draw_indices, vote, write_moments
+from lidarslam.mapping.slides.kernels import COLUMNS, ROWS, draw_indices, vote, write_moments
 
 _MIN_RANGE_M = 1.0
 _FEWEST_NEIGHBOURS = 5

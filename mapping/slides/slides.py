@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state import Shape, Stateful
-from mapping.slides.scan_surfels import BIN_M, Surfels, shift_profile
+from lidarslam.mapping.slides.scan_surfels import BIN_M, Surfels, shift_profile
 
 # A scan is kept after so many metres or scans, whichever comes first, and paired with the last two.
 _EVERY_M, _EVERY_SCANS = 7.0, 10

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.surfel_kernels import is_steep
+from lidarslam.mapping.surfels.surfel_kernels import is_steep
 
 # A single ring bent around a corner spans a plane too, that of its own rays. A plane seen at a grazing angle counts
 # only when its points differ so much in height across the rings.

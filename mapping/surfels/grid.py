@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, State, Stateful
-from mapping.surfels import cell_kernels as kernels
-from mapping.surfels.side_kernels import belong_to_others, turn_to_sensor
-from mapping.surfels.surfel_kernels import refresh
-from mapping.surfels.symmetric import SYMMETRIC
-from mapping.surfels.voxel_hash import ABSENT, Rows, VoxelHash, cell_keys, key_cells, point_keys
+from lidarslam.mapping.surfels import cell_kernels as kernels
+from lidarslam.mapping.surfels.side_kernels import belong_to_others, turn_to_sensor
+from lidarslam.mapping.surfels.surfel_kernels import refresh
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC
+from lidarslam.mapping.surfels.voxel_hash import ABSENT, Rows, VoxelHash, cell_keys, key_cells, point_keys
 
 # Columns of a cell's sums: number of points, first and second moments about the cell's centre in units of the cell,
 # first and second moment of the elevation, and the sum of the view directions.

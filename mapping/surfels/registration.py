@@ -11,12 +11,12 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
-from mapping.deskew import Sweep, body_velocity
-from mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
-from mapping.prediction import MotionState, Prediction
-from mapping.surfels.sampling import MIN_CORRESPONDENCES
-from mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
+from lidarslam.mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
+from lidarslam.mapping.deskew import Sweep, body_velocity
+from lidarslam.mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.prediction import MotionState, Prediction
+from lidarslam.mapping.surfels.sampling import MIN_CORRESPONDENCES
+from lidarslam.mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.
 _ITERATIONS, _PATIENT_ITERATIONS = (3, 20), (10, 40)

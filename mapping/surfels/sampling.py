@@ -9,9 +9,9 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import central_per_cell, one_per_cell
-from mapping.config import MappingConfig
-from mapping.deskew import Sweep
-from mapping.scene_scale import MIN_POINTS, SceneScale
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import Sweep
+from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
 
 # Fewer keypoints, or correspondences of them, make no pose.
 MIN_CORRESPONDENCES = MIN_POINTS

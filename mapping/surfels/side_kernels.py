@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.cell_kernels import Cells
-from mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one
+from lidarslam.mapping.surfels.cell_kernels import Cells
+from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one
 
 # Least squared cosine between the view of a point and those of its cell for one side.
 _SAME_VIEW = 0.5

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
-from mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
+from lidarslam.mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
+from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # A surfel is computed again when its cell has grown by this factor.
 _GROWTH = np.float32(1.3)

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state import Shape, Stateful
-from mapping.surfels.cell_kernels import write_views
-from mapping.surfels.correspondence_kernels import Rows, match_compact, match_planes
-from mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.cell_kernels import write_views
+from lidarslam.mapping.surfels.correspondence_kernels import Rows, match_compact, match_planes
+from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
 
 # Sizes of the grids, in cells. A point's correspondence is the plane of the finest grid that has one.
 LEVELS = (1, 2, 4)

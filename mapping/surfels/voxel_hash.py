@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels import cell_kernels as kernels
-from mapping.surfels.cell_kernels import ABSENT, Keys, Rows
+from lidarslam.mapping.surfels import cell_kernels as kernels
+from lidarslam.mapping.surfels.cell_kernels import ABSENT, Keys, Rows
 
 __all__ = ["ABSENT", "Keys", "Rows", "VoxelHash", "cell_keys", "key_cells", "key_steps", "point_keys"]
 

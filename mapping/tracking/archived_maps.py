@@ -1,11 +1,11 @@
 """Archived maps: maps that tracking was lost in, searched now and then for the sensor's return."""
 
 from lidarslam.core.state import Stateful
-from mapping.config import MappingConfig
-from mapping.prediction import MotionState, Prediction
-from mapping.surfels.sampling import SampledScan
-from mapping.surfels.surfel_map import SurfelMap
-from mapping.tracking.attempts import Attempt, ScanMatcher
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.prediction import MotionState, Prediction
+from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.attempts import Attempt, ScanMatcher
 
 # A map of fewer scans is not worth a search.
 _LEAST_SCANS = 5

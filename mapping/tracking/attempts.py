@@ -7,15 +7,21 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, log, transform_points
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig
-from mapping.deskew import body_velocity
-from mapping.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
-from mapping.surfels.registration import Registration, register, with_mean_velocity
-from mapping.surfels.sampling import SampledScan
-from mapping.surfels.surfel_map import SurfelMap
-from mapping.tracking.birds_eye_map import BirdsEyeMap
-from mapping.tracking.fit import NO_FIT, Fit
-from mapping.tracking.start_poses import best_starts, best_supported, best_velocity, positions_around, turned_poses
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import body_velocity
+from lidarslam.mapping.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
+from lidarslam.mapping.surfels.registration import Registration, register, with_mean_velocity
+from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
+from lidarslam.mapping.tracking.fit import NO_FIT, Fit
+from lidarslam.mapping.tracking.start_poses import (
+    best_starts,
+    best_supported,
+    best_velocity,
+    positions_around,
+    turned_poses,
+)
 
 # Covariance (6, 6) of a start without a prediction.
 _ANYWHERE = np.diag([np.pi**2] * 3 + [10.0**2] * 3)

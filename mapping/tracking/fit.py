@@ -7,7 +7,7 @@ from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
-from mapping.config import TrackingConfig
+from lidarslam.mapping.config import TrackingConfig
 
 # Largest distance of an inlier from its surface: the largest of a length, a share of the cell and a share of the range.
 _GATE_MIN_M, _GATE_CELLS, _GATE_RATIO = 0.05, 0.5, 0.02

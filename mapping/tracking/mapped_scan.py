@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
-from mapping.prediction import MotionState
-from mapping.tracking.fit import Fit
+from lidarslam.mapping.prediction import MotionState
+from lidarslam.mapping.tracking.fit import Fit
 
 
 @dataclass(frozen=True, eq=False)

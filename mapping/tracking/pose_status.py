@@ -3,9 +3,9 @@
 import numpy as np
 
 from lidarslam.core.tracking import Status
-from mapping.config import TrackingConfig
-from mapping.tracking.attempts import Attempt
-from mapping.tracking.tracking_state import TrackingState
+from lidarslam.mapping.config import TrackingConfig
+from lidarslam.mapping.tracking.attempts import Attempt
+from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 
 def judge(

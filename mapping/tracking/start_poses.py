@@ -3,9 +3,9 @@
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, transform_points
-from mapping.deskew import Sweep
-from mapping.surfels.surfel_map import LEVELS, SurfelMap
-from mapping.tracking.fit import translation_information
+from lidarslam.mapping.deskew import Sweep
+from lidarslam.mapping.surfels.surfel_map import LEVELS, SurfelMap
+from lidarslam.mapping.tracking.fit import translation_information
 
 # Points that score a start, and starts that are registered.
 _SCORED_POINTS = 600

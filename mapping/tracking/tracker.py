@@ -9,9 +9,9 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse
 from lidarslam.core.state import Stateful
 from lidarslam.core.tracking import Status
-from mapping.config import MappingConfig
-from mapping.deskew import body_velocity
-from mapping.prediction import (
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import body_velocity
+from lidarslam.mapping.prediction import (
     LARGEST_PROCESS_NOISE,
     LOST_MOTION,
     MotionState,
@@ -21,13 +21,13 @@ from mapping.prediction import (
     ProcessNoise,
     predict,
 )
-from mapping.surfels.sampling import SampledScan
-from mapping.surfels.surfel_map import SurfelMap
-from mapping.tracking.archived_maps import ArchivedMaps
-from mapping.tracking.attempts import Attempt, ScanMatcher, best_of
-from mapping.tracking.mapped_scan import MappedScan
-from mapping.tracking.pose_status import judge
-from mapping.tracking.tracking_state import TrackingState
+from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.archived_maps import ArchivedMaps
+from lidarslam.mapping.tracking.attempts import Attempt, ScanMatcher, best_of
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.pose_status import judge
+from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
 # error is forgotten by a factor a scan.

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
-from odometry.alignment.residuals import Motion
-from odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
+from lidarslam.odometry.alignment.residuals import Motion
+from lidarslam.odometry.alignment.sweep_motion import SweepPair
 
 # Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
 _COARSE_M = 0.5

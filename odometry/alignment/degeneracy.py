@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.images.sweep_images import SweepImages
+from lidarslam.odometry.images.sweep_images import SweepImages
 
 # Mean squared Jacobian of the points along a direction, from 0 to about 1. Where the end of a tunnel is in view it is
 # 0.002 and more, in an even one 0.0006 and less.

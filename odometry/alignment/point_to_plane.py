@@ -6,10 +6,10 @@ import numpy as np
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from odometry.alignment.residuals import Motion, Planes, accumulate
-from odometry.alignment.sweep_motion import SweepPair
-from odometry.images.projection import Floats
-from odometry.images.sweep_images import SweepImages
+from lidarslam.odometry.alignment.residuals import Motion, Planes, accumulate
+from lidarslam.odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.images.projection import Floats
+from lidarslam.odometry.images.sweep_images import SweepImages
 
 # Twice as many rows add hardly any information if half as many points are taken of each.
 _FULL_ROWS = 32

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from odometry.images.projection import Floats, column_of, row_of, write_angles
+from lidarslam.odometry.images.projection import Floats, column_of, row_of, write_angles
 
 # Points that are worked on together, so that the processor takes several at once.
 _BLOCK = 256

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, log
-from odometry.alignment.alignment import NORMAL, Alignment, Effort, InitialEstimate, align, align_each
-from odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.alignment.alignment import NORMAL, Alignment, Effort, InitialEstimate, align, align_each
+from lidarslam.odometry.alignment.sweep_motion import SweepPair
 
 # Several initial estimates are aligned roughly first; the best is aligned anew.
 _ROUGH = Effort(iterations=6, column_step=6)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.state import Shape, Stateful
-from odometry.images.sweep_images import SweepImages
+from lidarslam.odometry.images.sweep_images import SweepImages
 
 Twist = Annotated[FloatArray, Shape(6)]
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
-from odometry.config import ImageConfig
-from odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals
-from odometry.images.projection import Floats, ImageGrid, Points, Projection, project
+from lidarslam.odometry.config import ImageConfig
+from lidarslam.odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals
+from lidarslam.odometry.images.projection import Floats, ImageGrid, Points, Projection, project
 
 # The grid of a scan of fewer points, as of a covered sensor, is replaced by that of a scan of more.
 _ENOUGH_POINTS = 200

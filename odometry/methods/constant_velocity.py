@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
-from odometry.interface import Motion
+from lidarslam.odometry.interface import Motion
 
 
 class ConstantVelocity(Stateful):

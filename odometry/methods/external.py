@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.trajectory import Trajectory
-from odometry.interface import Motion
+from lidarslam.odometry.interface import Motion
 
 # A gap is never shorter than this, nor than so many of the trajectory's usual steps.
 _LEAST_GAP_S = 1.0

@@ -19,9 +19,9 @@ from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
-from odometry.config import KissConfig
-from odometry.interface import Motion
-from odometry.methods.kiss_worker import receive, send
+from lidarslam.odometry.config import KissConfig
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.methods.kiss_worker import receive, send
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class _Worker:
 
     def __init__(self, settings: dict[str, Any]) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "odometry.methods.kiss_worker"],
+            [sys.executable, "-m", "lidarslam.odometry.methods.kiss_worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             cwd=Path(__file__).resolve().parents[2],  # a folder called odometry where the user stands must not win

@@ -14,14 +14,14 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, orthonormalize
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Shape, Stateful
-from odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
-from odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
-from odometry.alignment.search import align_best
-from odometry.alignment.sweep_motion import StampInterpolator, SweepPair
-from odometry.config import ImageConfig
-from odometry.images.sweep_images import Imager, ScanImages
-from odometry.interface import Motion
-from odometry.network.candidates import Candidate, Described, Search
+from lidarslam.odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
+from lidarslam.odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
+from lidarslam.odometry.alignment.search import align_best
+from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepPair
+from lidarslam.odometry.config import ImageConfig
+from lidarslam.odometry.images.sweep_images import Imager, ScanImages
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.network.candidates import Candidate, Described, Search
 
 # Below this the scan does not fit the last one: see `Alignment.explained`, and inliers.
 _LEAST_EXPLAINED, _LEAST_INLIERS = 0.3, 60

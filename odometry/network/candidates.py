@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lidarslam.core.geometry import FloatArray
-from odometry.images.bird_eye import MOST_CELLS, SHIFTS, bird_eye
-from odometry.images.projection import Floats
+from lidarslam.odometry.images.bird_eye import MOST_CELLS, SHIFTS, bird_eye
+from lidarslam.odometry.images.projection import Floats
 
 # Turns and shifts that are followed, and the least probability beside the best one's.
 _TURNS, _SHIFT_PEAKS = 2, 3

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from lidarslam.core.errors import InputError
-from odometry.config import ImageConfig, NetworkConfig
-from odometry.network.exported import describe, read_description
-from odometry.network.networks import make_network
-from odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network.exported import describe, read_description
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.tensor_file import Kind, read_tensor_file, write_tensor_file
 
 WEIGHTS = Kind("weights", version=1)
 

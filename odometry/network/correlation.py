@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from odometry.images import bird_eye
-from odometry.images.bird_eye import SHIFTS
-from odometry.network.pair_network import Estimate, PairImages, has_normal
-from odometry.network.torch_geometry import make_transform, turn_about_z
+from lidarslam.odometry.images import bird_eye
+from lidarslam.odometry.images.bird_eye import SHIFTS
+from lidarslam.odometry.network.pair_network import Estimate, PairImages, has_normal
+from lidarslam.odometry.network.torch_geometry import make_transform, turn_about_z
 
 INPUT_CHANNELS = 9
 # Channels of the three stages of the column encoder, and of the bird's-eye encoder; features that are correlated.

@@ -5,8 +5,8 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from odometry.network.pair_network import Estimate, PairImages
-from odometry.network.torch_geometry import make_transform, rotation_from_quaternion
+from lidarslam.odometry.network.pair_network import Estimate, PairImages
+from lidarslam.odometry.network.torch_geometry import make_transform, rotation_from_quaternion
 
 # Output channels of the four stages, and their stride in (elevation, azimuth).
 _STAGES = ((64, (1, 1)), (128, (1, 2)), (256, (1, 2)), (512, (2, 2)))

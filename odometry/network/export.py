@@ -16,12 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from lidarslam.core.errors import ConfigError, OutputError
-from odometry.images import bird_eye
-from odometry.images.bird_eye import SHIFTS
-from odometry.network.checkpoint import Checkpoint, network_of
-from odometry.network.correlation import CorrelationNetwork
-from odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
-from odometry.network.pair_network import PairImages
+from lidarslam.odometry.images import bird_eye
+from lidarslam.odometry.images.bird_eye import SHIFTS
+from lidarslam.odometry.network.checkpoint import Checkpoint, network_of
+from lidarslam.odometry.network.correlation import CorrelationNetwork
+from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
+from lidarslam.odometry.network.pair_network import PairImages
 
 # Not a size of anything else, so that no dimension is taken for another.
 _EXAMPLE_BATCH = 2

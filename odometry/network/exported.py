@@ -9,8 +9,8 @@ import onnxruntime
 from pydantic import ValidationError
 
 from lidarslam.core.errors import InputError
-from odometry.config import ImageConfig, NetworkConfig
-from odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
 
 DESCRIPTION = "network.json"
 COLUMNS, TURNS, BIRD, PEAKS, PAIR = "columns.onnx", "turns.onnx", "bird.onnx", "peaks.onnx", "pair.onnx"

@@ -2,9 +2,9 @@
 
 from torch import nn
 
-from odometry.config import NetworkConfig
-from odometry.network.correlation import CorrelationNetwork
-from odometry.network.delora import DeloraNetwork
+from lidarslam.odometry.config import NetworkConfig
+from lidarslam.odometry.network.correlation import CorrelationNetwork
+from lidarslam.odometry.network.delora import DeloraNetwork
 
 
 def make_network(config: NetworkConfig) -> nn.Module:

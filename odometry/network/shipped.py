@@ -21,7 +21,7 @@ def shipped_folder() -> Path:
 
 
 def _required(name: str) -> Path:
-    path = Path(str(files("odometry"))) / "weights" / name
+    path = Path(str(files("lidarslam.odometry"))) / "weights" / name
     if not path.exists():
         raise ConfigError(
             f"{path}: the weights that come with the program are missing;"

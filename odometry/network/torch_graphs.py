@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from odometry.images.projection import Floats
-from odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
-from odometry.network.correlation import CorrelationNetwork
-from odometry.network.pair_network import PairImages
+from lidarslam.odometry.images.projection import Floats
+from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
+from lidarslam.odometry.network.correlation import CorrelationNetwork
+from lidarslam.odometry.network.pair_network import PairImages
 
 
 def torch_search(network: nn.Module, device: torch.device | str = "cpu", threads: int = 1) -> Search:

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Generator, Tensor
 
-from odometry.network.pair_network import PairImages
-from odometry.network.torch_geometry import make_transform, turn_about_z
-from odometry.training.torch_images import mirror, rotate_columns
+from lidarslam.odometry.network.pair_network import PairImages
+from lidarslam.odometry.network.torch_geometry import make_transform, turn_about_z
+from lidarslam.odometry.training.torch_images import mirror, rotate_columns
 
 # Surfaces whose normals have a vertical component of more than this count as ground.
 _LEVEL = 0.9

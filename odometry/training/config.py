@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
-from odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
 
 Teacher = Literal["alignment", "map"]
 

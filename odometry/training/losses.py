@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from odometry.network.torch_geometry import rotate, transform_points
-from odometry.training.config import LossConfig
-from odometry.training.correspondence import nearest
+from lidarslam.odometry.network.torch_geometry import rotate, transform_points
+from lidarslam.odometry.training.config import LossConfig
+from lidarslam.odometry.training.correspondence import nearest
 
 # The robust losses gate the distance of a correspondence, and weigh residuals with Huber's kernel of this scale.
 _GATE_M, _HUBER_M = 1.0, 0.1

@@ -7,12 +7,12 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional
 
-from odometry.images import bird_eye
-from odometry.network.pair_network import Estimate, has_normal
-from odometry.network.torch_geometry import inverse, log
-from odometry.training.augmentation import PairBatch
-from odometry.training.config import TrainingConfig
-from odometry.training.losses import Surfaces, geometric_loss
+from lidarslam.odometry.images import bird_eye
+from lidarslam.odometry.network.pair_network import Estimate, has_normal
+from lidarslam.odometry.network.torch_geometry import inverse, log
+from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.losses import Surfaces, geometric_loss
 
 # Points of the current scan that the geometric losses use.
 _GEOMETRIC_POINTS = 1024

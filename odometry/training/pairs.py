@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from odometry.images.bird_eye import bird_eye
-from odometry.network.torch_geometry import inverse, log
-from odometry.training.augmentation import AUGMENTATION, Augmentation, PairBatch, augmented
-from odometry.training.preparation import PreparedRecording
-from odometry.training.torch_images import compensated
+from lidarslam.odometry.images.bird_eye import bird_eye
+from lidarslam.odometry.network.torch_geometry import inverse, log
+from lidarslam.odometry.training.augmentation import AUGMENTATION, Augmentation, PairBatch, augmented
+from lidarslam.odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.training.torch_images import compensated
 
 # A prime that keeps the random streams of steps and processes apart.
 _STREAM = 1_000_003

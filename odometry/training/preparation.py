@@ -14,11 +14,11 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, exp, log
 from lidarslam.core.scan import Scan
-from odometry.alignment.alignment import Alignment, Effort, InitialEstimate
-from odometry.alignment.search import DOUBTFUL, align_best, try_instead
-from odometry.alignment.sweep_motion import SweepMotion, SweepPair
-from odometry.config import ImageConfig
-from odometry.images.sweep_images import Imager, SweepImages
+from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate
+from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
+from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
+from lidarslam.odometry.config import ImageConfig
+from lidarslam.odometry.images.sweep_images import Imager, SweepImages
 
 # Initial estimates of the turn from one scan to the next, degrees. Alignment converges over half a step.
 _TURNS_DEG = (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0)

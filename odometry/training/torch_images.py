@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from odometry.network.torch_geometry import skew
+from lidarslam.odometry.network.torch_geometry import skew
 
 
 def rotate_columns(images: Tensor, shift: Tensor) -> Tensor:

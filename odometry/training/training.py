@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from odometry.network.candidates import Search
-from odometry.network.pair_network import PairNetwork
-from odometry.network.torch_graphs import torch_search
-from odometry.training.augmentation import PairBatch
-from odometry.training.config import TrainingConfig
-from odometry.training.objective import Objective, motion_error, objective
-from odometry.training.pairs import pair_of
-from odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.network.candidates import Search
+from lidarslam.odometry.network.pair_network import PairNetwork
+from lidarslam.odometry.network.torch_graphs import torch_search
+from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.objective import Objective, motion_error, objective
+from lidarslam.odometry.training.pairs import pair_of
+from lidarslam.odometry.training.preparation import PreparedRecording
 
 _LEAST_RATE = 0.01  # of the learning rate, at the end
 _WEIGHT_DECAY = 1e-3

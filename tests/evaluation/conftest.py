@@ -5,7 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from evaluation.comparison.comparison import (
+from lidarslam.core.geometry import exp
+from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.evaluation.comparison.comparison import (
     Comparison,
     MapErrors,
     MethodResult,
@@ -13,10 +15,8 @@ from evaluation.comparison.comparison import (
     PublishedRow,
     SequenceComparison,
 )
-from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
-from evaluation.trajectory.metrics import evaluate_trajectory
-from lidarslam.core.geometry import exp
-from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 
 @pytest.fixture

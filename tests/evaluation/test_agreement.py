@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from evaluation.trajectory.metrics import disagreement, evaluate_trajectory
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.metrics import disagreement, evaluate_trajectory
 
 
 def along(positions: FloatArray) -> Trajectory:

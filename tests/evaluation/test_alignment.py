@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from evaluation.trajectory.alignment import align, align_se3
 from lidarslam.core.geometry import exp, inverse, is_rigid, rotation_angle
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.alignment import align, align_se3
 
 MOTIONS = [(0.0,) * 6, (0.3, -0.2, 2.5, 10.0, -4.0, 1.0), (3.1, 0.1, 0.2, -500.0, 20.0, 3.0)]
 

@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evaluation.comparison.comparison import (
+from lidarslam.core.errors import ConfigError
+from lidarslam.core.geometry import exp
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.comparison.comparison import (
     Comparison,
     MethodResult,
     MethodStatus,
     MissingRecording,
     SequenceComparison,
 )
-from evaluation.comparison.mean_table import TablePlan, mean_table
-from evaluation.comparison.quantities import QUANTITIES, find_quantity
-from evaluation.comparison.table import TableCell, TableRow
-from evaluation.trajectory.metrics import evaluate_trajectory
-from lidarslam.core.errors import ConfigError
-from lidarslam.core.geometry import exp
-from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.comparison.mean_table import TablePlan, mean_table
+from lidarslam.evaluation.comparison.quantities import QUANTITIES, find_quantity
+from lidarslam.evaluation.comparison.table import TableCell, TableRow
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 
 
 @pytest.fixture

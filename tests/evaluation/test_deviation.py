@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from evaluation.trajectory.association import associate
-from evaluation.trajectory.metrics import absolute_errors, deviations, evaluate_trajectory
 from lidarslam.core.geometry import exp, make_transform
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.metrics import absolute_errors, deviations, evaluate_trajectory
 
 
 def test_a_shift_in_the_lidars_frame_is_found_along_its_axes(random_drive):

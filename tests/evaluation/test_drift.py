@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 from kiss_icp.metrics import sequence_error
 
-from evaluation.trajectory.association import associate
-from evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, kitti_drift, segment_errors, short_drift
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.drift import (
+    KITTI_LENGTHS_M,
+    SHORT_LENGTHS_M,
+    kitti_drift,
+    segment_errors,
+    short_drift,
+)
 
 # KISS-ICP, like the development kit's first version, takes pi for 3.14 and returns single precision.
 KISS_ICP_PI = 3.14

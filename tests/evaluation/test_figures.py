@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from evaluation.comparison.comparison import MapErrors
-from evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text, printable
-from evaluation.report.figures.figure import Panel, line_trace, method_styles, plot_text, thin_curve
-from evaluation.report.figures.maps import raster
+from lidarslam.evaluation.comparison.comparison import MapErrors
+from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text, printable
+from lidarslam.evaluation.report.figures.figure import Panel, line_trace, method_styles, plot_text, thin_curve
+from lidarslam.evaluation.report.figures.maps import raster
 
 
 def test_a_thinned_curve_keeps_its_peaks_and_ends(rng):

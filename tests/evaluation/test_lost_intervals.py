@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from evaluation.comparison.comparison import MethodResult
-from evaluation.comparison.lost import lost_intervals
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.comparison.comparison import MethodResult
+from lidarslam.evaluation.comparison.lost import lost_intervals
 
 LOST = MethodResult(
     name="a",

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from evaluation.map.alignment import align_map
-from evaluation.map.voxel_thinning import thin
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
+from lidarslam.evaluation.map.alignment import align_map
+from lidarslam.evaluation.map.voxel_thinning import thin
 
 UTM = np.array([5e5, 5e6, 300.0])
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from evaluation.map.entropy import map_entropy
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.map.entropy import map_entropy
 
 
 def _slab(rng: np.random.Generator, sigma_m: float) -> FloatArray:
@@ -44,7 +44,7 @@ def test_a_flawless_plane_is_finite_and_the_place_does_not_matter(rng: np.random
 def test_chunks_and_samples_change_little(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     points = _slab(rng, 0.02)
     whole, sampled = map_entropy(points), map_entropy(points, most_samples=500)
-    monkeypatch.setattr("evaluation.map.entropy._CHUNK", 1_000)
+    monkeypatch.setattr("lidarslam.evaluation.map.entropy._CHUNK", 1_000)
     chunked = map_entropy(points)
     assert whole is not None
     assert sampled is not None

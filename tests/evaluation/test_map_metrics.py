@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from evaluation.map.metrics import MapMetrics, compare_maps
-from evaluation.map.voxel_thinning import thin
-from evaluation.report.error_colours import error_colours
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.map.metrics import MapMetrics, compare_maps
+from lidarslam.evaluation.map.voxel_thinning import thin
+from lidarslam.evaluation.report.error_colours import error_colours
 
 UTM = np.array([5e5, 5e6, 300.0])
 

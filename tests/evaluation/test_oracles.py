@@ -5,11 +5,11 @@ import pytest
 from evo.core.metrics import APE, RPE, PoseRelation, Unit
 from evo.core.trajectory import PoseTrajectory3D
 
-from evaluation.trajectory.alignment import align
-from evaluation.trajectory.association import associate
-from evaluation.trajectory.metrics import absolute_errors, evaluate_trajectory, relative_errors
 from lidarslam.core.geometry import exp
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.metrics import absolute_errors, evaluate_trajectory, relative_errors
 
 ELSEWHERE = exp([0.3, -0.2, 2.0, 100.0, -40.0, 5.0])
 SEEDS = range(3)

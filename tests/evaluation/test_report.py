@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 import pytest
 from plotly.offline import get_plotlyjs
 
-from evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
-from evaluation.report.report import render_html, render_markdown
+from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
+from lidarslam.evaluation.report.report import render_html, render_markdown
 
 HOSTILE = "<script>alert('x')</script> & \"quoted\" | `tick` ünïcode 测试 \ufffd"
 

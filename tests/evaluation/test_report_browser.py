@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.report.report import render_html
+from lidarslam.evaluation.report.report import render_html
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 DEADLINE_S = 60.0

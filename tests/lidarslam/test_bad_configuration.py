@@ -18,10 +18,10 @@ from safetensors.torch import save_file
 
 from lidarslam.cli import main
 from lidarslam.core.trajectory_io import format_kitti, read_tum
-from odometry.config import ImageConfig, NetworkConfig
-from odometry.network.checkpoint import checkpoint_of, save_checkpoint
-from odometry.network.networks import make_network
-from odometry.network.shipped import default_weights
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.shipped import default_weights
 
 
 def lidarslam(*arguments: object) -> Result:

@@ -22,10 +22,10 @@ from lidarslam.core.files import only_writer
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.storage.directory import FILES, RunDirectory
 from lidarslam.viewer.rerun_recording import IncompleteRecordingError, require_complete
-from mapping.global_map.global_map import PointCloud
-from mapping.global_map.map_io import write_cloud
 
 FAST = ("--odometry", "constant-velocity")
 

@@ -15,6 +15,10 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.odometry.methods.consistency import ConsistencyCheck
+from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run import checkpoints
@@ -24,10 +28,6 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
 from lidarslam.storage.unfinished import About, Unfinished, require_whole
-from mapping.config import GlobalMapConfig
-from odometry.methods.consistency import ConsistencyCheck
-from odometry.methods.constant_velocity import ConstantVelocity
-from odometry.methods.external import ExternalOdometry
 
 
 class Clock:

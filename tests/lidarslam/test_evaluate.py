@@ -18,8 +18,8 @@ from lidarslam.evaluate.inputs import read_estimate
 from lidarslam.evaluate.map_evaluation import MapOptions, evaluate_map, read_transform
 from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
 from lidarslam.evaluate.text import format_evaluation
-from mapping.global_map.global_map import PointCloud
-from mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
 
 # Where the run's world lies in the recording's.
 T_TRUTH_RUN = exp([0.0, 0.0, 2.0, 5.0, -3.0, 0.5])

@@ -14,7 +14,7 @@ from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
-from mapping.loam.features import Features, extract_features
+from lidarslam.mapping.loam.features import Features, extract_features
 
 SCANS = 8
 FIELDS = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8"), ("ring", "u2")])
@@ -86,7 +86,7 @@ def test_an_interrupted_run_comes_to_the_same_results(
             raise KeyboardInterrupt
         return extract_features(*given)
 
-    monkeypatch.setattr("mapping.loam.mapper.extract_features", interrupted)
+    monkeypatch.setattr("lidarslam.mapping.loam.mapper.extract_features", interrupted)
     command = ["run", str(source), "--out", str(out), *arguments]
     assert CliRunner().invoke(main, command).exit_code == 1
     assert (out / "unfinished" / "state.npz").exists()

@@ -13,16 +13,16 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
+from lidarslam.mapping.loam.mapper import LoamMapper
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.odometry.interface import Motion, Odometry
+from lidarslam.odometry.methods.consistency import ConsistencyCheck
+from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, SweepMotion
 from lidarslam.pipeline.localisation import OdometryAlone, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from mapping.config import GlobalMapConfig, MappingConfig, MappingName
-from mapping.loam.mapper import LoamMapper
-from mapping.surfel_mapper import SurfelMapper
-from odometry.interface import Motion, Odometry
-from odometry.methods.consistency import ConsistencyCheck
-from odometry.methods.constant_velocity import ConstantVelocity
-from odometry.methods.external import ExternalOdometry
 
 BEFORE, AFTER = np.arange(6.0), np.arange(6.0) ** 2 - 3.0
 

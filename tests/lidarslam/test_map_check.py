@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from evaluation.map.entropy import map_entropy, sampled_map_entropy
 from lidarslam.cli import main
 from lidarslam.compare.method_ending import judge
 from lidarslam.compare.supervised import Ending, Limits
@@ -16,6 +15,7 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.evaluation.map.entropy import map_entropy, sampled_map_entropy
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.odometry.methods.consistency import ConsistencyCheck
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
-from mapping.config import GlobalMapConfig
-from odometry.methods.consistency import ConsistencyCheck
-from odometry.methods.external import ExternalOdometry
 
 SCANS = 60
 PASSES_UNTIL = 15

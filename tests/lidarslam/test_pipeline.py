@@ -12,14 +12,14 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.methods.consistency import ConsistencyCheck
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
-from mapping.config import GlobalMapConfig
-from mapping.pose_graph.graph_scan import GraphScan
-from odometry.interface import Motion
-from odometry.methods.consistency import ConsistencyCheck
-from odometry.methods.external import ExternalOdometry
 
 
 def make_pipeline(odometry: Any, voxel_size_m: float = 0.1) -> Pipeline:

@@ -36,7 +36,7 @@ SERVER = """
 import json, os, shutil, signal, sys, threading
 from pathlib import Path
 import lidarslam.viewer.rerun_viewer, lidarslam.run.run, mapping.global_map.map_io, mapping.pose_graph.slam_graph
-import odometry.methods.learned
+import lidarslam.odometry.methods.learned
 from lidarslam.cli import main
 
 EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "fsync"}

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.run.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.run.summary_text import format_outcome
-from mapping.loops.closure import LoopClosure
 
 
 def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:

@@ -7,6 +7,8 @@ import torch
 from lidarslam.core.geometry import inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.odometry.config import ImageConfig
+from lidarslam.odometry.training.preparation import prepare
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
@@ -14,8 +16,6 @@ from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
 from lidarslam.train.data import Stretch, draw_weights
 from lidarslam.train.teacher import MapTeacher
-from odometry.config import ImageConfig
-from odometry.training.preparation import prepare
 
 SCANS = 14
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
-from mapping.tracking.birds_eye_map import BirdsEyeMap
+from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.trajectory import chain
-from mapping.pose_graph.correction import corrected
+from lidarslam.mapping.pose_graph.correction import corrected
 
 FAR = exp([0.2, -0.3, 2.0, 5e5, -3e5, 100.0])
 

@@ -26,6 +26,11 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, ro
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import Sweep
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.motion.route_motion import motion_along_route
@@ -35,11 +40,6 @@ from lidarslam.simulation.sensors.sensor import Sensor
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.world import World
 from lidarslam.simulation.worlds.registry import build_world
-from mapping.config import MappingConfig
-from mapping.deskew import Sweep
-from mapping.prediction import Prior
-from mapping.surfel_mapper import SurfelMapper
-from mapping.tracking.mapped_scan import MappedScan
 
 AT = 70
 COUNT = 100
@@ -56,7 +56,7 @@ def light(name: str = "vlp-16") -> Sensor:
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 5)
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 5)
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,10 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.tracking import Status
-from mapping.config import TrackingConfig
-from mapping.surfels.surfel_map import SurfelMap
-from mapping.tracking.attempts import measure_fit
-from mapping.tracking.fit import Fit, directional_support
+from lidarslam.mapping.config import TrackingConfig
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.attempts import measure_fit
+from lidarslam.mapping.tracking.fit import Fit, directional_support
 
 CONFIG = TrackingConfig()
 HALF = np.array([7.0, 5.0, 2.0])

@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp
-from mapping.loops.closure import RelativePose
-from mapping.pose_graph.g2o import format_g2o
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.g2o import format_g2o
 
 
 def random_covariance(rng: np.random.Generator) -> FloatArray:

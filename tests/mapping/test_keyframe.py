@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from mapping.config import KeyframeConfig
-from mapping.pose_graph import keyframes
-from mapping.pose_graph.keyframes import KeyframeSelector
+from lidarslam.mapping.config import KeyframeConfig
+from lidarslam.mapping.pose_graph import keyframes
+from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 
 
 @pytest.fixture

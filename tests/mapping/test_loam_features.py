@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from mapping.loam.feature_kernels import EDGE, PLANE, classify, write_curvatures
-from mapping.loam.features import extract_features
-from mapping.loam.rings import ring_order
+from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE, classify, write_curvatures
+from lidarslam.mapping.loam.features import extract_features
+from lidarslam.mapping.loam.rings import ring_order
 
 Scanner = Callable[..., Scan]
 FINE_M = 0.001  # voxels of single points

@@ -13,10 +13,10 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from mapping.config import MappingConfig, TrackingConfig
-from mapping.loam.mapper import LoamMapper
-from mapping.prediction import Prior
-from mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.config import MappingConfig, TrackingConfig
+from lidarslam.mapping.loam.mapper import LoamMapper
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 Path = Callable[[FloatArray], FloatArray]
 ThroughDisk = Callable[[State], Saved]
@@ -255,7 +255,7 @@ def test_a_covered_sensor_begins_no_new_map(
 def test_a_scan_in_between_counts_the_lost_ones_anew(
     settled: LoamMapper, ring_scans: list[Scan], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mapping.loam.mapper.GIVE_UP_AFTER", 3)
+    monkeypatch.setattr("lidarslam.mapping.loam.mapper.GIVE_UP_AFTER", 3)
     for _ in range(2):
         for _ in range(2):
             assert "new map" not in settled.process(elsewhere(ring_scans[4]), Prior(np.eye(4), VELOCITY)).message
@@ -320,7 +320,7 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
 
 def test_a_mapper_goes_on(ring_scans: list[Scan], through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch) -> None:
     """Among the scans are two of another place, so that the map is begun anew, and an empty one."""
-    monkeypatch.setattr("mapping.loam.mapper.GIVE_UP_AFTER", 2)
+    monkeypatch.setattr("lidarslam.mapping.loam.mapper.GIVE_UP_AFTER", 2)
     scans = [scan.select(np.flatnonzero(scan.rings % 2)) for scan in ring_scans[:10] if scan.rings is not None]
     scans[4:6] = [elsewhere(scan) for scan in scans[4:6]]
     scans[7] = empty(scans[7].stamp)

@@ -7,11 +7,11 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.core.trajectory import chain
-from mapping.config import LoopConfig
-from mapping.loops import candidates, detection
-from mapping.loops.candidates import KeyframeDatabase
-from mapping.loops.closure import LoopClosure
-from mapping.loops.detection import LoopDetector
+from lidarslam.mapping.config import LoopConfig
+from lidarslam.mapping.loops import candidates, detection
+from lidarslam.mapping.loops.candidates import KeyframeDatabase
+from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.mapping.loops.detection import LoopDetector
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
-from mapping.loops import refinement
-from mapping.loops.closure import LoopClosure
-from mapping.loops.refinement import DenseSubmap
+from lidarslam.mapping.loops import refinement
+from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.mapping.loops.refinement import DenseSubmap
 
 T_TARGET_SOURCE = exp([0.01, -0.02, 0.6, 3.0, -1.5, 0.1])
 OFF = exp([0.004, -0.003, 0.006, 0.05, -0.04, 0.03])

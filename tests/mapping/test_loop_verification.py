@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle, transform_points
-from mapping.config import LoopConfig
-from mapping.loops.registration import Correspondences, SubmapCloud
-from mapping.loops.sparse_submap import SparseSubmap
-from mapping.loops.verification import evaluate, verify
+from lidarslam.mapping.config import LoopConfig
+from lidarslam.mapping.loops.registration import Correspondences, SubmapCloud
+from lidarslam.mapping.loops.sparse_submap import SparseSubmap
+from lidarslam.mapping.loops.verification import evaluate, verify
 
 MIN_OVERLAP = LoopConfig().min_overlap
 # Centre and half sizes; the sensor stands inside.

@@ -7,8 +7,8 @@ import open3d as o3d
 import pytest
 
 from lidarslam.core.errors import OutputError
-from mapping.global_map.global_map import PointCloud
-from mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
 
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd"])

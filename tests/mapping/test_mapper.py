@@ -11,10 +11,10 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from mapping.config import MappingConfig, TrackingConfig
-from mapping.prediction import Prior
-from mapping.surfel_mapper import SurfelMapper
-from mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.config import MappingConfig, TrackingConfig
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 Path = Callable[[FloatArray], FloatArray]
 VELOCITY = np.array([0.0, 0.01, 0.3, 0.8, 0.05, 0.0])  # of the drive
@@ -276,7 +276,7 @@ def test_turned_on_the_spot_it_finds_its_way_back(
 
 
 def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans: list[Scan], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 3)
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 3)
     mapper = SurfelMapper(MappingConfig())
     process(mapper, rest_scans[:10])
     stamps = rest_scans[9].stamp + 0.1 * np.arange(1, 4)
@@ -289,7 +289,7 @@ def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(
     rest_scans: list[Scan], rest_truth: Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two covered scans, then the room again, which fits the new map and not what came between."""
-    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 1)
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 1)
     mapper = SurfelMapper(MappingConfig())
     process(mapper, [garbage(0.0)])
     restarted = mapper.process(rest_scans[0], NOTHING)
@@ -304,7 +304,7 @@ def test_in_the_new_map_it_goes_on_from_where_the_old_one_ended(
 def test_scans_of_nothing_never_begin_a_new_map(
     rest_scans: list[Scan], rest_truth: Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
     mapper = SurfelMapper(MappingConfig())
     process(mapper, rest_scans[:10])
     held = size(mapper)

@@ -10,13 +10,13 @@ from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.tracking import Status
-from mapping.config import KeyframeConfig, MappingConfig
-from mapping.global_map import global_map
-from mapping.global_map.global_map import GlobalMap
-from mapping.pose_graph.keyframes import KeyframeSelector
-from mapping.prediction import OdometryNoise, Prior, ProcessNoise
-from mapping.surfel_mapper import SurfelMapper
-from mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.config import KeyframeConfig, MappingConfig
+from lidarslam.mapping.global_map import global_map
+from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
+from lidarslam.mapping.prediction import OdometryNoise, Prior, ProcessNoise
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 ThroughDisk = Callable[[State], Saved]
 CONFIG = MappingConfig(keypoints=600)
@@ -24,7 +24,7 @@ CONFIG = MappingConfig(keypoints=600)
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
+    monkeypatch.setattr("lidarslam.mapping.tracking.tracking_state.GIVE_UP_AFTER", 2)
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +67,9 @@ def test_a_map_that_has_forgotten_goes_on(
     rng: np.random.Generator, through_disk: ThroughDisk, monkeypatch: pytest.MonkeyPatch, tidied_after: int
 ) -> None:
     """Rows of cells are in the order in which they came, also after some were dropped."""
-    from mapping.surfels.surfel_map import SurfelMap
+    from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
-    monkeypatch.setattr("mapping.surfels.surfel_map._TIDIED_AFTER", tidied_after)
+    monkeypatch.setattr("lidarslam.mapping.surfels.surfel_map._TIDIED_AFTER", tidied_after)
 
     def add(local_map: SurfelMap, step: int, seed: int) -> None:
         points = np.random.default_rng(seed).uniform(-4.0, 4.0, (3000, 3)) + np.array([2.0 * step, 0.0, 0.0])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
-from mapping.loops.bird_eye_view import BirdEyeView, align, compare
-from mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, _level_rotation
+from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
+from lidarslam.mapping.loops.sparse_submap import LINE, PLANE, SparseSubmap, _level_rotation
 
 RADIUS_M = 16.0
 UPSIDE_DOWN = exp([np.pi, 0, 0, 0, 0, 0])

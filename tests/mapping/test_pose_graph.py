@@ -9,9 +9,9 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import chain
-from mapping.loops.closure import RelativePose
-from mapping.pose_graph.edges import first_connected
-from mapping.pose_graph.optimizer import _LEAST, bounded, optimise, relax
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.edges import first_connected
+from lidarslam.mapping.pose_graph.optimizer import _LEAST, bounded, optimise, relax
 
 LOOSE = np.diag([0.02, 0.01, 0.03, 0.3, 0.2, 0.1]) ** 2
 TIGHT = np.diag([0.002, 0.001, 0.003, 0.03, 0.02, 0.01]) ** 2

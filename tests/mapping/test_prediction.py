@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
-from mapping.config import MappingConfig
-from mapping.prediction import LEAST_SIGMA, MotionState, OdometryNoise, Prediction, Prior, ProcessNoise, predict
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.prediction import (
+    LEAST_SIGMA,
+    MotionState,
+    OdometryNoise,
+    Prediction,
+    Prior,
+    ProcessNoise,
+    predict,
+)
 
 VELOCITY = np.array([0.1, -0.2, 0.5, 2.0, 0.3, -0.1])  # rad/s, m/s
 MOVED = exp(0.1 * VELOCITY)

@@ -5,8 +5,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from mapping.config import MappingConfig
-from mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
 
 
 def shell(rng: np.random.Generator, radius_m: float, count: int = 20_000, stamp: float = 0.0) -> Scan:

@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from lidarslam.core.state import Saved, State
-from mapping.config import PoseGraphConfig
-from mapping.loops.closure import LoopClosure, RelativePose
-from mapping.pose_graph import slam_graph
-from mapping.pose_graph.correction import Corrected
-from mapping.pose_graph.graph_scan import GraphScan
-from mapping.pose_graph.optimizer import Optimised, optimise
-from mapping.pose_graph.slam_graph import SlamGraph
+from lidarslam.mapping.config import PoseGraphConfig
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.pose_graph import slam_graph
+from lidarslam.mapping.pose_graph.correction import Corrected
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise
+from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 VOXEL_M = 0.1
 CONFIG = PoseGraphConfig(enabled=True)

@@ -8,8 +8,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.state import Saved, State
-from mapping.slides.scan_surfels import Surfels, shift_profile
-from mapping.slides.slides import Contradiction, SlideCheck, find_contradictions
+from lidarslam.mapping.slides.scan_surfels import Surfels, shift_profile
+from lidarslam.mapping.slides.slides import Contradiction, SlideCheck, find_contradictions
 
 # A street of 120 m with buildings, parked vans and posts, driven through at 8 m/s.
 SCANS, STEP_M = 40, 0.8

@@ -6,16 +6,16 @@ import pytest
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.deskew import move
+from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import build_world
-from mapping.config import MappingConfig
-from mapping.deskew import move
-from mapping.prediction import Prior
-from mapping.surfel_mapper import SurfelMapper
-from mapping.tracking.mapped_scan import MappedScan
 
 COUNT = 12
 # What an odometry states of itself: a tenth of a degree and a centimetre.

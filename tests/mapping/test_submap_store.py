@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import exp
-from mapping.global_map.global_map import GlobalMap
-from mapping.pose_graph.submap_store import SubmapStore
+from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 
 
 def test_submaps_come_back_in_any_order(rng: np.random.Generator, tmp_path: Path) -> None:

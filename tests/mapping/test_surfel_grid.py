@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.grid import COUNT, DIRECTION, ELEVATION_SPREAD, IS_PLANE, MEAN, NORMAL, SPREADS, SurfelGrid
-from mapping.surfels.voxel_hash import ABSENT
+from lidarslam.mapping.surfels.grid import (
+    COUNT,
+    DIRECTION,
+    ELEVATION_SPREAD,
+    IS_PLANE,
+    MEAN,
+    NORMAL,
+    SPREADS,
+    SurfelGrid,
+)
+from lidarslam.mapping.surfels.voxel_hash import ABSENT
 
 CELL = 0.5
 

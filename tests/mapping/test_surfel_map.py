@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.state import Saved
-from mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
+from lidarslam.mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
 
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])
@@ -225,9 +225,9 @@ def test_without_a_floor_the_vertical_is_the_worlds(rng: np.random.Generator) ->
 def test_the_map_is_tidied_now_and_then_also_when_it_was_restored(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
-    monkeypatch.setattr("mapping.surfels.surfel_map._TIDIED_AFTER", 3)
+    monkeypatch.setattr("lidarslam.mapping.surfels.surfel_map._TIDIED_AFTER", 3)
     tidied: list[float] = []
-    monkeypatch.setattr("mapping.surfels.grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
+    monkeypatch.setattr("lidarslam.mapping.surfels.grid.SurfelGrid.tidy", lambda grid: tidied.append(grid.cell_m))
 
     def add(local_map: SurfelMap) -> int:
         tidied.clear()

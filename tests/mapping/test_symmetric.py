@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray
-from mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 
 
 def eigenvalues(M: FloatArray) -> FloatArray:

@@ -7,10 +7,10 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state import Saved
-from mapping.surfels.cell_kernels import OTHER_SIDE
-from mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
-from mapping.surfels.surfel_map import SurfelMap
-from mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
+from lidarslam.mapping.surfels.cell_kernels import OTHER_SIDE
+from lidarslam.mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
 
 CELL = 0.5
 NOISE_M = 0.005

@@ -3,7 +3,7 @@
 import pytest
 
 from lidarslam.core.tracking import Status
-from mapping.tracking.tracking_state import TrackingState
+from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 
 def test_it_is_not_surprised_by_the_next_scan_but_by_one_after_a_gap() -> None:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps, point_keys
+from lidarslam.mapping.surfels.voxel_hash import ABSENT, VoxelHash, cell_keys, key_cells, key_steps, point_keys
 
 Cell = tuple[int, int, int]
 near = st.integers(-3, 3)

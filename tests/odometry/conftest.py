@@ -9,8 +9,8 @@ import torch
 
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
-from odometry.images.sweep_images import SweepImages
-from odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.images.sweep_images import SweepImages
+from lidarslam.odometry.training.preparation import PreparedRecording
 
 _LOW, _HIGH = np.deg2rad(-18.0), np.deg2rad(18.0)
 

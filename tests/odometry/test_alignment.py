@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment import alignment as module
-from odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align, align_each
-from odometry.alignment.point_to_plane import FINE_M
-from odometry.alignment.sweep_motion import SweepMotion, SweepPair
-from odometry.images.sweep_images import SweepImages
+from lidarslam.odometry.alignment import alignment as module
+from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align, align_each
+from lidarslam.odometry.alignment.point_to_plane import FINE_M
+from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
+from lidarslam.odometry.images.sweep_images import SweepImages
 
 FINE, NO_STEP = Effort(column_step=2), Effort(iterations=0, column_step=2)
 INTERVAL_S = 0.1

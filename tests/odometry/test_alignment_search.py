@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment import search
-from odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align
-from odometry.alignment.search import DOUBTFUL, align_best, try_instead
-from odometry.alignment.sweep_motion import SweepPair
-from odometry.images.sweep_images import SweepImages
+from lidarslam.odometry.alignment import search
+from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate, align
+from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
+from lidarslam.odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.images.sweep_images import SweepImages
 
 FINE = Effort(column_step=2)
 TWIST = (0.0, 0.0, 0.0, 14.0, 0.0, 0.0)  # rad/s, m/s: 1.4 m from sweep to sweep

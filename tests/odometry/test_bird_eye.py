@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from odometry.images.bird_eye import CELL_M, CELLS, CHANNELS, MOST_CELLS, bird_eye
+from lidarslam.odometry.images.bird_eye import CELL_M, CELLS, CHANNELS, MOST_CELLS, bird_eye
 
 MIDDLE = CELLS // 2
 

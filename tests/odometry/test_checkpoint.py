@@ -11,13 +11,19 @@ import torch
 from safetensors.torch import save_file
 
 from lidarslam.core.errors import ConfigError, InputError, OutputError
-from odometry.config import ImageConfig, NetworkConfig
-from odometry.network import checkpoint as module
-from odometry.network import shipped
-from odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of, save_checkpoint
-from odometry.network.networks import make_network
-from odometry.network.shipped import default_weights, shipped_folder
-from odometry.network.tensor_file import Kind, write_tensor_file
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network import checkpoint as module
+from lidarslam.odometry.network import shipped
+from lidarslam.odometry.network.checkpoint import (
+    Checkpoint,
+    checkpoint_of,
+    load_checkpoint,
+    network_of,
+    save_checkpoint,
+)
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.shipped import default_weights, shipped_folder
+from lidarslam.odometry.network.tensor_file import Kind, write_tensor_file
 
 IMAGES = ImageConfig(rows=16, columns=96)
 

@@ -7,8 +7,8 @@ from lidarslam.core.geometry import exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from mapping.deskew import body_velocity, deskew
-from odometry.methods.consistency import Consistency, ConsistencyCheck, plane_distances
+from lidarslam.mapping.deskew import body_velocity, deskew
+from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck, plane_distances
 
 
 @pytest.fixture

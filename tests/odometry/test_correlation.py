@@ -7,19 +7,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.config import NetworkConfig
-from odometry.images import bird_eye
-from odometry.images.bird_eye import SHIFTS
-from odometry.network.correlation import INPUT_CHANNELS, CorrelationNetwork, column_channels
-from odometry.network.networks import make_network
-from odometry.network.pair_network import PairImages
-from odometry.network.torch_geometry import inverse, log
-from odometry.training.augmentation import PairBatch
-from odometry.training.config import TrainingConfig
-from odometry.training.objective import objective
-from odometry.training.pairs import birds, pair_of
-from odometry.training.torch_images import rotate_columns
-from odometry.training.training import loss_of
+from lidarslam.odometry.config import NetworkConfig
+from lidarslam.odometry.images import bird_eye
+from lidarslam.odometry.images.bird_eye import SHIFTS
+from lidarslam.odometry.network.correlation import INPUT_CHANNELS, CorrelationNetwork, column_channels
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.pair_network import PairImages
+from lidarslam.odometry.network.torch_geometry import inverse, log
+from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.objective import objective
+from lidarslam.odometry.training.pairs import birds, pair_of
+from lidarslam.odometry.training.torch_images import rotate_columns
+from lidarslam.odometry.training.training import loss_of
 
 COLUMNS = 96
 FEATURE_COLUMNS = COLUMNS // 4

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from odometry.training import correspondence
-from odometry.training.correspondence import nearest
+from lidarslam.odometry.training import correspondence
+from lidarslam.odometry.training.correspondence import nearest
 
 
 @pytest.fixture(params=["k-d tree", "all distances"])

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.network.delora import DeloraNetwork
-from odometry.network.pair_network import PairImages
+from lidarslam.odometry.network.delora import DeloraNetwork
+from lidarslam.odometry.network.pair_network import PairImages
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,14 @@ import torch
 from torch.nn import functional
 
 from lidarslam.core.errors import ConfigError, InputError
-from odometry.config import ImageConfig, NetworkConfig
-from odometry.network.candidates import CorrelationSearch
-from odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of
-from odometry.network.export import export_onnx
-from odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, onnx_search, read_exported
-from odometry.network.networks import make_network
-from odometry.network.shipped import default_weights, shipped_folder
-from odometry.network.torch_graphs import torch_search
+from lidarslam.odometry.config import ImageConfig, NetworkConfig
+from lidarslam.odometry.network.candidates import CorrelationSearch
+from lidarslam.odometry.network.checkpoint import Checkpoint, checkpoint_of, load_checkpoint, network_of
+from lidarslam.odometry.network.export import export_onnx
+from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PEAKS, TURNS, onnx_search, read_exported
+from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.shipped import default_weights, shipped_folder
+from lidarslam.odometry.network.torch_graphs import torch_search
 
 SHAPE = (16, 96)
 # Sums in another order differ in the last digits of float32.
@@ -101,8 +101,8 @@ def test_missing_packages_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_inference_imports_no_torch() -> None:
     code = (
         "import sys\n"
-        "from odometry.config import OdometryConfig\n"
-        "from odometry.registry import make_odometry\n"
+        "from lidarslam.odometry.config import OdometryConfig\n"
+        "from lidarslam.odometry.registry import make_odometry\n"
         "make_odometry(OdometryConfig(method='learned'))\n"
         "assert 'torch' not in sys.modules\n"
     )

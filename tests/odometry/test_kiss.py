@@ -14,8 +14,8 @@ from kiss_icp.kiss_icp import KissICP
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
-from odometry.config import KissConfig
-from odometry.methods.kiss import KissOdometry
+from lidarslam.odometry.config import KissConfig
+from lidarslam.odometry.methods.kiss import KissOdometry
 
 # Small enough for the room to have structure at KISS-ICP's resolution.
 INDOOR = KissConfig(voxel_size_m=0.2, max_range_m=30.0)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.core.scan import Scan
-from odometry.alignment import search
-from odometry.config import ImageConfig, LearnedConfig, OdometryConfig
-from odometry.interface import Motion
-from odometry.methods import learned
-from odometry.methods.learned import LearnedOdometry
-from odometry.network.candidates import Candidate, Described
-from odometry.registry import make_odometry
+from lidarslam.odometry.alignment import search
+from lidarslam.odometry.config import ImageConfig, LearnedConfig, OdometryConfig
+from lidarslam.odometry.interface import Motion
+from lidarslam.odometry.methods import learned
+from lidarslam.odometry.methods.learned import LearnedOdometry
+from lidarslam.odometry.network.candidates import Candidate, Described
+from lidarslam.odometry.registry import make_odometry
 
 Floats = NDArray[np.float32]
 

@@ -7,9 +7,9 @@ from pydantic import ValidationError
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from odometry.network.torch_geometry import inverse, log, rotate, skew, transform_points
-from odometry.training.config import LossConfig
-from odometry.training.losses import Surfaces, geometric_loss
+from lidarslam.odometry.network.torch_geometry import inverse, log, rotate, skew, transform_points
+from lidarslam.odometry.training.config import LossConfig
+from lidarslam.odometry.training.losses import Surfaces, geometric_loss
 
 EYE = torch.eye(4, dtype=torch.float64)[None]
 XI = torch.tensor([0.03, -0.04, 0.05, 0.12, -0.1, 0.08], dtype=torch.float64)

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.images.normals import FINE_PATCHES, PATCHES, Patch
-from odometry.images.normals import surface_normals as normals_of
+from lidarslam.odometry.images.normals import FINE_PATCHES, PATCHES, Patch
+from lidarslam.odometry.images.normals import surface_normals as normals_of
 
 CONFIG = PATCHES
 FIRST_TRY = PATCHES[:1]

@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.network.pair_network import Estimate
-from odometry.network.torch_geometry import inverse, skew
-from odometry.training import objective as module
-from odometry.training.augmentation import PairBatch
-from odometry.training.config import TrainingConfig
-from odometry.training.objective import Objective, motion_error, objective
-from odometry.training.pairs import pair_of
+from lidarslam.odometry.network.pair_network import Estimate
+from lidarslam.odometry.network.torch_geometry import inverse, skew
+from lidarslam.odometry.training import objective as module
+from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.objective import Objective, motion_error, objective
+from lidarslam.odometry.training.pairs import pair_of
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 WIDTH = 24

@@ -9,11 +9,11 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Saved, State
 from lidarslam.core.trajectory import Trajectory
-from odometry.config import OdometryConfig
-from odometry.interface import Motion, Odometry
-from odometry.methods.consistency import ConsistencyCheck
-from odometry.methods.external import ExternalOdometry
-from odometry.registry import make_odometry
+from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.interface import Motion, Odometry
+from lidarslam.odometry.methods.consistency import ConsistencyCheck
+from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.odometry.registry import make_odometry
 
 ThroughDisk = Callable[[State], Saved]
 EMPTY, GARBAGE = 3, 5

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.network.torch_geometry import inverse, log, rotate, skew, transform_points
-from odometry.training.augmentation import Augmentation, PairBatch, augmented
-from odometry.training.pairs import Pairs, pair_of
-from odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.network.torch_geometry import inverse, log, rotate, skew, transform_points
+from lidarslam.odometry.training.augmentation import Augmentation, PairBatch, augmented
+from lidarslam.odometry.training.pairs import Pairs, pair_of
+from lidarslam.odometry.training.preparation import PreparedRecording
 
 TWIST = (0.1, -0.1, 0.8, 2.0, 0.6, 0.2)
 NONE = Augmentation(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from odometry.alignment.point_to_plane import FINE_M, PointToPlane
-from odometry.alignment.residuals import Motion
-from odometry.alignment.sweep_motion import SweepPair
-from odometry.images.projection import ImageGrid
+from lidarslam.odometry.alignment.point_to_plane import FINE_M, PointToPlane
+from lidarslam.odometry.alignment.residuals import Motion
+from lidarslam.odometry.alignment.sweep_motion import SweepPair
+from lidarslam.odometry.images.projection import ImageGrid
 
 STEP, FILL, GATE_M, GATE_PER_M, LEAST_COSINE = 2, 4, 0.2, 0.04, 0.8
 TWIST = (0.1, -0.05, 0.6, 1.0, 0.3, 0.1)

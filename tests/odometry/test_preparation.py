@@ -8,9 +8,9 @@ import torch
 
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
-from odometry.config import ImageConfig
-from odometry.network.torch_geometry import inverse, log
-from odometry.training.preparation import prepare
+from lidarslam.odometry.config import ImageConfig
+from lidarslam.odometry.network.torch_geometry import inverse, log
+from lidarslam.odometry.training.preparation import prepare
 
 CONFIG = ImageConfig(rows=16, columns=360)
 SLOW = (0.05, -0.05, 0.1, 1.0, 0.3, 0.1)

@@ -7,10 +7,10 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from odometry.config import OdometryConfig
-from odometry.methods.constant_velocity import ConstantVelocity
-from odometry.methods.external import ExternalOdometry
-from odometry.registry import make_odometry
+from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
+from lidarslam.odometry.methods.external import ExternalOdometry
+from lidarslam.odometry.registry import make_odometry
 
 VELOCITY = np.array([0.1, -0.2, 1.5, 2.0, 0.3, -0.1])
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from odometry.images import projection
-from odometry.images.projection import ImageGrid
-from odometry.training.torch_images import mirror, rotate_columns
+from lidarslam.odometry.images import projection
+from lidarslam.odometry.images.projection import ImageGrid
+from lidarslam.odometry.training.torch_images import mirror, rotate_columns
 
 GRID = ImageGrid(16, 90, math.radians(-15.0), math.radians(15.0))
 

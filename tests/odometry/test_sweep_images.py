@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.scan import Scan
-from odometry.config import ImageConfig
-from odometry.images.sweep_images import Imager, SweepImages
+from lidarslam.odometry.config import ImageConfig
+from lidarslam.odometry.images.sweep_images import Imager, SweepImages
 
 CONFIG = ImageConfig(rows=16, columns=360)
 TWIST = (0.0, 0.0, 0.5, 1.0, 0.0, 0.0)
@@ -128,7 +128,7 @@ def test_points_that_lie_in_no_rows_are_shown_to_alignment_as_to_the_network(azi
 def test_more_rows_for_alignment_leave_the_images_of_the_network_as_they_are(box_room, monkeypatch):
     (scan,) = replace(box_room, rows=64, columns=720).scans(1, TWIST)
     both = Imager(CONFIG).images(scan)
-    monkeypatch.setattr("odometry.images.sweep_images.rows_of_sensor", lambda *_: CONFIG.rows)
+    monkeypatch.setattr("lidarslam.odometry.images.sweep_images.rows_of_sensor", lambda *_: CONFIG.rows)
     alone = Imager(CONFIG).images(scan)
     assert both.alignment.points.shape == (3, 64, 360)
     for name in ("points", "normals", "offsets"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from odometry.alignment.sweep_motion import StampInterpolator
+from lidarslam.odometry.alignment.sweep_motion import StampInterpolator
 
 AXIS = np.array([0.2, -0.1, 0.9, 3.0, 0.5, -0.2])  # a screw: along it poses of different times commute
 

@@ -4,7 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core import geometry
-from odometry.network import torch_geometry as tg
+from lidarslam.odometry.network import torch_geometry as tg
 
 ANGLES = (0.0, 1e-9, 1e-5, 1e-3, 0.0999, 0.1001, 0.4999, 0.5001, 1.0, 2.0, 3.0, 3.1415)
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from odometry.network.correlation import CorrelationNetwork
-from odometry.network.pair_network import Estimate, PairImages
-from odometry.network.torch_geometry import skew
-from odometry.training.augmentation import PairBatch
-from odometry.training.config import TrainingConfig
-from odometry.training.pairs import birds, pair_of
-from odometry.training.preparation import PreparedRecording
-from odometry.training.training import learning_rate, loss_of, make_optimizer, summarise, validate
+from lidarslam.odometry.network.correlation import CorrelationNetwork
+from lidarslam.odometry.network.pair_network import Estimate, PairImages
+from lidarslam.odometry.network.torch_geometry import skew
+from lidarslam.odometry.training.augmentation import PairBatch
+from lidarslam.odometry.training.config import TrainingConfig
+from lidarslam.odometry.training.pairs import birds, pair_of
+from lidarslam.odometry.training.preparation import PreparedRecording
+from lidarslam.odometry.training.training import learning_rate, loss_of, make_optimizer, summarise, validate
 
 TWIST = (0.0, 0.0, 0.8, 2.0, 0.6, 0.2)
 SCHEDULE = TrainingConfig(learning_rate=1e-3, warmup_steps=10, steps=110)

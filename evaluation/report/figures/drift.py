@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from evaluation.comparison.comparison import SequenceComparison
-from evaluation.report.figures.errors import measured_methods, needs_log
-from evaluation.report.figures.figure import Figure, Panel, Styles, line_trace
-from evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
+from lidarslam.evaluation.comparison.comparison import SequenceComparison
+from lidarslam.evaluation.report.figures.errors import measured_methods, needs_log
+from lidarslam.evaluation.report.figures.figure import Figure, Panel, Styles, line_trace
+from lidarslam.evaluation.trajectory.drift import KITTI_LENGTHS_M, SHORT_LENGTHS_M, Drift
 
 _LENGTH = "segment length [m]"
 Parts = Sequence[tuple[str, Mapping[int, Drift | None]]]

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.comparison.comparison import MethodResult, SequenceComparison
-from evaluation.report.figures.figure import Figure, Panel, Styles, line_trace, thin_curve
-from evaluation.trajectory.metrics import TrajectoryMetrics, absolute_errors, deviations
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.report.figures.figure import Figure, Panel, Styles, line_trace, thin_curve
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, absolute_errors, deviations
 
 ALIGNED = {
     "se3": "after SE(3) alignment",

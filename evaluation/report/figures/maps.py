@@ -4,9 +4,9 @@ import numpy as np
 import plotly.graph_objects as go
 from scipy.stats import binned_statistic_2d
 
-from evaluation.comparison.comparison import MapErrors, SequenceComparison
-from evaluation.report.figures.figure import EQUAL_AXES, Figure, Panel, Styles, line_trace, plot_text
 from lidarslam.core.geometry import FloatArray
+from lidarslam.evaluation.comparison.comparison import MapErrors, SequenceComparison
+from lidarslam.evaluation.report.figures.figure import EQUAL_AXES, Figure, Panel, Styles, line_trace, plot_text
 
 _NOMINAL_WIDTH, _LOWEST, _TALLEST = 480.0, 220.0, 480.0
 _MOST_CELLS = 60_000

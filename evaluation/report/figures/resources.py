@@ -3,8 +3,8 @@
 import numpy as np
 import plotly.graph_objects as go
 
-from evaluation.comparison.comparison import SequenceComparison
-from evaluation.report.figures.figure import Figure, Panel, Styles, bar_panel, plot_text
+from lidarslam.evaluation.comparison.comparison import SequenceComparison
+from lidarslam.evaluation.report.figures.figure import Figure, Panel, Styles, bar_panel, plot_text
 
 # A dashed line at the scan period is drawn up to this multiple of the longest bar.
 _PERIOD_IN_REACH = 2.5

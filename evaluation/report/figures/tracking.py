@@ -2,9 +2,9 @@
 
 import plotly.graph_objects as go
 
-from evaluation.comparison.comparison import SequenceComparison
-from evaluation.comparison.lost import lost_intervals
-from evaluation.report.figures.figure import Figure, Panel, Styles, plot_text
+from lidarslam.evaluation.comparison.comparison import SequenceComparison
+from lidarslam.evaluation.comparison.lost import lost_intervals
+from lidarslam.evaluation.report.figures.figure import Figure, Panel, Styles, plot_text
 
 # The shortest interval is still seen.
 _LEAST_SHARE = 0.003

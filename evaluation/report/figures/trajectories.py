@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from evaluation.comparison.comparison import MethodResult, SequenceComparison
-from evaluation.report.figures.errors import ALIGNED
-from evaluation.report.figures.figure import EQUAL_AXES, MOST_POINTS, Figure, Panel, Styles, line_trace, plot_text
-from evaluation.trajectory.alignment import align
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
+from lidarslam.evaluation.report.figures.errors import ALIGNED
+from lidarslam.evaluation.report.figures.figure import (
+    EQUAL_AXES,
+    MOST_POINTS,
+    Figure,
+    Panel,
+    Styles,
+    line_trace,
+    plot_text,
+)
+from lidarslam.evaluation.trajectory.alignment import align
 
 _NOMINAL_WIDTH, _LOWEST, _TALLEST, _SIDE_HEIGHT = 500.0, 240.0, 480.0, 210
 # The view holds every path up to this multiple of the reference's size; beyond, it starts at the reference.

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import Recording
+from lidarslam.mapping.global_map.moved_points import PlacedViews
+from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
 from lidarslam.run.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
 from lidarslam.run.merge.summary import MergedRecording, MergeSummary
@@ -22,11 +24,9 @@ from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
-from mapping.global_map.moved_points import PlacedViews
-from mapping.pose_graph.g2o import format_g2o
 
 if TYPE_CHECKING:
-    from mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 # In the summary of a run; that of the merge says how to mend it.
 _OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
