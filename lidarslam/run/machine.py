@@ -7,7 +7,7 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-_PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "open3d", "torch")
+_PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "onnxruntime", "open3d", "open3d-cpu", "torch")
 
 
 def versions() -> dict[str, str]:
