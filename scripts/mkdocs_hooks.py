@@ -1,12 +1,13 @@
-"""Hooks of mkdocs: mathematics as MathML, and links that leave docs/ lead to the repository; nothing loads at reading."""
+"""Hooks of mkdocs: mathematics becomes MathML, and links that leave docs/ lead to the repository."""
 
 import re
-import tomllib
 from html import unescape
 from pathlib import Path, PurePosixPath
 from posixpath import normpath
 from typing import Any
 
+import tomllib
+import tomllib
 from latex2mathml.converter import convert
 
 REPOSITORY = Path(__file__).parents[1]
@@ -15,7 +16,8 @@ _MATH = re.compile(r'<(?:span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</(?:
 
 
 def _url() -> str:
-    return str(tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"]["Homepage"])
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return str(project["urls"]["Homepage"])
 
 
 def on_config(config: Any) -> Any:
