@@ -7,7 +7,6 @@ from posixpath import normpath
 from typing import Any
 
 import tomllib
-import tomllib
 from latex2mathml.converter import convert
 
 REPOSITORY = Path(__file__).parents[1]
