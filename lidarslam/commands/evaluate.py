@@ -72,9 +72,9 @@ def evaluate(run: Path, **options: Any) -> None:
 
     RUN is a run directory, or a trajectory in TUM or KITTI text.
     """
-    from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
-    from lidarslam.assessment.map_evaluation import MapOptions
-    from lidarslam.assessment.text import format_evaluation
+    from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
+    from lidarslam.compare.assessment.map_evaluation import MapOptions
+    from lidarslam.compare.assessment.text import format_evaluation
 
     given = {name: value for name, value in options.items() if value is not None}
     if given.get("reference") and given["no_reference"]:

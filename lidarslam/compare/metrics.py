@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarslam.assessment.inputs import read_estimate
-from lidarslam.assessment.map_evaluation import evaluate_map
-from lidarslam.assessment.reference_map import ReferenceMap, find_reference_map, load_reference_map
+from lidarslam.compare.assessment.inputs import read_estimate
+from lidarslam.compare.assessment.map_evaluation import evaluate_map
+from lidarslam.compare.assessment.reference_map import ReferenceMap, find_reference_map, load_reference_map
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarslam.assessment.evaluate import EvaluateRequest, evaluate
-from lidarslam.assessment.inputs import read_estimate
-from lidarslam.assessment.map_evaluation import MapOptions, evaluate_map, read_transform
-from lidarslam.assessment.reference_map import find_reference_map, load_reference_map
-from lidarslam.assessment.text import format_evaluation
+from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
+from lidarslam.compare.assessment.inputs import read_estimate
+from lidarslam.compare.assessment.map_evaluation import MapOptions, evaluate_map, read_transform
+from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
+from lidarslam.compare.assessment.text import format_evaluation
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points

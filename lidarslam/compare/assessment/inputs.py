@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from lidarslam.assessment.reference_cloud import read_cloud
+from lidarslam.compare.assessment.reference_cloud import read_cloud
 from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Mapping
 
-from lidarslam.assessment.evaluate import Evaluation
-from lidarslam.assessment.map_evaluation import MapEvaluation
+from lidarslam.compare.assessment.evaluate import Evaluation
+from lidarslam.compare.assessment.map_evaluation import MapEvaluation
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.assessment.inputs import Estimate
-from lidarslam.assessment.reference_map import ReferenceMap
+from lidarslam.compare.assessment.inputs import Estimate
+from lidarslam.compare.assessment.reference_map import ReferenceMap
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse, is_rigid, orthonormalize, transform_points
 from lidarslam.core.trajectory import Trajectory

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lidarslam.assessment.error_cloud import check_error_files, write_errors
-from lidarslam.assessment.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
-from lidarslam.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
-from lidarslam.assessment.reference_map import find_reference_map, load_reference_map
+from lidarslam.compare.assessment.error_cloud import check_error_files, write_errors
+from lidarslam.compare.assessment.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
+from lidarslam.compare.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
+from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidarslam.assessment.reference_cloud import read_cloud
+from lidarslam.compare.assessment.reference_cloud import read_cloud
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
