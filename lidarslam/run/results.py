@@ -106,7 +106,9 @@ def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> Trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
     T_cam_lidar = unless_damaged(
-        lambda: recording and recording.T_cam_lidar, log, f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame"
+        lambda: None if recording is None else recording.T_cam_lidar,
+        log,
+        f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame",
     )
     poses = trajectory.T_world_lidar
     if T_cam_lidar is not None:  # the devkit compares camera poses
