@@ -47,6 +47,9 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> N
 
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
     """
+    from lidarslam.odometry.train_extra import require_train_extra
+
+    require_train_extra("training")
     from lidarslam.train.command import run_train
 
     if not run_train(sources, say, **options):
