@@ -44,7 +44,7 @@ def describe_as_json(source: Path, config: ReaderConfig) -> str:
     try:
         content |= _known(open_recording(source, config).describe())
     except SeveralTopicsError as error:
-        content["topics"] = [asdict(topic) for topic in error.topics]
+        content["topics"] = _topics(error.topics)
         content["topic_choices"] = [topic.name for topic in error.clouds]
         content["notes"] = [_CHOOSE.format(error.clouds[0].name)]
     # ASCII, so that no name can steer a terminal; DEL is the one such character that JSON leaves as it is.
@@ -83,8 +83,12 @@ def _known(info: RecordingInfo) -> dict[str, Any]:
         "ground_truth": None if info.ground_truth is None else str(info.ground_truth),
         "fields": [{"name": field.name, "type": field.type_name} for field in info.fields],
         "notes": list(info.notes),
-        "topics": [asdict(topic) for topic in info.topics],
+        "topics": _topics(info.topics),
     }
+
+
+def _topics(topics: Sequence[Topic]) -> list[dict[str, Any]]:
+    return [{"name": topic.name, "type": topic.message_type, "messages": topic.messages} for topic in topics]
 
 
 def _known_point_time(info: RecordingInfo) -> dict[str, Any] | None:
