@@ -311,7 +311,7 @@ def test_command_misused(option, value, choice, tmp_path):
 def test_help_lists_the_choices_and_an_example():
     done = CliRunner().invoke(main, ["simulate", "--help"])
     assert done.exit_code == 0
-    for name in ("street", "hdl-32e", "legged", "tilted", "rosbag2", "lidarslam simulate --out"):
+    for name in ("street", "hdl-32e", "legged", "tilted", "rosbag2", "lidarslam simulate -o"):
         assert name in done.output
 
 
