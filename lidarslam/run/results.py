@@ -1,8 +1,9 @@
 """The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
 from dataclasses import dataclass
+from typing import Any
 
-from lidarslam.config.settings import dump_yaml
+from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
@@ -14,7 +15,6 @@ from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
@@ -56,16 +56,29 @@ def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMa
 
 
 def write_results(
-    directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None, drawn: DrawnMap
+    directory: RunDirectory,
+    config: Config,
+    described: dict[str, Any],
+    tracked: Tracked,
+    closed: GraphOutcome | None,
+    drawn: DrawnMap,
+    pcd: bool = False,
 ) -> RunOutcome:
-    """Write everything; the poses are final."""
-    config, log = request.config, tracked.log
-    directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
+    """Write everything; the poses are final.
+
+    Args:
+        directory: of the run.
+        config, described: the settings, and what was run, for config.yaml.
+        tracked, closed, drawn: the results.
+        pcd: whether the map is written as .pcd too.
+    """
+    log = tracked.log
+    directory.write_text(files.CONFIG, dump_yaml(config, described))
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))
     directory.write_text(files.SCANS_CSV, log.format_csv())
     metrics = _write_trajectories(directory, tracked)
-    written = write_map(directory, drawn, request.pcd)
+    written = write_map(directory, drawn, pcd)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
@@ -93,7 +106,9 @@ def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> Trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
     T_cam_lidar = unless_damaged(
-        lambda: recording.T_cam_lidar, log, f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame"
+        lambda: None if recording is None else recording.T_cam_lidar,
+        log,
+        f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame",
     )
     poses = trajectory.T_world_lidar
     if T_cam_lidar is not None:  # the devkit compares camera poses

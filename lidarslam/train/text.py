@@ -46,7 +46,7 @@ def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None
     errors = "" if best is None else f", on held-out scans {format_errors(best)}"
     lines = [
         f"{steps:,} steps done; weights written to {weights}{errors}",
-        f"use them:   {as_typed('lidarslam')} run SOURCE --out RUN --odometry learned --weights {weights}",
+        f"use them:   {as_typed('lidarslam')} run SOURCE --weights {weights}",
         f"curves:     {as_typed('tensorboard')} --logdir {out / 'tensorboard'}",
     ]
     if is_interrupted:
