@@ -9,9 +9,11 @@ from lidarslam.commands.options import (
     PATH,
     CommandWithExample,
     config_options,
+    map_options,
     odometry_options,
     reader_options,
     take_config,
+    take_map_formats,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
@@ -20,7 +22,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 @click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
 @click.option("--out", type=PATH, required=True, metavar="DIR", help="Directory of the merged map.")
 @odometry_options
-@click.option("--pcd", is_flag=True, help="Write the maps as map.pcd too.")
+@map_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
 @reader_options
 @config_options
@@ -37,8 +39,8 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
     from lidarslam.run.merge.text import format_merge
     from lidarslam.run.progress import show_progress
 
-    config = take_config(options, *sources)
-    outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
+    config, map_formats = take_config(options, *sources), take_map_formats(options)
+    outcome = execute(MergeRequest(sources, out, config, map_formats, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:
         note(line)

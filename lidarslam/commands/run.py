@@ -11,11 +11,13 @@ from lidarslam.commands.options import (
     SOURCE,
     CommandWithExample,
     config_options,
+    map_options,
     mapping_options,
     odometry_options,
     reader_options,
     scan_options,
     take_config,
+    take_map_formats,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
@@ -42,7 +44,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
     show_default=True,
     help="Save a Rerun recording; spawn opens a window too.",
 )
-@click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@map_options
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @reader_options
@@ -58,8 +60,8 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    config = take_config(options, source)
-    request = RunRequest(source, out, config, **options)
+    config, map_formats = take_config(options, source), take_map_formats(options)
+    request = RunRequest(source, out, config, map_formats=map_formats, **options)
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished already")
         ctx.exit(EXIT_LOST if lost else 0)

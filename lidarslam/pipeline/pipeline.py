@@ -144,7 +144,7 @@ class Pipeline(Stateful):
     def _add_pending(self, next_is_lost: bool) -> None:
         added = self.map.add_pending(next_is_lost)
         if added is not None and self._graph is not None:
-            self._graph_worker.submit(self._graph.draw, *added, self.map.voxel_size_m)
+            self._graph_worker.submit(self._graph.draw, *added)
 
 
 def _ms(start: float, end: float) -> float:
