@@ -16,7 +16,7 @@ class PointAttributes:
 
     intensity: NDArray[np.float32] | None = None  # (N,) on the scale of the recording; NaN where there is none
     rgb: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue; black where there is none
-    ring: NDArray[np.int16] | None = None  # (N,) the laser; -1 where it is unknown
+    ring: NDArray[np.int32] | None = None  # (N,) the laser; -1 where it is unknown
     time: NDArray[np.float64] | None = None  # (N,) seconds, on the clock of the scans' stamps
 
     def __post_init__(self) -> None:

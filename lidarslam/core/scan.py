@@ -63,7 +63,7 @@ class Scan:
         return PointAttributes(
             intensity=self.intensities if "intensity" in wanted else None,
             rgb=self.colours if "rgb" in wanted else None,
-            ring=self.rings.astype(np.int16) if "ring" in wanted and self.rings is not None else None,
+            ring=self.rings if "ring" in wanted else None,
             time=self.stamp + offsets if {"ring", "time"} & set(wanted) else None,
         )
 

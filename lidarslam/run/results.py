@@ -8,9 +8,9 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
-from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.config import GlobalMapConfig, MapFormat
 from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
-from lidarslam.mapping.global_map.map_io import MapFormat, write_cloud
+from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions

@@ -93,7 +93,7 @@ def load_map(path: Path) -> PointCloud:
     except ValueError as error:
         raise InputError(f"{file}: not a readable point cloud: {error}") from None
     normals = _normals(table)
-    usable = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
+    usable = np.asarray(np.isfinite(np.hstack([points, normals])).all(axis=1))
     if not usable.any():
         raise InputError(f"{file}: not a readable point cloud; no point is finite")
     return PointCloud(points[usable], normals[usable], _attributes(table).select(usable))
@@ -113,7 +113,7 @@ def _attributes(table: NDArray[np.void]) -> PointAttributes:
     return PointAttributes(
         intensity=read_intensities(table, names),
         rgb=read_colours(table, names),
-        ring=table["ring"].astype(np.int16) if "ring" in names else None,
+        ring=table["ring"].astype(np.int32) if "ring" in names else None,
         time=table["time"].astype(np.float64) if "time" in names else None,
     )
 

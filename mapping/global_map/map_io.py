@@ -17,7 +17,7 @@ from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.survey_formats import write_e57, write_laz
 
 _POINTS_AT_A_TIME = 1_000_000
-_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
 def require_format(name: MapFormat) -> None:

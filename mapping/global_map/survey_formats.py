@@ -27,7 +27,7 @@ def write_laz(path: Path, cloud: PointCloud) -> None:
     header.offsets = np.round(0.5 * (cloud.points.min(axis=0) + cloud.points.max(axis=0)))
     header.add_extra_dims([laspy.ExtraBytesParams(name, "float32") for name in _LAZ_NORMALS])
     if known.ring is not None:
-        header.add_extra_dim(laspy.ExtraBytesParams("ring", "int16"))
+        header.add_extra_dim(laspy.ExtraBytesParams("ring", "int32"))
     columns = dict(zip("xyz", cloud.points.T, strict=True)) | dict(zip(_LAZ_NORMALS, cloud.normals.T, strict=True))
     columns |= dict.fromkeys(("return_number", "number_of_returns"), np.ones(len(cloud), dtype=np.uint8))
     if known.intensity is not None:
@@ -56,6 +56,7 @@ def write_e57(path: Path, cloud: PointCloud) -> None:
     known = cloud.attributes
     axes = ("cartesianX", "cartesianY", "cartesianZ")
     data = {axis: np.ascontiguousarray(values) for axis, values in zip(axes, cloud.points.T, strict=True)}
+    data["cartesianInvalidState"] = np.zeros(len(cloud), dtype=np.int8)  # without it pye57's own read_scan fails
     if known.intensity is not None:
         data["intensity"] = np.nan_to_num(known.intensity)
     if known.rgb is not None:

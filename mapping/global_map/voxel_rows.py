@@ -83,7 +83,7 @@ class Layout:
     def attributes(self, rows: Rows) -> PointAttributes:
         """Means of intensity and colour, ring and time of the earliest point; rings as far as one is known."""
         intensity, rgb, first = self.parts(rows)
-        ring = first[:, 2].astype(np.int16) if self.first else None
+        ring = first[:, 2].astype(np.int32) if self.first else None
         return PointAttributes(
             intensity=_means(intensity, unknown=np.nan)[:, 0] if self.intensity else None,
             rgb=np.round(_means(rgb, unknown=0.0)).astype(np.uint8) if self.rgb else None,

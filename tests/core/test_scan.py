@@ -107,3 +107,32 @@ def test_select_keeps_everything_in_step(chosen):
     assert part.rings.tolist() == [0, 3]
     assert (part.stamp, part.dropped) == (3.0, 1)
     assert Scan(np.ones((4, 3)), 0.0).select(chosen).rings is None
+
+
+def test_intensities_and_colours_go_with_their_points():
+    points = np.array([[1, 2, 3], [0, 0, 0], [4, 5, 6], [7, 8, 9]])
+    colours = np.arange(12).reshape(4, 3)
+    scan = Scan.from_raw(points, 1.0, intensities=np.array([0, 65535, 7, 300], dtype=np.uint16), colours=colours)
+    assert scan.intensities.dtype == np.float32
+    assert scan.intensities.tolist() == [0.0, 7.0, 300.0]
+    assert scan.colours.tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
+    part = scan.select(np.array([2, 0]))
+    assert part.intensities.tolist() == [300.0, 0.0]
+    assert part.colours.tolist() == [[9, 10, 11], [0, 1, 2]]
+    for name, value in (("intensities", np.zeros(3)), ("colours", np.zeros((3, 3))), ("colours", np.zeros((3, 4)))):
+        with pytest.raises(ValueError, match=name):
+            Scan.from_raw(points, 1.0, **{name: value})
+        with pytest.raises(ValueError, match=rf"Scan\.{name} must be"):
+            dataclasses.replace(scan, **{name: value[:-1]})
+
+
+def test_attributes_are_those_that_are_wanted_and_there():
+    scan = Scan.from_raw(np.ones((3, 3)), 5.0, [0.0, 0.1, 0.2], [4, 5, 6], intensities=[1, 2, 3])
+    known = scan.attributes(["intensity", "rgb", "ring", "time"])
+    assert known.intensity.tolist() == [1.0, 2.0, 3.0]
+    assert known.rgb is None
+    assert known.ring.tolist() == [4, 5, 6]
+    assert known.time.tolist() == [5.0, 5.1, 5.2]
+    assert not list(scan.attributes([]).present())
+    untimed = Scan.from_raw(np.ones((2, 3)), 5.0).attributes(["time"])
+    assert untimed.time.tolist() == [5.0, 5.0]
