@@ -7,9 +7,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
 
 from lidarslam.core.limits import require_lost_worse, require_range_left
-from lidarslam.core.point_attributes import AttributeName
 
 MappingName = Literal["surfels", "loam", "off"]
+MapField = Literal["intensity", "rgb", "ring", "time"]
+"""An attribute of the points of a map."""
 MapFormat = Literal["pcd", "laz", "e57"]
 """What a map can be written as beside .ply."""
 
@@ -112,7 +113,7 @@ class GlobalMapConfig(BaseModel):
     leave_out_moved: bool = Field(
         True, description="leave out what other scans saw through where it was: people and vehicles that passed"
     )
-    fields: tuple[AttributeName, ...] = Field(
+    fields: tuple[MapField, ...] = Field(
         ("intensity", "rgb"),
         description="attributes of points that the map has where scans have them: intensity, rgb, ring, time",
     )

@@ -1,7 +1,7 @@
-"""One sweep of a LiDAR, and the protocol of a recording."""
+"""One sweep of a LiDAR, the attributes of its points, and the protocol of a recording."""
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from typing_extensions import Self
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.point_attributes import AttributeName, PointAttributes
 from lidarslam.core.trajectory import Trajectory
 
 # No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
@@ -18,6 +17,36 @@ _MAX_RANGE_M = 10_000.0
 _MOST_RINGS = 4096
 # The fields of a scan with an entry for each point, beside the points.
 _COLUMNS = ("time_offsets", "rings", "intensities", "colours")
+
+
+@dataclass(frozen=True, eq=False)
+class PointAttributes:
+    """Attributes of N points; None where no point has one."""
+
+    intensity: NDArray[np.float32] | None = None  # (N,) on the scale of the recording; NaN where there is none
+    rgb: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue; black where there is none
+    ring: NDArray[np.int32] | None = None  # (N,) the laser; -1 where it is unknown
+    time: NDArray[np.float64] | None = None  # (N,) seconds, on the clock of the scans' stamps
+
+    def __post_init__(self) -> None:
+        lengths = {name: len(values) for name, values in self.present()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"attributes of the same points differ in length: {lengths}")
+        if self.rgb is not None and (self.rgb.ndim != 2 or self.rgb.shape[1] != 3):
+            raise ValueError(f"rgb must be (N, 3), got {self.rgb.shape}")
+
+    def present(self) -> Iterator[tuple[str, NDArray[np.generic]]]:
+        """Names and values of those that there are."""
+        named = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return ((name, values) for name, values in named if values is not None)
+
+    def only(self, names: Collection[str]) -> "PointAttributes":
+        """Those with some names."""
+        return PointAttributes(**{name: values for name, values in self.present() if name in names})  # type: ignore[arg-type]
+
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PointAttributes":
+        """Those of some of the points, by a mask or by indices."""
+        return PointAttributes(**{name: values[chosen] for name, values in self.present()})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +83,7 @@ class Scan:
             return 0.0
         return float(0.5 * (self.time_offsets.min() + self.time_offsets.max()))
 
-    def attributes(self, wanted: Collection[AttributeName]) -> PointAttributes:
+    def attributes(self, wanted: Collection[str]) -> PointAttributes:
         """The wanted attributes of the points, as far as there are any.
 
         Rings come with times, by which a map chooses among points; without offsets the time is the stamp.

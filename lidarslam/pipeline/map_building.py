@@ -6,8 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.point_attributes import PointAttributes
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.point_attributes import PointAttributes
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
-from lidarslam.datasets.point_attributes import read_colours, read_intensities
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.unfinished import require_whole

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.core.point_attributes import PointAttributes
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.global_map import kernels
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.point_attributes import PointAttributes
+from lidarslam.core.scan import PointAttributes
 
 POSITION, VIEW, COUNT = slice(0, 3), slice(3, 6), 6
 _GEOMETRY = 7

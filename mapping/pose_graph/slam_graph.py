@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, log
-from lidarslam.core.point_attributes import PointAttributes
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, means_points

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.datasets.folders.ply import read_ply
-from lidarslam.datasets.point_attributes import (
+from lidarslam.datasets.folders.point_attributes import (
     find_colour_fields,
     find_intensity_field,
     read_colours,

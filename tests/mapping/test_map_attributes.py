@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.core.point_attributes import PointAttributes
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import Saved, State
 from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.global_map import GlobalMap

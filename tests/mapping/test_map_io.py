@@ -8,7 +8,7 @@ import open3d as o3d
 import pytest
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.point_attributes import PointAttributes
+from lidarslam.core.scan import PointAttributes
 from lidarslam.mapping.global_map import map_io
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import require_format, write_cloud

@@ -17,8 +17,8 @@ from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.formats import table_reader
 from lidarslam.datasets.folders.layout import find_layout
+from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
-from lidarslam.datasets.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.point_time import (
     CLOCK_LIMIT_S,
     UNITS_PER_SECOND,
