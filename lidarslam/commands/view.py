@@ -5,18 +5,18 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample, config_options
+from lidarslam.commands.options import PATH, CommandWithExample, config_options, latest_run
 from lidarslam.commands.terminal import say
 from lidarslam.core.errors import InputError
 
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam view runs/04
+    epilog="""lidarslam view
     lidarslam view runs/04 runs/wheels --web
     lidarslam view runs/04 --picture map.png""",
 )
-@click.argument("runs", type=PATH, nargs=-1, required=True)
+@click.argument("runs", type=PATH, nargs=-1, metavar="[RUN]...")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
 @click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
 @click.option("--picture", type=PATH, metavar="FILE.png", help="Draw the map of one run, or a .ply file, instead.")
@@ -29,12 +29,16 @@ def view(
     config_file: Path | None,
     settings: tuple[str, ...],
 ) -> None:
-    """Show finished runs in Rerun: trajectories, maps, and where tracking was lost."""
+    """Show finished runs in Rerun: trajectories, maps, and where tracking was lost.
+
+    RUN is a run directory.  [default: the latest run in runs]
+    """
     from lidarslam.config.settings import load_config
     from lidarslam.storage.finished_run import load_run
 
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
+    runs = runs or (latest_run(),)
     if picture is not None:
         _draw_map(runs, picture)
         return

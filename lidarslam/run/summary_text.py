@@ -1,5 +1,6 @@
 """The text that `lidarslam run` prints at the end."""
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,6 +34,9 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield f"warning: {warning}"
     yield from _lost(summary)
     yield f"written to {out}"
+    yield f"next: {shlex.join(['lidarslam', 'view', str(out)])}"
+    if outcome.metrics is not None:
+        yield f"      {shlex.join(['lidarslam', 'evaluate', str(out)])}"
 
 
 def format_map(written: WrittenMap) -> str:
