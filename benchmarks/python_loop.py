@@ -118,7 +118,11 @@ def main() -> None:
     settings = dict(setting.split("=", 1) for setting in given.set)
     print(f"{len(scans)} scans of {recording.name} at {given.rate:g} Hz")
     print("            median   p99 ms  p99 late  overruns    ATE m   MB: half  end")
-    for name, run in {"lidarslam": partial(run_slam, settings=settings), "kiss-icp": run_kiss_icp}.items():
+    methods: dict[str, Callable[[list[lidarslam.Scan], float], Paced]] = {
+        "lidarslam": partial(run_slam, settings=settings),
+        "kiss-icp": run_kiss_icp,
+    }
+    for name, run in methods.items():
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             paced = pool.submit(run, scans, period_s).result()
         print(f"{name:10}{describe(paced, recording.ground_truth, period_s)}", flush=True)

@@ -6,6 +6,7 @@ Defaults live in the code, beside what consumes them; a file or `--set` holds on
 import difflib
 import reprlib
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -80,7 +81,7 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     return load_model(Config, path, switches_first, "odometry.kiss_icp.voxel_size_m=0.5")
 
 
-def make_config(given: Config | Path | str | Mapping[str, Any] | None) -> Config:
+def make_config(given: Config | str | PathLike[str] | Mapping[str, Any] | None) -> Config:
     """A configuration, the path of one in YAML, or settings: sections as dictionaries, keys with dots, or both.
 
     Raises:
