@@ -45,7 +45,8 @@ def load_run(path: Path) -> FinishedRun:
         InputError: there is no run, or a file of it is damaged.
     """
     trajectory = read_trajectory(path)
-    lost, loops = _lost(path / files.SCANS_CSV, len(trajectory)), _loops(path, len(trajectory))
+    statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
+    lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
     return FinishedRun(path.resolve().name, trajectory, lost, load_map(path).points, loops)
 
 
@@ -128,19 +129,23 @@ def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     return found[((found >= 0) & (found < scans)).all(axis=1)]
 
 
-def _lost(scans_csv: Path, poses: int) -> NDArray[np.bool_]:
-    if not scans_csv.is_file():
-        return np.zeros(poses, dtype=np.bool_)
+def read_statuses(path: Path, poses: int) -> list[Status]:
+    """The status of each scan of a run; ok where no table has been kept.
+
+    Raises:
+        InputError: the table is damaged, or has not a row for each pose.
+    """
+    file = path / files.SCANS_CSV
+    if not file.is_file():
+        return [Status.OK] * poses
     try:
-        with scans_csv.open(encoding="utf-8", newline="") as rows:
-            statuses = [row["status"] for row in csv.DictReader(rows)]
-    except (KeyError, UnicodeDecodeError, csv.Error) as error:
-        raise _damaged(scans_csv, "a run's table", error) from error
+        with file.open(encoding="utf-8", newline="") as rows:
+            statuses = [Status(row["status"]) for row in csv.DictReader(rows)]
+    except (KeyError, ValueError, csv.Error) as error:  # not UTF-8 is a ValueError
+        raise _damaged(file, "a run's table", error) from error
     if len(statuses) != poses:
-        raise InputError(
-            f"{scans_csv}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again"
-        )
-    return np.array([status == Status.LOST.value for status in statuses], dtype=np.bool_)
+        raise InputError(f"{file}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again")
+    return statuses
 
 
 def _damaged(file: Path, kind: str, error: Exception) -> InputError:

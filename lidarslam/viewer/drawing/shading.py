@@ -1,0 +1,100 @@
+"""Clouds as shaded pixels: the nearest point at every pixel, its brightness by light and depth."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.viewer.drawing.view import View
+
+# Points are drawn as squares that close the gaps between neighbours, up to so many pixels.
+_LARGEST_SPLAT = 12
+_GAPS_CLOSED = 1.3
+_SAMPLED_PLACES, _SAMPLED_POINTS = 8, 400
+# The light comes from the upper left of the picture, along right, up and towards the camera.
+_LIGHT = np.array([-0.45, 0.5, 0.74])
+_AMBIENT = 0.55
+# Eye-dome lighting (Boucheny, 2009): distances of the neighbours in pixels, and how strongly a pixel behind them is
+# darkened.
+_REACHES, _EDGE_STRENGTH, _STEEPEST = (1, 3, 8), 0.8, 4.0
+_NOTHING = np.float32(-1e9)  # depth where there is no point, behind all points
+# Surfaces that face away by more than this are left out, so that one looks through ceilings into rooms.
+_LEAST_FACING = -0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """One cloud, drawn."""
+
+    # (height, width): the row of the point at a pixel, -1 where there is none; whether there is one; from 0 to 1
+    index: NDArray[np.int32]
+    covered: NDArray[np.bool_]
+    brightness: NDArray[np.float32]
+
+
+def draw_layer(points: FloatArray, normals: FloatArray, view: View) -> Layer:
+    """Draw points (N, 3) with normals (N, 3); surfaces that face away are left out."""
+    facing = np.flatnonzero(normals @ view.axes[2] > _LEAST_FACING)
+    splat = int(np.clip(np.ceil(_GAPS_CLOSED * spacing_m(points) / view.pixel_m), 1, _LARGEST_SPLAT))
+    towards = view.depth(points)
+    index = _rasterise(view.project(points), towards, facing[np.argsort(towards[facing])], view, splat)
+    covered = index >= 0
+    seen = index[covered]
+    depth = np.full(index.shape, _NOTHING, dtype=np.float32)
+    depth[covered] = (towards - towards[facing].mean() if len(facing) else towards).astype(np.float32)[seen]
+    brightness = _eye_dome(depth, view.pixel_m)
+    brightness[covered] *= _lit(normals, view)[seen]
+    return Layer(index, covered, brightness)
+
+
+def spacing_m(points: FloatArray) -> float:
+    """Median distance between neighbouring points (N, 3), from a few places."""
+    if len(points) < 2:
+        return 0.0
+    distances = []
+    for place in points[:: max(1, len(points) // _SAMPLED_PLACES)][:_SAMPLED_PLACES]:
+        count = min(_SAMPLED_POINTS, len(points))
+        near = points[np.argpartition(((points - place) ** 2).sum(axis=1), count - 1)[:count]]
+        distances.append(cKDTree(near).query(near, k=2)[0][:, 1])
+    return float(np.median(np.concatenate(distances)))
+
+
+def _rasterise(
+    pixels: FloatArray, towards: FloatArray, order: NDArray[np.intp], view: View, splat: int
+) -> NDArray[np.int32]:
+    """Row of the nearest point at every pixel (height, width), -1 where there is none; the nearest is last in order."""
+    index = np.full((view.height, view.width), -1, dtype=np.int32)
+    corner = np.floor(pixels[order] - 0.5 * (splat - 1) + 0.5).astype(np.int32)
+    depth = towards[order].astype(np.float32)
+    nearest = np.full(index.shape, -np.inf, dtype=np.float32)
+    for column_step, row_step in product(range(splat), repeat=2):
+        column, row = corner[:, 0] + column_step, corner[:, 1] + row_step
+        inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+        pixel = row[inside] * view.width + column[inside]
+        shown = depth[inside] > nearest.reshape(-1)[pixel]
+        pixel = pixel[shown]
+        nearest.reshape(-1)[pixel] = depth[inside][shown]
+        index.reshape(-1)[pixel] = order[inside][shown]
+    return index
+
+
+def _lit(normals: FloatArray, view: View) -> NDArray[np.float32]:
+    """Brightness (N,) of surfaces by their angle to the light."""
+    light = _LIGHT / np.linalg.norm(_LIGHT) @ view.axes
+    return np.float32(_AMBIENT) + np.float32(1.0 - _AMBIENT) * np.maximum(normals @ light, 0.0).astype(np.float32)
+
+
+def _eye_dome(depth: NDArray[np.float32], pixel_m: float) -> NDArray[np.float32]:
+    """Brightness (height, width): darker the farther a pixel lies behind its neighbours, relative to their distance."""
+    behind = np.zeros_like(depth)
+    height, width = depth.shape
+    for reach in _REACHES:
+        padded = np.pad(depth, reach, constant_values=_NOTHING)
+        for row, column in ((0, 1), (2, 1), (1, 0), (1, 2)):
+            step = padded[row * reach : row * reach + height, column * reach : column * reach + width] - depth
+            step *= np.float32(1.0 / (reach * pixel_m))
+            behind += np.clip(step, 0.0, _STEEPEST, out=step)
+    return np.exp(behind * np.float32(-_EDGE_STRENGTH / (4 * len(_REACHES))))
