@@ -43,6 +43,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
     help="Save a Rerun recording; spawn opens a window too.",
 )
 @click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @reader_options

@@ -60,7 +60,7 @@ def read_trajectory(path: Path) -> Trajectory:
     file = path / files.TRAJECTORY_TUM
     if not file.is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
-    trajectory, scans = read_tum(file), _summary(path).get("scans")
+    trajectory, scans = read_tum(file), read_summary(path).get("scans")
     if scans not in (None, len(trajectory)):
         raise InputError(
             f"{file}: holds {len(trajectory):,} poses, {files.SUMMARY} says {scans:,} scans: one of them is cut off;"
@@ -104,8 +104,12 @@ def _normals(table: NDArray[np.void]) -> FloatArray:
     return np.tile([0.0, 0.0, 1.0], (len(table), 1))
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    """The content of summary.json, empty when there is none."""
+def read_summary(path: Path) -> dict[str, Any]:
+    """The content of a run's summary.json, empty when there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
     file = path / files.SUMMARY
     if not file.is_file():
         return {}
@@ -121,7 +125,7 @@ def _summary(path: Path) -> dict[str, Any]:
 def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     """The loops that a run closed; none for a run without a graph."""
     try:
-        loops = (_summary(path).get("pose_graph") or {"loops": []})["loops"]
+        loops = (read_summary(path).get("pose_graph") or {"loops": []})["loops"]
         pairs = [(loop["first_scan"], loop["second_scan"]) for loop in loops if loop["accepted"]]
         found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     except (ValueError, KeyError, TypeError, OverflowError) as error:

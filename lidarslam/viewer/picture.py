@@ -79,9 +79,10 @@ def draw_runs(
     colours = _colours(runs)
     image = Image.fromarray(_draw_maps(runs, colours, fine))
     if reference is not None:
-        notes.draw_path(image, fine, reference, [_REFERENCE] * len(reference))
+        notes.draw_path(image, fine, reference, [_REFERENCE] * len(reference), around=_REFERENCE)
+    halo = notes.HALO if len(points) else None
     for run, colour in zip(runs, colours, strict=True):
-        notes.draw_path(image, fine, run.positions, _path_colours(run, colour))
+        notes.draw_path(image, fine, run.positions, _path_colours(run, colour), halo)
     for run, colour in zip(runs, colours, strict=True):
         notes.draw_ends(image, fine, run.positions, colour or notes.INK)
     image = notes.with_strip(image.reduce(_SUPERSAMPLING), list(_entries(runs, colours, view, reference is not None)))
@@ -132,15 +133,18 @@ def _colours(runs: Sequence[DrawnRun]) -> list[Colour | None]:
 
 def _draw_maps(runs: Sequence[DrawnRun], colours: Sequence[Colour | None], view: View) -> NDArray[np.uint8]:
     """All maps (height, width, 3) on paper; the mean of their colours where several cover a pixel."""
-    total = np.zeros((view.height, view.width, 3), dtype=np.uint16)
-    count = np.zeros((view.height, view.width, 1), dtype=np.uint16)
+    total = np.zeros((view.height * view.width, 3), dtype=np.uint16)
+    count = np.zeros(len(total), dtype=np.uint16)
     for run, colour in zip(runs, colours, strict=True):
-        layer = draw_layer(run.cloud.points, run.cloud.normals, view)
-        surface = _paper_colours(run.cloud.points)[layer.index[layer.covered]] if colour is None else _tint(colour)
-        total[layer.covered] += (surface * layer.brightness[layer.covered, None]).astype(np.uint16)
-        count[layer.covered] += 1
-    total[count[..., 0] == 0] = notes.PAPER
-    return (total // np.maximum(count, 1)).astype(np.uint8)
+        if len(run.cloud):
+            layer = draw_layer(run.cloud.points, run.cloud.normals, view)
+            surface = _paper_colours(run.cloud.points)[layer.points] if colour is None else _tint(colour)
+            total[layer.pixels] += (surface * layer.brightness[:, None]).astype(np.uint16)
+            count[layer.pixels] += 1
+    picture = np.full(total.shape, notes.PAPER, dtype=np.uint8)
+    drawn = np.flatnonzero(count)
+    picture[drawn] = total[drawn] // count[drawn, None]
+    return picture.reshape(view.height, view.width, 3)
 
 
 def _tint(colour: Colour) -> NDArray[np.float32]:
@@ -177,5 +181,5 @@ def _entries(
         ramp = _RAMP[np.linspace(0, 255, round(_RAMP_LENGTH * view.width)).astype(np.intp)]
         entries.append(notes.ramp_entry(f"z {low:.1f}", f"{high:.1f} m", ramp, view.width))
     across, up = view.size_m
-    size = f"{across:.0f} m × {up:.0f} m" if view.axes[2, 2] == 1.0 else f"{across:.0f} m wide"
+    size = f"{across:.0f} m x {up:.0f} m" if view.axes[2, 2] == 1.0 else f"{across:.0f} m wide"
     return [*entries, notes.scale_entry(view), Entry(size)]

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.plain_text import printable
 from lidarslam.viewer.drawing.view import View
 
 Colour = tuple[int, int, int]
@@ -31,13 +30,16 @@ class Entry:
     symbol: Callable[[ImageDraw.ImageDraw, float, float], None] | None = None
 
 
-def draw_path(picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour]) -> None:
-    """Draw a path through positions (N, 3) above everything, with a halo; colours are those of its poses."""
+def draw_path(
+    picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], around: Colour | None = HALO
+) -> None:
+    """Draw a path through positions (N, 3) above everything; colours are those of its poses, and of a wider line."""
     if len(positions) < 2:
         return
     pen, width = ImageDraw.Draw(picture), max(2, round(view.width * _LINE))
     pixels = [tuple(pixel) for pixel in view.project(positions).tolist()]
-    pen.line(pixels, fill=HALO, width=2 * width, joint="curve")
+    if around is not None:
+        pen.line(pixels, fill=around, width=2 * width, joint="curve")
     for first, last in _stretches(colours):
         pen.line(pixels[first : last + 1], fill=colours[last], width=width, joint="curve")
 
@@ -126,8 +128,8 @@ def with_strip(picture: Image.Image, entries: Sequence[Entry]) -> Image.Image:
         for column, entry in row:
             if entry.symbol is not None:
                 entry.symbol(pen, column, middle)
-                column += entry.symbol_width + text_gap
-            pen.text((column, middle), entry.text, fill=INK, font=font, anchor="lm")
+            text_column = column + entry.symbol_width + text_gap
+            pen.text((text_column, middle), entry.text, fill=INK, font=font, anchor="lm")
     return whole
 
 
@@ -136,8 +138,9 @@ def _font(width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _short(text: str) -> str:
-    text = printable(text)
-    return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 1]}…"
+    """Shortened, and without the characters that Pillow's font lacks."""
+    text = text.encode("ascii", "replace").decode()
+    return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..."
 
 
 def _mark(pen: ImageDraw.ImageDraw, column: float, row: float, radius: float, colour: Colour) -> None:

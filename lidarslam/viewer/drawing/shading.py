@@ -12,7 +12,7 @@ from lidarslam.viewer.drawing.view import View
 
 # Points are drawn as squares that close the gaps between neighbours, up to so many pixels.
 _LARGEST_SPLAT = 12
-_GAPS_CLOSED = 1.3
+_GAPS_CLOSED = 1.7
 _SAMPLED_PLACES, _SAMPLED_POINTS = 8, 400
 # The light comes from the upper left of the picture, along right, up and towards the camera.
 _LIGHT = np.array([-0.45, 0.5, 0.74])
@@ -27,38 +27,35 @@ _LEAST_FACING = -0.1
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One cloud, drawn."""
+    """One cloud, drawn: the K pixels where there is a point."""
 
-    # (height, width): the row of the point at a pixel, -1 where there is none; whether there is one; from 0 to 1
-    index: NDArray[np.int32]
-    covered: NDArray[np.bool_]
+    # (K,): the pixel's number in the picture, row by row; the row of the point; brightness from 0 to 1
+    pixels: NDArray[np.intp]
+    points: NDArray[np.int32]
     brightness: NDArray[np.float32]
 
 
 def draw_layer(points: FloatArray, normals: FloatArray, view: View) -> Layer:
     """Draw points (N, 3) with normals (N, 3); surfaces that face away are left out."""
-    facing = np.flatnonzero(normals @ view.axes[2] > _LEAST_FACING)
     splat = int(np.clip(np.ceil(_GAPS_CLOSED * spacing_m(points) / view.pixel_m), 1, _LARGEST_SPLAT))
     towards = view.depth(points)
+    facing = np.flatnonzero(normals @ view.axes[2] > _LEAST_FACING)
     index = _rasterise(view.project(points), towards, facing[np.argsort(towards[facing])], view, splat)
-    covered = index >= 0
-    seen = index[covered]
-    depth = np.full(index.shape, _NOTHING, dtype=np.float32)
-    depth[covered] = (towards - towards[facing].mean() if len(facing) else towards).astype(np.float32)[seen]
-    brightness = _eye_dome(depth, view.pixel_m)
-    brightness[covered] *= _lit(normals, view)[seen]
-    return Layer(index, covered, brightness)
+    pixels = np.flatnonzero(index >= 0)
+    seen = index.reshape(-1)[pixels]
+    depth = (towards - towards.mean()).astype(np.float32)[seen]
+    return Layer(pixels, seen, _lit(normals, view)[seen] * _eye_dome(depth, pixels, view))
 
 
 def spacing_m(points: FloatArray) -> float:
     """Median distance between neighbouring points (N, 3), from a few places."""
     if len(points) < 2:
         return 0.0
-    distances = []
+    distances: list[FloatArray] = []
     for place in points[:: max(1, len(points) // _SAMPLED_PLACES)][:_SAMPLED_PLACES]:
         count = min(_SAMPLED_POINTS, len(points))
         near = points[np.argpartition(((points - place) ** 2).sum(axis=1), count - 1)[:count]]
-        distances.append(cKDTree(near).query(near, k=2)[0][:, 1])
+        distances.append(np.asarray(cKDTree(near).query(near, k=2)[0])[:, 1])
     return float(np.median(np.concatenate(distances)))
 
 
@@ -84,17 +81,26 @@ def _rasterise(
 def _lit(normals: FloatArray, view: View) -> NDArray[np.float32]:
     """Brightness (N,) of surfaces by their angle to the light."""
     light = _LIGHT / np.linalg.norm(_LIGHT) @ view.axes
-    return np.float32(_AMBIENT) + np.float32(1.0 - _AMBIENT) * np.maximum(normals @ light, 0.0).astype(np.float32)
+    lit: FloatArray = _AMBIENT + (1.0 - _AMBIENT) * np.maximum(normals @ light, 0.0)
+    return lit.astype(np.float32)
 
 
-def _eye_dome(depth: NDArray[np.float32], pixel_m: float) -> NDArray[np.float32]:
-    """Brightness (height, width): darker the farther a pixel lies behind its neighbours, relative to their distance."""
+def _eye_dome(depth: NDArray[np.float32], pixels: NDArray[np.intp], view: View) -> NDArray[np.float32]:
+    """Brightness (K,): darker the farther a pixel lies behind its neighbours, relative to their distance.
+
+    Opposite neighbours count together, so that a plane has no shade however it is inclined.
+    """
+    border = max(_REACHES)
+    width = view.width + 2 * border
+    framed = np.full((view.height + 2 * border) * width, _NOTHING)
+    middle = (pixels // view.width + border) * width + pixels % view.width + border
+    framed[middle] = depth
     behind = np.zeros_like(depth)
-    height, width = depth.shape
-    for reach in _REACHES:
-        padded = np.pad(depth, reach, constant_values=_NOTHING)
-        for row, column in ((0, 1), (2, 1), (1, 0), (1, 2)):
-            step = padded[row * reach : row * reach + height, column * reach : column * reach + width] - depth
-            step *= np.float32(1.0 / (reach * pixel_m))
-            behind += np.clip(step, 0.0, _STEEPEST, out=step)
-    return np.exp(behind * np.float32(-_EDGE_STRENGTH / (4 * len(_REACHES))))
+    for reach, stride in product(_REACHES, (1, width)):
+        pair = np.zeros_like(depth)
+        for neighbour in (framed[middle - reach * stride], framed[middle + reach * stride]):
+            step = np.clip((neighbour - depth) / np.float32(reach * view.pixel_m), -_STEEPEST, _STEEPEST)
+            pair += np.where(neighbour == _NOTHING, np.float32(0.0), step)
+        behind += np.maximum(pair, 0.0)
+    darkness: NDArray[np.float32] = behind * np.float32(_EDGE_STRENGTH / (2 * len(_REACHES)))
+    return np.exp(-darkness)

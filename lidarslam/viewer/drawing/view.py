@@ -6,15 +6,16 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 
-WIDTH, TALLEST, LOWEST = 1600, 1000, 320
-_MARGIN = 40
+WIDTH = 1600
+# Height of a picture and its margin, relative to its width.
+_TALLEST, _LOWEST, _MARGIN = 0.625, 0.2, 0.025
 # The frame holds this share of the occupied cells, along each axis, and up to so much of the size beyond.
-_FRAMED_PERCENT, _BEYOND = (0.5, 99.5), 0.1
+_FRAMED_PERCENT, _BEYOND = (0.5, 99.5), 0.3
 _CELLS, _LEAST_POINTS = 300, 3
-_SAMPLED = 20_000
-# The picture is turned only where this enlarges the scene noticeably.
+_SAMPLED = 5_000
+# The picture is turned only where this saves much empty space.
 _TURNS_DEG = (*range(0, 95, 5), *range(-85, 0, 5))
-_WORTH_TURNING = 1.15
+_WORTH_TURNING = 1.2
 _LEAST_SIZE_M = 1.0
 
 
@@ -30,14 +31,21 @@ class View:
     height: int
     size_m: FloatArray  # (2,) of the scene along right and up; the picture shows a margin around it
 
+    @property
+    def area_m2(self) -> float:
+        """What the picture shows."""
+        return self.width * self.height * self.pixel_m**2
+
     def project(self, points: FloatArray) -> FloatArray:
         """Column and row (N, 2) of points (N, 3); pixel centres are at whole numbers."""
         across = (points @ self.axes[:2].T - self.centre) / self.pixel_m
-        return across * [1.0, -1.0] + 0.5 * np.array([self.width, self.height]) - 0.5
+        middle = 0.5 * np.array([self.width, self.height]) - 0.5
+        return np.asarray(across * [1.0, -1.0] + middle, dtype=np.float64)
 
     def depth(self, points: FloatArray) -> FloatArray:
         """Distance (N,) of points (N, 3) towards the camera, m."""
-        return points @ self.axes[2]
+        depth: FloatArray = points @ self.axes[2]
+        return depth
 
     def enlarged(self, factor: int) -> "View":
         """The same part of the scene on more pixels."""
@@ -62,23 +70,24 @@ def fit_view(
         points: of all clouds; may be empty.
         path: positions of all trajectories; may be empty.
         elevation_deg: of the camera above the horizon.
-        turn_deg: of the picture about z; None: the turn that shows the scene largest, 0 unless another is much better.
+        turn_deg: of the picture about z; None: the turn that leaves the least empty space, 0 unless it saves much.
         width: of the picture, pixels; its height follows the scene.
     """
     if turn_deg is None:
         sample = points[:: max(1, len(points) // _SAMPLED)]
-        sizes = {turn: _pixel_m(_box(view_axes(turn, elevation_deg), sample, path), width) for turn in _TURNS_DEG}
-        best = min(sizes, key=lambda turn: sizes[turn])
-        turn_deg = float(best) if sizes[0] > _WORTH_TURNING * sizes[best] else 0.0
-    axes = view_axes(turn_deg, elevation_deg)
+        areas = {turn: _fit(view_axes(turn, elevation_deg), sample, path, width).area_m2 for turn in _TURNS_DEG}
+        best = min(areas, key=lambda turn: areas[turn])
+        turn_deg = float(best) if areas[0] > _WORTH_TURNING * areas[best] else 0.0
+    return _fit(view_axes(turn_deg, elevation_deg), points, path, width)
+
+
+def _fit(axes: FloatArray, points: FloatArray, path: FloatArray, width: int) -> View:
     box = _box(axes, points, path)
-    pixel_m = _pixel_m(box, width)
-    height = int(np.clip(np.ceil((box[1, 1] - box[0, 1]) / pixel_m) + 2 * _MARGIN, LOWEST, TALLEST))
-    return View(axes, box.mean(axis=0), pixel_m, width, height, box[1] - box[0])
-
-
-def _pixel_m(box: FloatArray, width: int) -> float:
-    return float(((box[1] - box[0]) / [width - 2 * _MARGIN, TALLEST - 2 * _MARGIN]).max())
+    size_m, margin = box[1] - box[0], round(_MARGIN * width)
+    tallest, lowest = round(_TALLEST * width), round(_LOWEST * width)
+    pixel_m = float((size_m / [width - 2 * margin, tallest - 2 * margin]).max())
+    height = int(np.clip(np.ceil(size_m[1] / pixel_m) + 2 * margin, lowest, tallest))
+    return View(axes, box.mean(axis=0), pixel_m, width, height, size_m)
 
 
 def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:
@@ -93,7 +102,7 @@ def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:
         return np.array([[-0.5, -0.5], [0.5, 0.5]]) * _LEAST_SIZE_M
     box = np.stack([np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]])
     short = np.maximum(_LEAST_SIZE_M - (box[1] - box[0]), 0.0) / 2.0
-    return box + np.stack([-short, short])
+    return np.stack([box[0] - short, box[1] + short])
 
 
 def _occupied(across: FloatArray) -> FloatArray:
