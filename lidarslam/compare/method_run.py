@@ -14,10 +14,10 @@ from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.files import remove_partial_files
 from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult
-from lidarslam.report.run_result import with_run
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
+from lidarslam.viewer.page.run_result import with_run
 
 # Beside a run's own files: how its process went, and its standard error.
 PROCESS, LOG = "process.json", "process.log"

@@ -105,7 +105,7 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
 
 def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:
     """The page of the run with its errors; `compared` are the poses in the camera's frame, if they were compared."""
-    from lidarslam.report.run_report import Accuracy, leave_report
+    from lidarslam.viewer.page.run_report import Accuracy, leave_report
 
     accuracy = Accuracy(
         evaluation.metrics,

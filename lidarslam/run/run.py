@@ -64,7 +64,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     if unfinished is not None:
         unfinished.end(outcome.stopped is not None)
     if request.report:
-        from lidarslam.report.run_report import Accuracy, leave_report
+        from lidarslam.viewer.page.run_report import Accuracy, leave_report
 
         leave_report(request.out, Accuracy(outcome.metrics))
     return outcome

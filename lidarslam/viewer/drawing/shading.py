@@ -5,21 +5,22 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.viewer.drawing.view import View
 
-# Points are drawn as squares that close the gaps between neighbours, up to so many pixels.
-_LARGEST_SPLAT = 12
+# Points are drawn as squares that close the gaps between neighbours, up to this share of the width.
+_LARGEST_SPLAT = 1 / 60
 _GAPS_CLOSED = 1.7
-_SAMPLED_PLACES, _SAMPLED_POINTS = 8, 400
+_SAMPLED_PLACES, _SAMPLED_POINTS = 5, 400
 # The light comes from the upper left of the picture, along right, up and towards the camera.
 _LIGHT = np.array([-0.45, 0.5, 0.74])
 _AMBIENT = 0.55
-# Eye-dome lighting (Boucheny, 2009): distances of the neighbours in pixels, and how strongly a pixel behind them is
+# Eye-dome lighting (Boucheny, 2009): distances of the neighbours in splats, and how strongly a pixel behind them is
 # darkened.
-_REACHES, _EDGE_STRENGTH, _STEEPEST = (1, 3, 8), 0.8, 4.0
+_REACHES, _EDGE_STRENGTH, _STEEPEST = (1, 3), 0.8, 4.0
 _NOTHING = np.float32(-1e9)  # depth where there is no point, behind all points
 # Surfaces that face away by more than this are left out, so that one looks through ceilings into rooms.
 _LEAST_FACING = -0.1
@@ -31,20 +32,20 @@ class Layer:
 
     # (K,): the pixel's number in the picture, row by row; the row of the point; brightness from 0 to 1
     pixels: NDArray[np.intp]
-    points: NDArray[np.int32]
+    points: NDArray[np.intp]
     brightness: NDArray[np.float32]
 
 
 def draw_layer(points: FloatArray, normals: FloatArray, view: View) -> Layer:
     """Draw points (N, 3) with normals (N, 3); surfaces that face away are left out."""
-    splat = int(np.clip(np.ceil(_GAPS_CLOSED * spacing_m(points) / view.pixel_m), 1, _LARGEST_SPLAT))
+    splat = int(np.clip(np.ceil(_GAPS_CLOSED * spacing_m(points) / view.pixel_m), 1, _LARGEST_SPLAT * view.width))
     towards = view.depth(points)
     facing = np.flatnonzero(normals @ view.axes[2] > _LEAST_FACING)
-    index = _rasterise(view.project(points), towards, facing[np.argsort(towards[facing])], view, splat)
+    index = _rasterise(view.project(points), facing[np.argsort(towards[facing])], view, splat)
     pixels = np.flatnonzero(index >= 0)
     seen = index.reshape(-1)[pixels]
     depth = (towards - towards.mean()).astype(np.float32)[seen]
-    return Layer(pixels, seen, _lit(normals, view)[seen] * _eye_dome(depth, pixels, view))
+    return Layer(pixels, seen, _lit(normals, view)[seen] * _eye_dome(depth, pixels, view, splat))
 
 
 def spacing_m(points: FloatArray) -> float:
@@ -59,23 +60,14 @@ def spacing_m(points: FloatArray) -> float:
     return float(np.median(np.concatenate(distances)))
 
 
-def _rasterise(
-    pixels: FloatArray, towards: FloatArray, order: NDArray[np.intp], view: View, splat: int
-) -> NDArray[np.int32]:
+def _rasterise(pixels: FloatArray, order: NDArray[np.intp], view: View, splat: int) -> NDArray[np.intp]:
     """Row of the nearest point at every pixel (height, width), -1 where there is none; the nearest is last in order."""
-    index = np.full((view.height, view.width), -1, dtype=np.int32)
-    corner = np.floor(pixels[order] - 0.5 * (splat - 1) + 0.5).astype(np.int32)
-    depth = towards[order].astype(np.float32)
-    nearest = np.full(index.shape, -np.inf, dtype=np.float32)
-    for column_step, row_step in product(range(splat), repeat=2):
-        column, row = corner[:, 0] + column_step, corner[:, 1] + row_step
-        inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
-        pixel = row[inside] * view.width + column[inside]
-        shown = depth[inside] > nearest.reshape(-1)[pixel]
-        pixel = pixel[shown]
-        nearest.reshape(-1)[pixel] = depth[inside][shown]
-        index.reshape(-1)[pixel] = order[inside][shown]
-    return index
+    column, row = np.round(pixels[order]).astype(np.int64).T
+    inside = np.flatnonzero((column >= 0) & (column < view.width) & (row >= 0) & (row < view.height))
+    rank = np.full((view.height, view.width), -1, dtype=np.int32)
+    rank[row[inside], column[inside]] = inside  # of several points at a pixel the last stays
+    rank = maximum_filter(rank, size=splat, mode="constant", cval=-1)
+    return np.append(order, -1)[rank]
 
 
 def _lit(normals: FloatArray, view: View) -> NDArray[np.float32]:
@@ -85,18 +77,18 @@ def _lit(normals: FloatArray, view: View) -> NDArray[np.float32]:
     return lit.astype(np.float32)
 
 
-def _eye_dome(depth: NDArray[np.float32], pixels: NDArray[np.intp], view: View) -> NDArray[np.float32]:
+def _eye_dome(depth: NDArray[np.float32], pixels: NDArray[np.intp], view: View, splat: int) -> NDArray[np.float32]:
     """Brightness (K,): darker the farther a pixel lies behind its neighbours, relative to their distance.
 
     Opposite neighbours count together, so that a plane has no shade however it is inclined.
     """
-    border = max(_REACHES)
+    border = max(_REACHES) * splat
     width = view.width + 2 * border
     framed = np.full((view.height + 2 * border) * width, _NOTHING)
     middle = (pixels // view.width + border) * width + pixels % view.width + border
     framed[middle] = depth
     behind = np.zeros_like(depth)
-    for reach, stride in product(_REACHES, (1, width)):
+    for reach, stride in product([splat * reach for reach in _REACHES], (1, width)):
         pair = np.zeros_like(depth)
         for neighbour in (framed[middle - reach * stride], framed[middle + reach * stride]):
             step = np.clip((neighbour - depth) / np.float32(reach * view.pixel_m), -_STEEPEST, _STEEPEST)

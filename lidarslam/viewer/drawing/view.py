@@ -11,7 +11,7 @@ WIDTH = 1600
 _TALLEST, _LOWEST, _MARGIN = 0.625, 0.2, 0.025
 # The frame holds this share of the occupied cells, along each axis, and up to so much of the size beyond.
 _FRAMED_PERCENT, _BEYOND = (0.5, 99.5), 0.3
-_CELLS, _LEAST_POINTS = 300, 3
+_CELLS = 300
 _SAMPLED = 5_000
 # The picture is turned only where this saves much empty space.
 _TURNS_DEG = (*range(0, 95, 5), *range(-85, 0, 5))
@@ -108,10 +108,10 @@ def _box(axes: FloatArray, points: FloatArray, path: FloatArray) -> FloatArray:
 def _occupied(across: FloatArray) -> FloatArray:
     """Corners of the occupied cells, so that dense places do not count more than the ends of a long drive."""
     low, high = across.min(axis=0), across.max(axis=0)
-    cell_m = max(float((high - low).max()) / _CELLS, 1e-9)
-    row = np.floor((across - low) / cell_m).astype(np.int64) @ np.array([1, 2 * _CELLS])
-    _, first, counts = np.unique(row, return_index=True, return_counts=True)
-    cells = across[first[counts >= min(_LEAST_POINTS, counts.max())]]
+    inner_low, inner_high = np.percentile(across, _FRAMED_PERCENT, axis=0)  # strays would make the cells large
+    cell_m = max(float((inner_high - inner_low).max()) / _CELLS, 1e-6)
+    row = np.floor((across - low) / cell_m).astype(np.int64) @ np.array([1, 1 << 32])
+    cells = across[np.unique(row, return_index=True)[1]]
     inner_low, inner_high = np.percentile(cells, _FRAMED_PERCENT, axis=0)
     beyond = _BEYOND * (inner_high - inner_low) + cell_m
     return np.stack([np.maximum(low, inner_low - beyond), np.minimum(high, inner_high + beyond)])
