@@ -47,6 +47,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
     help="Save a Rerun recording; spawn opens a window too.",
 )
 @map_options
+@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @reader_options

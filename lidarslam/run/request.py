@@ -27,6 +27,7 @@ class RunRequest:
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
     resumable: bool = True  # whether checkpoints are saved
+    report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:
