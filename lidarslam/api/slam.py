@@ -42,8 +42,9 @@ class Slam:
     A context manager: `close` ends its threads. Methods may be called from several threads; one waits for the other.
 
     Args:
-        config: the path of a YAML file, settings such as `{"odometry.method": "kiss-icp"}` or
-            `{"pose_graph": {"enabled": True}}`, or a `Config`; None: the defaults, as in `lidarslam run`.
+        config: the path of a YAML file, or the name of one that comes with the program; settings such as
+            `{"odometry.method": "kiss-icp"}` or `{"pose_graph": {"enabled": True}}`; or a `Config`. None: the defaults,
+            as in `lidarslam run`.
 
     Raises:
         ConfigError: a setting does not exist or does not fit.
@@ -77,7 +78,8 @@ class Slam:
 
         Args:
             points: (N, 3) or more columns, of which the first three are x, y, z: metres, in the LiDAR frame (x forward,
-                z up) of the instant each was measured at. Or a `Scan`, which has times and stamp of its own.
+                z up) of the instant each was measured at. Or a `Scan`, which has times and stamp of its own, and
+                whatever else goes into maps.
             point_times: (N,) seconds from the stamp at which each point was measured; None when the points are
                 motion compensated, or the times unknown.
             stamp: seconds, after that of the scan before; the pose belongs to this instant. None, then for all scans:
