@@ -97,7 +97,7 @@ class Slam:
                 estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
                 localised = self._stages.localise(estimated)
                 total_ms = 1e3 * (time.perf_counter() - started)
-                self._builder.submit(self._build, estimated, localised, total_ms)
+                self._submit(estimated, localised, total_ms)
             return RegisteredScan.of(scan.stamp, localised)
 
     def trajectory(self) -> Trajectory:
@@ -182,6 +182,13 @@ class Slam:
         self._count, self._counts_stamps = self._count + 1, counts_stamps
         self._last_stamp, self._longest_interval_s = seconds, longest_s
         return look_at(scan, self._faults)
+
+    def _submit(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
+        """Leave the rest to the background; an error of an earlier scan may be raised."""
+        try:
+            self._builder.submit(self._build, estimated, localised, total_ms)
+        except Exception as error:
+            raise _map_error(error) from error
 
     def _build(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
         """What of a scan is done in the background."""
