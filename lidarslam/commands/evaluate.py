@@ -73,9 +73,9 @@ def evaluate(run: Path | None, **options: Any) -> None:
 
     RUN is a run directory, or a trajectory in TUM or KITTI text.  [default: the latest run in runs]
     """
-    from lidarslam.evaluate.evaluate import EvaluateRequest, evaluate
-    from lidarslam.evaluate.map_evaluation import MapOptions
-    from lidarslam.evaluate.text import format_evaluation
+    from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
+    from lidarslam.compare.assessment.map_evaluation import MapOptions
+    from lidarslam.compare.assessment.text import format_evaluation
 
     given = {name: value for name, value in options.items() if value is not None}
     if given.get("reference") and given["no_reference"]:

@@ -48,6 +48,9 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
 
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
     """
+    from lidarslam.odometry.train_extra import require_train_extra
+
+    require_train_extra("training")
     from lidarslam.storage.default_places import source_name
     from lidarslam.train.command import run_train
 

@@ -3,8 +3,8 @@
 import shlex
 from collections.abc import Iterator, Mapping
 
-from lidarslam.evaluate.evaluate import Evaluation
-from lidarslam.evaluate.map_evaluation import MapEvaluation
+from lidarslam.compare.assessment.evaluate import Evaluation
+from lidarslam.compare.assessment.map_evaluation import MapEvaluation
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
