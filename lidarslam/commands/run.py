@@ -63,9 +63,8 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    sequence = options["sequence"]
     config, map_formats = take_config(options, source), take_map_formats(options)
-    out = out or _default_out(source, sequence, options["resume"])
+    out = out or _default_out(source, config.reader.sequence, options["resume"])
     request = RunRequest(source, out, config, map_formats=map_formats, **options)
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished already")
