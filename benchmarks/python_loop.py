@@ -38,6 +38,9 @@ class Paced:
     memory_mb: tuple[float, float]  # in the middle and at the end
 
 
+Method = Callable[[list[lidarslam.Scan], float], Paced]
+
+
 def pace(register: Register, scans: list[lidarslam.Scan], period_s: float) -> Paced:
     """Register each scan when it is due, or as soon as the one before is done."""
     memory, process = [0.0, 0.0], psutil.Process()
@@ -118,7 +121,8 @@ def main() -> None:
     settings = dict(setting.split("=", 1) for setting in given.set)
     print(f"{len(scans)} scans of {recording.name} at {given.rate:g} Hz")
     print("            median   p99 ms  p99 late  overruns    ATE m   MB: half  end")
-    for name, run in {"lidarslam": partial(run_slam, settings=settings), "kiss-icp": run_kiss_icp}.items():
+    methods: dict[str, Method] = {"lidarslam": partial(run_slam, settings=settings), "kiss-icp": run_kiss_icp}
+    for name, run in methods.items():
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             paced = pool.submit(run, scans, period_s).result()
         print(f"{name:10}{describe(paced, recording.ground_truth, period_s)}", flush=True)

@@ -42,8 +42,9 @@ class Slam:
     A context manager: `close` ends its threads. Methods may be called from several threads; one waits for the other.
 
     Args:
-        config: the path of a YAML file, settings such as `{"odometry.method": "kiss-icp"}` or
-            `{"pose_graph": {"enabled": True}}`, or a `Config`; None: the defaults, as in `lidarslam run`.
+        config: the path of a YAML file, or the name of one that comes with the program; settings such as
+            `{"odometry.method": "kiss-icp"}` or `{"pose_graph": {"enabled": True}}`; or a `Config`. None: the defaults,
+            as in `lidarslam run`.
 
     Raises:
         ConfigError: a setting does not exist or does not fit.
@@ -77,7 +78,8 @@ class Slam:
 
         Args:
             points: (N, 3) or more columns, of which the first three are x, y, z: metres, in the LiDAR frame (x forward,
-                z up) of the instant each was measured at. Or a `Scan`, which has times and stamp of its own.
+                z up) of the instant each was measured at. Or a `Scan`, which has times and stamp of its own, and
+                whatever else goes into maps.
             point_times: (N,) seconds from the stamp at which each point was measured; None when the points are
                 motion compensated, or the times unknown.
             stamp: seconds, after that of the scan before; the pose belongs to this instant. None, then for all scans:
@@ -95,7 +97,7 @@ class Slam:
                 estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
                 localised = self._stages.localise(estimated)
                 total_ms = 1e3 * (time.perf_counter() - started)
-                self._builder.submit(self._build, estimated, localised, total_ms)
+                self._submit(estimated, localised, total_ms)
             return RegisteredScan.of(scan.stamp, localised)
 
     def trajectory(self) -> Trajectory:
@@ -180,6 +182,13 @@ class Slam:
         self._count, self._counts_stamps = self._count + 1, counts_stamps
         self._last_stamp, self._longest_interval_s = seconds, longest_s
         return look_at(scan, self._faults)
+
+    def _submit(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
+        """Leave the rest to the background; an error of an earlier scan may be raised."""
+        try:
+            self._builder.submit(self._build, estimated, localised, total_ms)
+        except Exception as error:
+            raise _map_error(error) from error
 
     def _build(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
         """What of a scan is done in the background."""

@@ -10,10 +10,12 @@ from lidarslam.commands.options import (
     CommandWithExample,
     config_options,
     default_out,
+    map_options,
     odometry_options,
     out_option,
     reader_options,
     take_config,
+    take_map_formats,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
@@ -22,7 +24,7 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 @click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
 @out_option("Directory of the merged map.", "merged/SOURCE_TIME, after the first")
 @odometry_options
-@click.option("--pcd", is_flag=True, help="Write the maps as map.pcd too.")
+@map_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
 @reader_options
 @config_options
@@ -40,10 +42,9 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     from lidarslam.run.progress import show_progress
     from lidarslam.storage.default_places import source_name
 
-    sequence = options["sequence"]
-    config = take_config(options, *sources)
-    out = out or default_out("merged", source_name(sources[0], sequence))
-    outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
+    config, map_formats = take_config(options, *sources), take_map_formats(options)
+    out = out or default_out("merged", source_name(sources[0], config.reader.sequence))
+    outcome = execute(MergeRequest(sources, out, config, map_formats, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:
         note(line)

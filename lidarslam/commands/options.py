@@ -11,6 +11,7 @@ from lidarslam.commands.terminal import note
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
+    from lidarslam.mapping.config import MapFormat
 
 
 class CommandWithExample(click.Command):
@@ -95,6 +96,29 @@ mapping_options = _together(
     ),
     click.option("--no-mapping", is_flag=True, help="The odometry alone, as --mapping off."),
 )
+map_options = _together(
+    click.option(
+        "--map-format",
+        type=click.Choice(["pcd", "laz", "e57"]),
+        multiple=True,
+        help="Write the map as map.pcd, map.laz or map.e57 too; may be repeated.",
+    ),
+    click.option("--pcd", is_flag=True, help="As --map-format pcd."),
+)
+
+
+def take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":
+    """The formats of the map beside .ply; the options they are made of are removed.
+
+    Raises:
+        OutputError: a library for one is not installed.
+    """
+    from lidarslam.mapping.global_map.map_io import require_format
+
+    formats = (*options.pop("map_format"), *(["pcd"] if options.pop("pcd") else []))
+    for one in formats:
+        require_format(one)
+    return tuple(dict.fromkeys(formats))
 
 
 def out_option(what: str, default: str) -> _Decorator:

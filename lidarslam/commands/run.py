@@ -11,12 +11,14 @@ from lidarslam.commands.options import (
     CommandWithExample,
     config_options,
     default_out,
+    map_options,
     mapping_options,
     odometry_options,
     out_option,
     reader_options,
     scan_options,
     take_config,
+    take_map_formats,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
@@ -44,7 +46,8 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
     show_default=True,
     help="Save a Rerun recording; spawn opens a window too.",
 )
-@click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@map_options
+@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @reader_options
@@ -60,10 +63,9 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    sequence = options["sequence"]
-    config = take_config(options, source)
-    out = out or _default_out(source, sequence, options["resume"])
-    request = RunRequest(source, out, config, **options)
+    config, map_formats = take_config(options, source), take_map_formats(options)
+    out = out or _default_out(source, config.reader.sequence, options["resume"])
+    request = RunRequest(source, out, config, map_formats=map_formats, **options)
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished already")
         ctx.exit(EXIT_LOST if lost else 0)

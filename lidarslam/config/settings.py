@@ -6,6 +6,7 @@ Defaults live in the code, beside what consumes them; a file or `--set` holds on
 import difflib
 import reprlib
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -13,6 +14,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
@@ -80,16 +82,16 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     return load_model(Config, path, switches_first, "odometry.kiss_icp.voxel_size_m=0.5")
 
 
-def make_config(given: Config | Path | str | Mapping[str, Any] | None) -> Config:
-    """A configuration, the path of one in YAML, or settings: sections as dictionaries, keys with dots, or both.
+def make_config(given: Config | PathLike[str] | str | Mapping[str, Any] | None) -> Config:
+    """A configuration; the path or name of one in YAML; or settings: sections as dictionaries, keys with dots, or both.
 
     Raises:
         ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
     """
-    if isinstance(given, Config):
-        return given
+    if given is None or isinstance(given, Config):
+        return given or Config()
     if not isinstance(given, Mapping):
-        return load_config(None if given is None else Path(given))
+        return load_config(shipped_files(CONFIGS).get(str(given), Path(given)))
     tree: dict[str, Any] = {}
     for dotted, value in given.items():
         _put(tree, str(dotted), value, f"configuration: {dotted}")

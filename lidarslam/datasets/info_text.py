@@ -7,7 +7,10 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidarslam.core.plain_text import one_line
+from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.registry import choose_reader, open_recording
@@ -122,6 +125,8 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
     yield "points", f"{len(info.first):,} in the first scan{dropped}"
     if info.fields:
         yield "fields", ", ".join(f"{field.name} {field.type_name}" for field in info.fields)
+    yield "intensity", _intensity(info.first)
+    yield "colour", "no" if info.first.colours is None else "yes"
     yield "rings", "no" if info.first.rings is None else "yes"
     yield "point time", _point_time(info)
     yield "ground truth", str(info.ground_truth) if info.ground_truth else "none"
@@ -133,6 +138,13 @@ def _instant(stamp: float) -> str:
     if not _EPOCH_FROM_S <= stamp < _EPOCH_UNTIL_S:
         return f"{stamp:.3f} s"
     return f"{datetime.fromtimestamp(stamp, timezone.utc):%Y-%m-%d %H:%M:%S} UTC ({stamp:.3f})"
+
+
+def _intensity(scan: Scan) -> str:
+    known = None if scan.intensities is None else scan.intensities[np.isfinite(scan.intensities)]
+    if known is None or not len(known):
+        return "no"
+    return f"{known.min():.4g} to {known.max():.4g} in the first scan"
 
 
 def _point_time(info: RecordingInfo) -> str:

@@ -84,7 +84,7 @@ class Stages(Stateful):
         """Add the last scan to the map, unless it is in there."""
         added = self.map.add_pending(next_is_lost)
         if added is not None and self._graph is not None:
-            self._graph_worker.submit(self._graph.draw, *added, self.map.voxel_size_m)
+            self._graph_worker.submit(self._graph.draw, *added)
 
     def finish(self) -> None:
         """Add the last scan to the map, and look at the last pair of scans; more may follow."""

@@ -1,6 +1,7 @@
 """The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
@@ -8,7 +9,7 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
-from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.config import GlobalMapConfig, MapFormat
 from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
@@ -52,6 +53,7 @@ def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMa
         return DrawnMap(None, None)
     moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
     cloud = global_map.cloud(config.min_hits, moved)
+    cloud = replace(cloud, attributes=cloud.attributes.only(config.fields))
     return DrawnMap(cloud, global_map.voxel_size_m, int(moved.sum()))
 
 
@@ -62,7 +64,7 @@ def write_results(
     tracked: Tracked,
     closed: GraphOutcome | None,
     drawn: DrawnMap,
-    pcd: bool = False,
+    map_formats: Sequence[MapFormat] = (),
 ) -> RunOutcome:
     """Write everything; the poses are final.
 
@@ -70,7 +72,7 @@ def write_results(
         directory: of the run.
         config, described: the settings, and what was run, for config.yaml.
         tracked, closed, drawn: the results.
-        pcd: whether the map is written as .pcd too.
+        map_formats: further formats of the map.
     """
     log = tracked.log
     directory.write_text(files.CONFIG, dump_yaml(config, described))
@@ -78,7 +80,7 @@ def write_results(
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))
     directory.write_text(files.SCANS_CSV, log.format_csv())
     metrics = _write_trajectories(directory, tracked)
-    written = write_map(directory, drawn, pcd)
+    written = write_map(directory, drawn, map_formats)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
@@ -87,16 +89,17 @@ def write_results(
     return RunOutcome(summary, metrics, tracked.stopped)
 
 
-def write_map(directory: RunDirectory, drawn: DrawnMap, pcd: bool) -> WrittenMap:
-    """Write a map, unless it is empty."""
+def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFormat] = ()) -> WrittenMap:
+    """Write a map as .ply and in further formats, unless it is empty."""
     cloud = drawn.cloud
     if cloud is None or not len(cloud):
         return WrittenMap(0, drawn.voxel_size_m, drawn.moved)
-    for name in (files.MAP_PLY, files.MAP_PCD) if pcd else (files.MAP_PLY,):
+    for name in (files.MAP_PLY, *(files.MAPS[one] for one in formats)):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
     entropy = sampled_map_entropy(cloud.points)
-    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean)
+    fields = tuple(name for name, _ in cloud.attributes.present())
+    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean, fields)
 
 
 def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:

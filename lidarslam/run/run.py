@@ -60,9 +60,13 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
             drawn = final_map(tracked, closed, config.global_map)
             if drawn.cloud is not None:
                 viewer.show_final_map(drawn.cloud.points)
-        outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, request.pcd)
+        outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, request.map_formats)
     if unfinished is not None:
         unfinished.end(outcome.stopped is not None)
+    if request.report:
+        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+        leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 

@@ -44,9 +44,10 @@ def format_map(written: WrittenMap) -> str:
     if written.voxel_size_m is None:
         return "no map: no scan was registered"
     voxel_cm = 100.0 * written.voxel_size_m
+    fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    return f"map of {count(written.points, 'point')}, voxels of {voxel_cm:.0f} cm{moved}{entropy}"
+    return f"map of {count(written.points, 'point')}, voxels of {voxel_cm:.0f} cm{fields}{moved}{entropy}"
 
 
 def _loops(graph: GraphSummary) -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
@@ -90,13 +91,19 @@ class SlamGraph(Stateful):
         self._selector = KeyframeSelector(self._config.keyframes)
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, self._segment + 1
 
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
+    def draw(
+        self,
+        points: FloatArray,
+        T_world_lidar: FloatArray,
+        voxel_size_m: float,
+        attributes: PointAttributes | None = None,
+    ) -> None:
         """Add points (N, 3) of the latest scan, at its pose as registered, to the submap of the last keyframe."""
         if not self._is_submap_open:
             return
         if self._submap is None:
             self._submap = GlobalMap(voxel_size_m)
-        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar)
+        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar, attributes)
 
     def add(self, scan: GraphScan) -> None:
         """Take the next scan; the points of the one before have been drawn by now."""
@@ -143,16 +150,8 @@ class SlamGraph(Stateful):
         frames = first_connected(len(firsts), [(int(of[loop.first]), int(of[loop.second])) for loop in loops])
         registered = np.array(self.scan_poses)
         poses = in_frames(optimised.poses, frames[of], registered[scans])
-        return Corrected(
-            corrected_recordings(registered, firsts, scans, poses),
-            scans,
-            poses,
-            tuple(closures),
-            inliers,
-            (*self._edges, *loops),
-            firsts,
-            frames,
-        )
+        corrected, edges = corrected_recordings(registered, firsts, scans, poses), (*self._edges, *loops)
+        return Corrected(corrected, scans, poses, tuple(closures), inliers, edges, firsts, frames)
 
     def draw_map(self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None) -> GlobalMap:
         """The submaps of some recordings, or of all, at their keyframes' corrected poses."""

@@ -287,6 +287,8 @@ def test_configurations_of_every_form(tmp_path: Path) -> None:
     for given in (file, str(file), SETTINGS, Config.model_validate({"odometry": {"method": "constant-velocity"}})):
         with Slam(given) as slam:
             assert slam._config.odometry.method == "constant-velocity"
+    with Slam("indoor") as slam:
+        assert slam._config != Config()
 
 
 @pytest.mark.parametrize(

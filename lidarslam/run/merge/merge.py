@@ -170,7 +170,7 @@ def _write(
                 views.append(part.tracked.views.placed(common.T_world_lidar[begin : begin + part.scans]))
             begin += part.scans
         drawn = drawn_map(common.global_map, PlacedViews.join(views), request.config.global_map)
-        written = write_map(directory, drawn, request.pcd)
+        written = write_map(directory, drawn, request.map_formats)
     recordings = tuple(_entry(part, runs[index], index in joined) for index, part in enumerate(parts))
     summary = MergeSummary(
         recordings=recordings,
@@ -201,7 +201,7 @@ def _write_run(part: _Part, finished: FinishedGraph | None, index: int, is_joine
     drawn = final_map(part.tracked, closed, part.request.config.global_map)
     request = part.request
     return write_results(
-        part.directory, request.config, describe_run(request), part.tracked, closed, drawn, request.pcd
+        part.directory, request.config, describe_run(request), part.tracked, closed, drawn, request.map_formats
     )
 
 
