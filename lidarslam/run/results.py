@@ -1,9 +1,11 @@
 """The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
+import logging
 from dataclasses import dataclass
 
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.geometry import inverse
+from lidarslam.core.plain_text import count
 from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
@@ -20,6 +22,8 @@ from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class RunOutcome:
@@ -28,6 +32,7 @@ class RunOutcome:
     summary: RunSummary  # the run in numbers
     metrics: TrajectoryMetrics | None  # its errors; None without ground truth
     stopped: str | None = None  # why it ended before its last scan, None when it did not
+    is_resumable: bool = False  # whether it can be continued from a checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +65,7 @@ def write_results(
 ) -> RunOutcome:
     """Write everything; the poses are final."""
     config, log = request.config, tracked.log
+    logger.info("writing the results of %s", count(len(log), "scan"))
     directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))

@@ -18,6 +18,14 @@ def format_outcome(out: Path, outcome: RunOutcome) -> str:
     return "\n".join(_lines(out, outcome))
 
 
+def format_stop(out: Path, outcome: RunOutcome) -> str:
+    """A line about a run that ended before its last scan."""
+    done = f"stopped after {count(outcome.summary.scans, 'scan')}: {outcome.stopped}"
+    if outcome.is_resumable:
+        return f"{done}; continue with --resume"
+    return f"{done}; {out} holds the results so far, but no checkpoint to continue from; --overwrite begins again"
+
+
 def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
