@@ -38,6 +38,8 @@ def view(
     if picture is not None:
         _draw_map(runs, picture)
         return
+    if save is not None and save.suffix.lower() != ".rrd":
+        raise InputError(f"{save}: a Rerun recording must end in .rrd; for a picture use --picture {save}")
     config = load_config(config_file, settings).viewer
     finished = [load_run(path) for path in runs]
     from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs

@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.plain_text import count
+from lidarslam.core.plain_text import count, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
 from lidarslam.storage.directory import SCANS_CSV, SUMMARY
 
+# A speed that differs less is that of the recording.
+_ALIKE = 1.05
 # Stretches of lost scans that are listed; summary.json has them all.
 _LISTED = 3
 
@@ -29,9 +31,9 @@ def format_stop(out: Path, outcome: RunOutcome) -> str:
 def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
-    speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
     total = summary.ms_per_scan["total"]
-    yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
+    speed = _speed(summary.realtime_factor)
+    yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:,.0f} MB of memory"
     yield format_map(summary.map)
     if summary.graph is not None:
         yield _loops(summary.graph)
@@ -43,14 +45,23 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     yield f"written to {out}"
 
 
+def _speed(realtime_factor: float | None) -> str:
+    """By the time of all scans, the slow first one included."""
+    if realtime_factor is None or realtime_factor <= 0.0:
+        return ""
+    times = max(realtime_factor, 1.0 / realtime_factor)
+    if times < _ALIKE:
+        return ", as fast as recorded"
+    return f", {times:.1f} times {'faster' if realtime_factor > 1.0 else 'slower'} than recorded"
+
+
 def format_map(written: WrittenMap) -> str:
     """A line about a map."""
     if written.voxel_size_m is None:
         return "no map: no scan was registered"
-    voxel_cm = 100.0 * written.voxel_size_m
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    return f"map of {count(written.points, 'point')}, voxels of {voxel_cm:.0f} cm{moved}{entropy}"
+    return f"map of {count(written.points, 'point')}, voxels of {small_length(written.voxel_size_m)}{moved}{entropy}"
 
 
 def _loops(graph: GraphSummary) -> str:
@@ -62,7 +73,10 @@ def _loops(graph: GraphSummary) -> str:
 
 def _accuracy(metrics: TrajectoryMetrics) -> Iterator[str]:
     errors = metrics.errors
-    yield f"against ground truth: ATE {errors.ate_rmse_m:.3f} m, {errors.ate_rotation_rmse_deg:.2f} deg"
+    steps = ""
+    if errors.rpe_translation_rmse_m is not None and errors.rpe_rotation_rmse_deg is not None:
+        steps = f"; from scan to scan {errors.rpe_translation_rmse_m:.3f} m, {errors.rpe_rotation_rmse_deg:.2f} deg"
+    yield f"against ground truth: ATE {errors.ate_rmse_m:.3f} m, {errors.ate_rotation_rmse_deg:.2f} deg{steps}"
     if metrics.kitti is not None:
         drift = metrics.kitti.overall
         yield f"KITTI drift {drift.translation_percent:.2f} %, {100.0 * drift.rotation_deg_per_m:.2f} deg per 100 m"

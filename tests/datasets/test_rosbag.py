@@ -541,4 +541,4 @@ def test_a_scan_whose_times_are_worth_nothing_keeps_its_points(bag_kit, make_swe
     scans = list(recording.scans(faults=faults))
     assert [scan.time_offsets is None for scan in scans] == [False, False, True, False]
     assert [len(scan) for scan in scans] == [200] * 4
-    assert faults.warnings()[0].startswith("1 scans have no usable times of their points")
+    assert faults.warnings()[0].startswith("1 scan has no usable times of its points")

@@ -379,7 +379,7 @@ def test_stamps_that_do_not_increase_are_interpolated(tmp_path, rng):
     (tmp_path / "times.txt").write_text("1.0\n1.5\n1.5\n2.5\n")
     recording = open_recording(tmp_path)
     np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [1.0, 1.5, 2.0, 2.5])
-    assert any("1 stamps of times.txt" in note for note in recording.describe().notes)
+    assert any("1 stamp of times.txt" in note for note in recording.describe().notes)
 
 
 @pytest.mark.parametrize("name", ["ground_truth.tum", "groundtruth.tum", "groundtruth.txt", "ground_truth.txt"])

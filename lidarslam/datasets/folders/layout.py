@@ -46,7 +46,7 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
         warnings += faults
         if replaced:
             warnings.append(
-                f"{replaced} stamps of {stamp_file.name} repeat, run backwards or far ahead and were interpolated."
+                f"{count(replaced, 'stamp')} of {stamp_file.name} interpolated: repeated, backwards or far ahead."
             )
     elif named is not None and len(set(named)) == len(named):
         notes.append("The stamps are the file names.")
@@ -74,10 +74,11 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     skipped = sorted(path.name for path in set(candidates) - set(files))
     shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
     gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
+    no_files = "is no file" if len(gone) == 1 else "are no files"
     return (
         files,
-        [f"{len(skipped)} other files were not taken for scans: {shown}."] if skipped else [],
-        [f"{len(gone)} scans are no files that can be opened, such as {gone[0]}."] if gone else [],
+        [f"{count(len(skipped), 'other file')} not taken for scans: {shown}."] if skipped else [],
+        [f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}."] if gone else [],
     )
 
 
