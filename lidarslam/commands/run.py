@@ -57,9 +57,9 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
     """Build trajectory and map of a recording."""
     from lidarslam.run.progress import show_progress
     from lidarslam.run.request import RunRequest
-    from lidarslam.run.resuming import lost_when_finished
+    from lidarslam.run.resuming import abandoned, lost_when_finished
     from lidarslam.run.run import execute
-    from lidarslam.run.summary_text import format_outcome
+    from lidarslam.run.summary_text import format_outcome, format_stop
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
@@ -69,11 +69,15 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished already")
         ctx.exit(EXIT_LOST if lost else 0)
-    with show_progress(source.name) as progress:
-        outcome = execute(request, progress)
+    try:
+        with show_progress(source.name) as progress:
+            outcome = execute(request, progress)
+    except KeyboardInterrupt:
+        note(abandoned(out))
+        ctx.exit(EXIT_MENDABLE)
     say(format_outcome(out, outcome))
     if outcome.stopped is not None:
-        note(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; continue with --resume")
+        note(format_stop(out, outcome))
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.went_astray:
         ctx.exit(EXIT_LOST)
