@@ -36,7 +36,6 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-<<<<<<< HEAD
 def as_typed(program: str) -> str:
     """The word that starts a program of this environment: its name where the shell finds it, else the path of its file.
 
@@ -47,14 +46,14 @@ def as_typed(program: str) -> str:
     if not beside.is_file() or (found is not None and beside.samefile(found)):
         return program
     return f"./{beside.relative_to(here)}" if beside.is_relative_to(here) else str(beside)
-=======
+
+
 def small_length(metres: float) -> str:
     """A length in the unit that suits it: 24 cm, 0.5 mm."""
     for factor, unit in ((1.0, "m"), (100.0, "cm")):
         if round(factor * metres, 6) >= 1.0:
             return f"{factor * metres:.3g} {unit}"
     return f"{1000.0 * metres:.2g} mm"
->>>>>>> main
 
 
 def _spelt(match: re.Match[str]) -> str:

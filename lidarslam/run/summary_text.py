@@ -4,11 +4,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-<<<<<<< HEAD
-from lidarslam.core.plain_text import as_typed, count
-=======
-from lidarslam.core.plain_text import count, small_length
->>>>>>> main
+from lidarslam.core.plain_text import as_typed, count, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap

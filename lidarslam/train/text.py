@@ -5,11 +5,7 @@ from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 
-<<<<<<< HEAD
-from lidarslam.core.plain_text import as_typed
-=======
-from lidarslam.core.plain_text import count
->>>>>>> main
+from lidarslam.core.plain_text import as_typed, count
 from lidarslam.odometry.training.training import Validation
 
 
