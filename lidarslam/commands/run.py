@@ -51,20 +51,22 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.run.progress import show_progress
-    from lidarslam.run.request import RunRequest
-    from lidarslam.run.resuming import lost_when_finished
-    from lidarslam.run.run import execute
-    from lidarslam.run.summary_text import format_outcome
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    config = take_config(options, source)
-    request = RunRequest(source, out, config, **options)
-    if request.resume and (lost := lost_when_finished(request)) is not None:
-        say(f"{out}: is finished already")
-        ctx.exit(EXIT_LOST if lost else 0)
     with show_progress(source.name) as progress:
-        outcome = execute(request, progress)
+        progress.phase("loading the program")
+        from lidarslam.run.request import RunRequest
+        from lidarslam.run.resuming import lost_when_finished
+        from lidarslam.run.run import execute
+        from lidarslam.run.summary_text import format_outcome
+
+        config = take_config(options, source)
+        request = RunRequest(source, out, config, **options)
+        if request.resume and (lost := lost_when_finished(request)) is not None:
+            say(f"{out}: is finished already")
+            ctx.exit(EXIT_LOST if lost else 0)
+        outcome = execute(request, progress, progress.phase)
     say(format_outcome(out, outcome))
     if outcome.stopped is not None:
         note(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; continue with --resume")
