@@ -1,12 +1,13 @@
 """Building the global map: each scan is added one scan late, once the motion it was deskewed with is confirmed."""
 
+import logging
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
@@ -14,6 +15,8 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.slides.slides import SlideCheck
 from lidarslam.pipeline.estimates import Localised, SweepMotion
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,9 @@ class MapBuilder(Stateful):
             return scan
         if self.voxel_size_m is None:
             self.voxel_size_m = voxel_size_for(scan.points)
+            logger.info(
+                "voxels of the map: %.3g m, 1/50 of the first scan's median range, from 5 to 25 cm", self.voxel_size_m
+            )
         thinned = scan.select(one_per_cell(scan.points, self.voxel_size_m))
         squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
         return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
@@ -67,8 +73,8 @@ class MapBuilder(Stateful):
             self._pending = PendingScan(self._scans, thinned, localised.motion, points, localised.T_world_lidar)
         self._scans += 1
 
-    def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray] | None:
-        """Add the scan before; its points (N, 3) and pose as they were added, None where there is none.
+    def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray, float, PointAttributes] | None:
+        """Add the scan before; its points (N, 3), pose, voxel size and attributes as added, None where there is none.
 
         Where tracking was lost right after it, the motion after its stamp is unknown: it is deskewed again with the
         motion before.
@@ -79,8 +85,9 @@ class MapBuilder(Stateful):
         points = SweepMotion(scan.motion.before, None).compensate(scan.thinned) if next_is_lost else scan.points
         if self.global_map is None:
             self.global_map = GlobalMap(self.voxel_size_m)
-        self.global_map.add(points, scan.T_world_lidar)
+        attributes = scan.thinned.attributes(self._config.fields)
+        self.global_map.add(points, scan.T_world_lidar, attributes)
         self.slides.add(points, scan.number, scan.T_world_lidar)
         if self._config.leave_out_moved:
             self.views.add(points, scan.number)
-        return points, scan.T_world_lidar
+        return points, scan.T_world_lidar, self.voxel_size_m, attributes

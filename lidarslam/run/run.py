@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,9 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
-from lidarslam.run.request import RunRequest
+from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.resuming import describe_computed
 from lidarslam.run.scan_log import ScanLog
@@ -50,32 +52,43 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
         raise InputError(
             f"{request.source}: none of its {len(recording)} scans is left after --start, --stop and --step"
         )
-    with ExitStack() as stack:
-        compiling = stack.enter_context(CompileAhead(parts_of(config)))
-        phase("loading the odometry")
-        odometry = open_odometry(config, request.prior)
-        stack.callback(odometry.close)
-        directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
-        unfinished = None
-        if request.resumable:
-            description = describe_computed(request, recording)
-            unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
-        log, graph = ScanLog(), _open_graph(config, directory, unfinished)
-        if graph is not None:
-            stack.callback(graph.close)
-        with _viewing(request, recording.name, directory, log) as viewer:
-            compiling.wait_for_first_scan(phase)
-            phase("reading the first scans")
-            tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
-            compiling.wait_for_all(phase)
-            phase("writing the results")
-            closed = close_loops(graph, tracked.global_map, log, viewer)
-            drawn = final_map(tracked, closed, config.global_map)
-            if drawn.cloud is not None:
-                viewer.show_final_map(drawn.cloud.points)
-        outcome = write_results(directory, request, tracked, closed, drawn)
-    if unfinished is not None:
-        unfinished.end(outcome.stopped is not None)
+    log_choices(request, chosen, len(recording))
+    with Interruptions() as interruptions:
+        with ExitStack() as stack:
+            compiling = stack.enter_context(CompileAhead(parts_of(config)))
+            phase("loading the odometry")
+            odometry = open_odometry(config, request.prior)
+            stack.callback(odometry.close)
+            directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
+            unfinished = None
+            if request.resumable:
+                description = describe_computed(request, recording)
+                unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
+            log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+            if graph is not None:
+                stack.callback(graph.close)
+            with _viewing(request, recording.name, directory, log) as viewer:
+                compiling.wait_for_first_scan(phase)
+                phase("reading the first scans")
+                tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
+                interruptions.protect_results()
+                compiling.wait_for_all(phase)
+                phase("writing the results")
+                closed = close_loops(graph, tracked.global_map, log, viewer)
+                drawn = final_map(tracked, closed, config.global_map)
+                if drawn.cloud is not None:
+                    viewer.show_final_map(drawn.cloud.points)
+            described = describe_run(request)
+            outcome = write_results(directory, config, described, tracked, closed, drawn, request.map_formats)
+        if unfinished is not None:
+            unfinished.end(outcome.stopped is not None)
+            is_resumable = outcome.stopped is not None and unfinished.state.is_file()
+            outcome = replace(outcome, is_resumable=is_resumable)
+    if request.report:
+        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+        phase("drawing the report")
+        leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 
