@@ -12,7 +12,7 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline.compile_ahead import CompileAhead
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest, describe_run, log_choices
@@ -55,7 +55,7 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
     log_choices(request, chosen, len(recording))
     with Interruptions() as interruptions:
         with ExitStack() as stack:
-            compiling = stack.enter_context(CompileAhead(config))
+            compiling = stack.enter_context(CompileAhead(parts_of(config)))
             phase("loading the odometry")
             odometry = open_odometry(config, request.prior)
             stack.callback(odometry.close)
