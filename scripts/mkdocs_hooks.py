@@ -38,4 +38,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def on_page_content(html: str, **_: Any) -> str:
     """TeX, as arithmatex leaves it, becomes MathML, which browsers show without a script."""
-    return _MATH.sub(lambda tex: convert(unescape(tex[2]), "block" if tex[1] == "[" else "inline"), html)
+    return _MATH.sub(_math_ml, html)
+
+
+def _math_ml(tex: re.Match[str]) -> str:
+    if tex[1] == "(":
+        return convert(unescape(tex[2]))
+    return f'<div class="math">{convert(unescape(tex[2]), display="block")}</div>'

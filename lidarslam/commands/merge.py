@@ -42,9 +42,8 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     from lidarslam.run.progress import show_progress
     from lidarslam.storage.default_places import source_name
 
-    sequence = options["sequence"]
     config, map_formats = take_config(options, *sources), take_map_formats(options)
-    out = out or default_out("merged", source_name(sources[0], sequence))
+    out = out or default_out("merged", source_name(sources[0], config.reader.sequence))
     outcome = execute(MergeRequest(sources, out, config, map_formats, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:

@@ -19,8 +19,9 @@ from lidarslam.run.machine import as_typed
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
-from lidarslam.storage.finished_run import load_map, load_run
-from lidarslam.viewer.picture import draw, height_colours, save_picture
+from lidarslam.storage.finished_run import load_run
+from lidarslam.viewer.drawn_runs import load_drawn_runs
+from lidarslam.viewer.picture import draw_runs, save_picture
 
 RECORDING, REPLAY = "recording", "demo.rrd"
 METHODS = "learned+map+graph,kiss-icp"
@@ -69,9 +70,8 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
 
 
 def _picture(out: Path, place: Path) -> Path:
-    cloud = load_map(place)
     path = out / f"{place.name}.png"
-    save_picture(path, draw(cloud.points, height_colours(cloud.points), cloud.normals))
+    save_picture(path, draw_runs(load_drawn_runs([place])).pixels)
     return path
 
 

@@ -23,10 +23,13 @@ def new_place(folder: Path, name: str) -> Path:
 
 
 def source_name(source: Path, sequence: str | None = None) -> str:
-    """What the results of a recording are named after: its file or folder without suffix and time, and the sequence."""
+    """What the results of a recording are named after: its file or folder, without suffix and time.
+
+    Of a KITTI odometry root, followed by the sequence.
+    """
     source = source.resolve()
     name = _TIMED.sub("", source.name if source.is_dir() else source.stem) or "recording"
-    return name if sequence is None else f"{name}_{sequence}"
+    return f"{name}_{sequence}" if sequence is not None and (source / "sequences").is_dir() else name
 
 
 def latest_run() -> Path | None:

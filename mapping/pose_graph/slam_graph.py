@@ -150,16 +150,8 @@ class SlamGraph(Stateful):
         frames = first_connected(len(firsts), [(int(of[loop.first]), int(of[loop.second])) for loop in loops])
         registered = np.array(self.scan_poses)
         poses = in_frames(optimised.poses, frames[of], registered[scans])
-        return Corrected(
-            corrected_recordings(registered, firsts, scans, poses),
-            scans,
-            poses,
-            tuple(closures),
-            inliers,
-            (*self._edges, *loops),
-            firsts,
-            frames,
-        )
+        corrected, edges = corrected_recordings(registered, firsts, scans, poses), (*self._edges, *loops)
+        return Corrected(corrected, scans, poses, tuple(closures), inliers, edges, firsts, frames)
 
     def draw_map(self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None) -> GlobalMap:
         """The submaps of some recordings, or of all, at their keyframes' corrected poses."""

@@ -82,6 +82,8 @@ def test_runs_in_the_same_second_do_not_meet() -> None:
         ("site.v2.mcap", None, "site.v2"),
         ("drive_0005.sync/", None, "drive_0005.sync"),
         ("KITTI/", "04", "KITTI_04"),
+        ("KITTI/sequences/04/", "04", "04"),
+        ("site.mcap", "04", "site"),
         ("recordings/office_2026-01-31_12-00-00/", None, "office"),
         ("recordings/office_2026-01-31_12-00-00-2/", None, "office"),
         ("2011_09_26_drive_0005_sync/", None, "2011_09_26_drive_0005_sync"),
@@ -91,6 +93,7 @@ def test_runs_in_the_same_second_do_not_meet() -> None:
 def test_results_bear_the_name_of_the_recording(source: str, sequence: str | None, name: str) -> None:
     if source.endswith("/"):
         Path(source).mkdir(parents=True, exist_ok=True)
+        Path("KITTI/sequences").mkdir(parents=True, exist_ok=True)
     assert source_name(Path(source), sequence) == name
 
 

@@ -38,6 +38,7 @@ class EvaluateRequest:
     out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
     needs_reference: bool = True  # whether it is an error that there is no reference
     write: bool = True  # whether the figures are written
+    report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +73,10 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     check_error_files(request.errors)
     estimate = read_estimate(request.run, request.map_file)
     notes: list[str] = []
-    reference, metrics = _reference(request, estimate, notes), None
+    reference, metrics, trajectory = _reference(request, estimate, notes), None, None
     if reference is not None:
         trajectories = pair(estimate, reference)
+        trajectory = trajectories[0]
         metrics = evaluate_trajectory(*trajectories, request.tolerance_s, request.max_gap_s, request.alignment)
         notes += [warning] if (warning := disagreement(metrics)) is not None else []
     # Poses of KITTI's camera do not give the LiDAR's world.
@@ -97,7 +99,24 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     if compared is not None:
         for path in request.errors:
             write_errors(path, compared.comparison, compared.positions, request.errors_clip_m)
+    if request.report and estimate.run is not None and request.out is None:
+        _draw_report(request, estimate.run, evaluation, trajectory if in_camera else None)
     return evaluation
+
+
+def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:
+    """The page of the run with its errors; `compared` are the poses in the camera's frame, if they were compared."""
+    from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+    accuracy = Accuracy(
+        evaluation.metrics,
+        request.reference.name if isinstance(request.reference, Path) else "ground truth",
+        compared,
+        None if evaluation.map is None else evaluation.map.json,
+        None if evaluation.map is None else evaluation.map.errors,
+        tuple(evaluation.notes),
+    )
+    leave_report(run, accuracy)
 
 
 def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -> Poses | None:
