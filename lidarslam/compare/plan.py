@@ -12,9 +12,10 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.comparison.comparison import MissingRecording
 from lidarslam.run.request import RunRequest
 from lidarslam.storage import directory as files
+from lidarslam.storage.comparison_folder import COMPARISON
 
 # In the comparison's folder; each recording's folder holds its own comparison.json.
-COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"
+REPORT_HTML, REPORT_MD = "report.html", "report.md"
 # Beside the recordings' folders: recordings that a benchmark has made.
 RECORDINGS = "recordings"
 
@@ -87,6 +88,8 @@ def _check_folder(request: CompareRequest, planned: list[PlannedRecording]) -> N
         raise OutputError(f"{out}: a file is in the way; name another directory")
     if any(out.resolve() == recording.source.resolve() for recording in planned):
         raise OutputError(f"{out}: is the recording itself; name another directory for the comparison")
+    if (out / files.TRAJECTORY_TUM).is_file() and (out / files.CONFIG).is_file():
+        raise OutputError(f"{out}: holds a run; name another directory for the comparison")
     if request.overwrite or request.reuse:
         return
     folders = [run.out for recording in planned for run in recording.runs]

@@ -1,5 +1,6 @@
 """The pose graph of a run: begun with it, and in the end trajectory and map corrected by it."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from lidarslam.viewer.viewer import Viewer
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.correction import Corrected
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,12 +94,28 @@ def close_loops(
     """Correct the log, and show it, once all scans are there; None where there is nothing to correct."""
     if graph is None or global_map is None:
         return None
-    finished = FinishedGraph.of_recordings(graph, [len(log)], global_map.voxel_size_m)
-    closed = None if finished is None else finished.outcome([0])
+    logger.info("optimising the pose graph")
+    closed = _corrected(graph, graph.finish(), global_map.voxel_size_m, log)
     if closed is not None:
-        log.correct(closed.T_world_lidar)
         pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
+    return closed
+
+
+def loops_so_far(graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog) -> "GraphOutcome | None":
+    """Correct the log with the loops that are closed by now; more scans may follow."""
+    if graph is None or global_map is None:
+        return None
+    return _corrected(graph, graph.present(), global_map.voxel_size_m, log)
+
+
+def _corrected(
+    graph: "SlamGraph", result: "Corrected | None", voxel_size_m: float, log: ScanLog
+) -> "GraphOutcome | None":
+    """Correct the log of one recording."""
+    closed = None if result is None else FinishedGraph(graph, result, (len(log),), voxel_size_m).outcome([0])
+    if closed is not None:
+        log.correct(closed.T_world_lidar)
     return closed
 
 

@@ -28,6 +28,9 @@ SCANS_CSV = "scans.csv"
 SUMMARY = "summary.json"
 METRICS = "metrics.json"
 RERUN = "recording.rrd"
+REPORT = "report.html"
+MAP_PNG = "map.png"
+TRAJECTORY_PNG = "trajectory.png"
 
 FILES = (
     CONFIG,
@@ -41,11 +44,15 @@ FILES = (
     SUMMARY,
     METRICS,
     RERUN,
+    REPORT,
+    MAP_PNG,
+    TRAJECTORY_PNG,
 )
 
 # The checkpoint of a run that is at work or was stopped, see `lidarslam.storage.unfinished`.
 UNFINISHED = "unfinished"
 ABOUT = f"{UNFINISHED}/run.json"
+STATE = f"{UNFINISHED}/state.npz"
 
 
 class RunDirectory:

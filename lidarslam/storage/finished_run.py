@@ -20,8 +20,10 @@ from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
+from lidarslam.datasets.unrecognised import absent
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
+from lidarslam.storage.not_a_run import not_a_run
 from lidarslam.storage.unfinished import require_whole
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
@@ -48,7 +50,8 @@ def load_run(path: Path) -> FinishedRun:
         InputError: there is no run, or a file of it is damaged.
     """
     trajectory = read_trajectory(path)
-    lost, loops = _lost(path / files.SCANS_CSV, len(trajectory)), _loops(path, len(trajectory))
+    statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
+    lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
     cloud = load_map(path)
     return FinishedRun(path.resolve().name, trajectory, lost, cloud.points, loops, cloud.attributes)
 
@@ -62,8 +65,8 @@ def read_trajectory(path: Path) -> Trajectory:
     require_whole(path)
     file = path / files.TRAJECTORY_TUM
     if not file.is_file():
-        raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
-    trajectory, scans = read_tum(file), _summary(path).get("scans")
+        raise InputError(not_a_run(path))
+    trajectory, scans = read_tum(file), read_summary(path).get("scans")
     if scans not in (None, len(trajectory)):
         raise InputError(
             f"{file}: holds {len(trajectory):,} poses, {files.SUMMARY} says {scans:,} scans: one of them is cut off;"
@@ -80,8 +83,10 @@ def load_map(path: Path) -> PointCloud:
     """
     file = path / files.MAP_PLY if path.is_dir() else path
     if not path.exists():
-        raise InputError(f"{path}: no such file")
+        raise InputError(absent(path))
     require_whole(path)
+    if path.is_dir() and not file.is_file() and not (path / files.TRAJECTORY_TUM).is_file():
+        raise InputError(not_a_run(path))
     if not file.is_file() or not file.stat().st_size:
         return PointCloud(np.empty((0, 3)), np.empty((0, 3)))
     read = _CLOUD_READERS.get(file.suffix.lower())
@@ -118,8 +123,12 @@ def _attributes(table: NDArray[np.void]) -> PointAttributes:
     )
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    """The content of summary.json, empty when there is none."""
+def read_summary(path: Path) -> dict[str, Any]:
+    """The content of a run's summary.json, empty when there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
     file = path / files.SUMMARY
     if not file.is_file():
         return {}
@@ -135,7 +144,7 @@ def _summary(path: Path) -> dict[str, Any]:
 def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     """The loops that a run closed; none for a run without a graph."""
     try:
-        loops = (_summary(path).get("pose_graph") or {"loops": []})["loops"]
+        loops = (read_summary(path).get("pose_graph") or {"loops": []})["loops"]
         pairs = [(loop["first_scan"], loop["second_scan"]) for loop in loops if loop["accepted"]]
         found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -143,19 +152,23 @@ def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     return found[((found >= 0) & (found < scans)).all(axis=1)]
 
 
-def _lost(scans_csv: Path, poses: int) -> NDArray[np.bool_]:
-    if not scans_csv.is_file():
-        return np.zeros(poses, dtype=np.bool_)
+def read_statuses(path: Path, poses: int) -> list[Status]:
+    """The status of each scan of a run; ok where no table has been kept.
+
+    Raises:
+        InputError: the table is damaged, or has not a row for each pose.
+    """
+    file = path / files.SCANS_CSV
+    if not file.is_file():
+        return [Status.OK] * poses
     try:
-        with scans_csv.open(encoding="utf-8", newline="") as rows:
-            statuses = [row["status"] for row in csv.DictReader(rows)]
-    except (KeyError, UnicodeDecodeError, csv.Error) as error:
-        raise _damaged(scans_csv, "a run's table", error) from error
+        with file.open(encoding="utf-8", newline="") as rows:
+            statuses = [Status(row["status"]) for row in csv.DictReader(rows)]
+    except (KeyError, ValueError, csv.Error) as error:  # not UTF-8 is a ValueError
+        raise _damaged(file, "a run's table", error) from error
     if len(statuses) != poses:
-        raise InputError(
-            f"{scans_csv}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again"
-        )
-    return np.array([status == Status.LOST.value for status in statuses], dtype=np.bool_)
+        raise InputError(f"{file}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again")
+    return statuses
 
 
 def _damaged(file: Path, kind: str, error: Exception) -> InputError:
