@@ -32,8 +32,8 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     total = summary.ms_per_scan["total"]
-    speed = _speed(summary.realtime_factor)
-    yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:,.0f} MB of memory"
+    speed, memory = _speed(summary.realtime_factor), f"{summary.peak_rss_mb:,.0f} MB of memory"
+    yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms){speed}, {memory}"
     yield format_map(summary.map)
     if summary.graph is not None:
         yield _loops(summary.graph)
