@@ -20,6 +20,8 @@ _URL = re.compile(r"[a-z][a-z0-9+]+:/", re.IGNORECASE)
 # Of a run's config.yaml.
 _SOURCE = re.compile(r"^  source: (.+?)(?: +#.*)?$", re.MULTILINE)
 
+# Readers of recordings of many folders; scans and bags may lie anywhere.
+_LAYOUTS = ("kitti-odometry", "kitti-raw")
 _CONVERT = "convert each scan to .ply, .pcd or .npy"
 _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), "images", "name the folder with the LiDAR's scans"),
@@ -88,8 +90,8 @@ def result_of_program(source: Path) -> str | None:
 def unrecognised(source: Path, reader_of: ReaderOf) -> str | None:
     """What else it is and what to do, as far as names alone show it; None where they do not."""
     for above in islice(source.resolve().parents, 2):
-        reader = reader_of(above)
-        if reader is not None and reader != "scan-folder":
+        reader = _reader(above, reader_of)
+        if reader in _LAYOUTS or (reader == "rosbag" and source.name == "metadata.yaml"):
             return f"{source}: lies in a recording ({reader}); name that: {above}"
     if source.is_dir() and (found := _recordings_in(source, reader_of)):
         reader = reader_of(found[0])

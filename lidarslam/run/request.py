@@ -9,6 +9,7 @@ from typing import Any
 
 from lidarslam.config.settings import Config
 from lidarslam.core.plain_text import count
+from lidarslam.mapping.config import MapFormat
 from lidarslam.viewer.viewer import RerunMode
 
 logger = logging.getLogger(__name__)
@@ -27,10 +28,11 @@ class RunRequest:
     step: int = 1
     prior: Path | None = None  # TUM file of an external odometry, for `odometry.method: external`
     rerun: RerunMode = "off"  # no Rerun recording, one in the run directory, or that and a window
-    pcd: bool = False  # whether the map is written as .pcd too
+    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
     resumable: bool = True  # whether checkpoints are saved
+    report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
 def log_choices(request: RunRequest, scans: range, recorded: int) -> None:

@@ -14,7 +14,7 @@ from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
-from lidarslam.run.request import RunRequest, log_choices
+from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.resuming import describe_computed
 from lidarslam.run.scan_log import ScanLog
@@ -65,11 +65,16 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
                 drawn = final_map(tracked, closed, config.global_map)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
-            outcome = write_results(directory, request, tracked, closed, drawn)
+            formats = request.map_formats
+            outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, formats)
         if unfinished is not None:
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
+    if request.report:
+        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+        leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 
