@@ -19,9 +19,8 @@ from lidarslam.commands.info import info
 from lidarslam.commands.merge import merge
 from lidarslam.commands.run import run
 from lidarslam.commands.simulate import simulate
-from lidarslam.commands.terminal import EXIT_MENDABLE, note
+from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
 from lidarslam.commands.train import train
-from lidarslam.commands.verbosity import prepare_log, verbose_option
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.run.interruption import ended_like_interrupted

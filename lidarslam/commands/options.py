@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarslam.commands.names import Registered, ShippedFile
-from lidarslam.commands.terminal import note
-from lidarslam.commands.verbosity import verbose_option
+from lidarslam.commands.terminal import note, verbose_option
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config

@@ -71,10 +71,10 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
-    if request.report:
-        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+        if request.report:
+            from lidarslam.viewer.page.run_report import Accuracy, leave_report
 
-        leave_report(request.out, Accuracy(outcome.metrics))
+            leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 
