@@ -34,9 +34,9 @@ def prepare_log() -> None:
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
 
 
-def _log_more(_ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
-    if is_asked:
-        logging.getLogger("lidarslam").setLevel(logging.INFO)
+def _log_more(ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
+    if is_asked or ctx.parent is None:  # before the command, where one that comes after it is not known yet
+        logging.getLogger("lidarslam").setLevel(logging.INFO if is_asked else logging.NOTSET)
 
 
 def verbose_option() -> click.Option:

@@ -33,10 +33,10 @@ _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ),
     (
         (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar", ".zst"),
-        "an archive",
+        "packed",
         "unpack it and name the result",
     ),
-    ((".las", ".laz", ".e57"), "survey point clouds, which are not read as scans", _CONVERT),
+    ((".las", ".laz", ".e57"), "survey formats, which are not read as scans", _CONVERT),
     ((".csv", ".xyz", ".pts", ".asc"), "points as text, which are not read as scans", _CONVERT),
     ((".tum", ".g2o"), "poses, not scans", "name the recording; lidarslam evaluate compares trajectories"),
     ((".rrd",), "a Rerun recording", "open it with `rerun FILE`"),
@@ -95,9 +95,14 @@ def unrecognised(source: Path, reader_of: ReaderOf) -> str | None:
             return f"{source}: lies in a recording ({reader}); name that: {above}"
     if source.is_dir() and (found := _recordings_in(source, reader_of)):
         reader = reader_of(found[0])
+        if len(found) == 1:
+            return f"{source}: holds the recording {found[0]} ({reader}); name that"
         more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
         listed = ", ".join(str(path) for path in found[:_LISTED])
         return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {listed}{more}"
+    results = [entry for entry in _entries(source) if entry.is_dir() and result_of_program(entry) is not None]
+    if results:
+        return f"{source}: holds results of lidarslam, such as {results[0]}, and no recording; name the recording"
     return _other_kind(source)
 
 
@@ -130,5 +135,6 @@ def _other_kind(source: Path) -> str | None:
     for suffixes, kind, remedy in _KINDS:
         suffix = max(suffixes, key=lambda suffix: counts[suffix])
         if 2 * counts[suffix] >= max(1, len(files)):
-            return f"{source}: {'holds' if source.is_dir() else 'is'} {kind} ({suffix}); {remedy}"
+            is_what = f"holds {suffix} files" if source.is_dir() else f"is a {suffix} file"
+            return f"{source}: {is_what}, {kind}; {remedy}"
     return None
