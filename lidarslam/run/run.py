@@ -78,17 +78,17 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
                 drawn = final_map(tracked, closed, config.global_map)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
-            described = describe_run(request)
-            outcome = write_results(directory, config, described, tracked, closed, drawn, request.map_formats)
+            formats = request.map_formats
+            outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, formats)
         if unfinished is not None:
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
-    if request.report:
-        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+        if request.report:
+            from lidarslam.viewer.page.run_report import Accuracy, leave_report
 
-        phase("drawing the report")
-        leave_report(request.out, Accuracy(outcome.metrics))
+            phase("drawing the report")
+            leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 

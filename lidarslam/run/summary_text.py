@@ -33,8 +33,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     total = summary.ms_per_scan["total"]
-    speed = _speed(summary.realtime_factor)
-    memory = f"{summary.peak_rss_mb:,.0f} MB of memory"
+    speed, memory = _speed(summary.realtime_factor), f"{summary.peak_rss_mb:,.0f} MB of memory"
     yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms){speed}, {memory}"
     yield format_map(summary.map)
     if summary.graph is not None:
@@ -64,11 +63,11 @@ def format_map(written: WrittenMap) -> str:
     """A line about a map."""
     if written.voxel_size_m is None:
         return "no map: no scan was registered"
+    voxel = small_length(written.voxel_size_m)
     fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    voxels = f"voxels of {small_length(written.voxel_size_m)}"
-    return f"map of {count(written.points, 'point')}, {voxels}{fields}{moved}{entropy}"
+    return f"map of {count(written.points, 'point')}, voxels of {voxel}{fields}{moved}{entropy}"
 
 
 def _loops(graph: GraphSummary) -> str:
