@@ -5,18 +5,18 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample, config_options
+from lidarslam.commands.options import PATH, CommandWithExample, config_options, latest_run
 from lidarslam.commands.terminal import say
 
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam view runs/04
+    epilog="""lidarslam view
     lidarslam view runs/04 runs/wheels --web
     lidarslam view runs/04 --picture map.png
     lidarslam view compared/04 --picture maps.png""",
 )
-@click.argument("runs", type=PATH, nargs=-1, required=True)
+@click.argument("runs", type=PATH, nargs=-1, metavar="[RUN]...")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
 @click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
 @click.option("--picture", type=PATH, metavar="FILE.png", help="Draw runs, or .ply files, in one picture instead.")
@@ -33,13 +33,15 @@ def view(
 ) -> None:
     """Show finished runs: trajectories, maps, and where tracking was lost.
 
-    With --picture, RUNS may also be the folder of a comparison, and clouds (.ply or .pcd).
+    RUN is a run directory.  [default: the latest run in runs]  With --picture, it may also be the folder of a
+    comparison, or a cloud (.ply or .pcd).
     """
     from lidarslam.config.settings import load_config
     from lidarslam.storage.finished_run import load_run
 
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
+    runs = runs or (latest_run(),)
     if picture is not None:
         _draw(runs, picture, oblique)
         return

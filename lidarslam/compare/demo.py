@@ -15,6 +15,7 @@ from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
+from lidarslam.run.machine import as_typed
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
@@ -79,7 +80,7 @@ def format_demo(demo: Demo) -> str:
     return f"""
 {format_comparison(demo.outcome.comparison, demo.out)}
 maps      {", ".join(str(picture) for picture in demo.pictures)}
-replay    rerun {demo.out / REPLAY}
+replay    {as_typed("rerun")} {demo.out / REPLAY}
 
 Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that; the
 network measures a turn whatever its size, and the map corrects the rest."""

@@ -21,7 +21,8 @@ TRAJECTORY_TUM = "trajectory.tum"
 TRAJECTORY_KITTI = "trajectory.kitti"
 ODOMETRY_TUM = "odometry.tum"
 MAP_PLY = "map.ply"
-MAP_PCD = "map.pcd"
+# Further formats of the map, by their names in `--map-format`.
+MAPS = {"pcd": "map.pcd", "laz": "map.laz", "e57": "map.e57"}
 POSE_GRAPH = "pose_graph.g2o"
 SCANS_CSV = "scans.csv"
 SUMMARY = "summary.json"
@@ -37,7 +38,7 @@ FILES = (
     TRAJECTORY_KITTI,
     ODOMETRY_TUM,
     MAP_PLY,
-    MAP_PCD,
+    *MAPS.values(),
     POSE_GRAPH,
     SCANS_CSV,
     SUMMARY,

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
-from lidarslam.datasets.folders.point_table import coordinates
+from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
+from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.unfinished import require_whole
@@ -36,6 +38,7 @@ class FinishedRun:
     lost: NDArray[np.bool_]  # (N,) which scans were lost
     map_points: FloatArray  # (M, 3) in the world, none when the map is missing
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
+    map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
 
 
 def load_run(path: Path) -> FinishedRun:
@@ -47,7 +50,8 @@ def load_run(path: Path) -> FinishedRun:
     trajectory = read_trajectory(path)
     statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
     lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
-    return FinishedRun(path.resolve().name, trajectory, lost, load_map(path).points, loops)
+    cloud = load_map(path)
+    return FinishedRun(path.resolve().name, trajectory, lost, cloud.points, loops, cloud.attributes)
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -70,7 +74,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def load_map(path: Path) -> PointCloud:
-    """The map of a run directory, or a .ply or .pcd file, with normals; empty when the run has none.
+    """The map of a run directory, or a .ply or .pcd file, with normals and attributes; empty when the run has none.
 
     Raises:
         InputError: there is no such file, or it cannot be read.
@@ -90,10 +94,10 @@ def load_map(path: Path) -> PointCloud:
     except ValueError as error:
         raise InputError(f"{file}: not a readable point cloud: {error}") from None
     normals = _normals(table)
-    usable = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
+    usable = np.asarray(np.isfinite(np.hstack([points, normals])).all(axis=1))
     if not usable.any():
         raise InputError(f"{file}: not a readable point cloud; no point is finite")
-    return PointCloud(points[usable], normals[usable])
+    return PointCloud(points[usable], normals[usable], _attributes(table).select(usable))
 
 
 def _normals(table: NDArray[np.void]) -> FloatArray:
@@ -102,6 +106,17 @@ def _normals(table: NDArray[np.void]) -> FloatArray:
         if set(names) <= set(table.dtype.names or ()):
             return np.column_stack([table[name].astype(np.float64) for name in names])
     return np.tile([0.0, 0.0, 1.0], (len(table), 1))
+
+
+def _attributes(table: NDArray[np.void]) -> PointAttributes:
+    """The attributes of N points, as this program names them and others do."""
+    names = scalar_fields(table)
+    return PointAttributes(
+        intensity=read_intensities(table, names),
+        rgb=read_colours(table, names),
+        ring=table["ring"].astype(np.int32) if "ring" in names else None,
+        time=table["time"].astype(np.float64) if "time" in names else None,
+    )
 
 
 def read_summary(path: Path) -> dict[str, Any]:

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lidarslam.compare.assessment.error_cloud import check_error_files, write_errors
+from lidarslam.compare.assessment.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
+from lidarslam.compare.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
+from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.evaluate.error_cloud import check_error_files, write_errors
-from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
-from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map
-from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
 from lidarslam.evaluation.report.error_colours import DEFAULT_CLIP_M
 from lidarslam.evaluation.trajectory.alignment import AlignmentMethod
@@ -23,9 +23,9 @@ from lidarslam.storage.directory import RunDirectory
 class EvaluateRequest:
     """Estimate, references and outputs."""
 
-    run: Path  # a run directory, or a trajectory in TUM or KITTI text
-    # a trajectory file, a run directory or a recording; None: the truth that came with the run's source
-    reference: Path | None = None
+    run: Path | Trajectory  # a run directory, or a trajectory, in memory or in TUM or KITTI text
+    # a trajectory likewise, a run directory or a recording; None: the truth that came with the run's source
+    reference: Path | Trajectory | None = None
     reference_map: Path | None = None  # a cloud; None: the exact map of a simulated source, else none
     map_file: Path | None = None  # the map of a bare trajectory, or another one than the run's
     alignment: AlignmentMethod = "se3"  # of the trajectory, for the ATE
@@ -37,6 +37,7 @@ class EvaluateRequest:
     errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
     out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
     needs_reference: bool = True  # whether it is an error that there is no reference
+    write: bool = True  # whether the figures are written
     report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
 
 
@@ -89,7 +90,7 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         notes += compared.warnings()
     elif estimate.map_file is not None:
         entropy = map_entropy(estimate.map_points())
-    out = request.out or (None if estimate.run is None else estimate.run / files.METRICS)
+    out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
     written = [*([] if out is None else [out]), *request.errors]
     label = None if reference is None else reference.label
     evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
@@ -109,7 +110,7 @@ def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, co
 
     accuracy = Accuracy(
         evaluation.metrics,
-        "ground truth" if request.reference is None else request.reference.name,
+        request.reference.name if isinstance(request.reference, Path) else "ground truth",
         compared,
         None if evaluation.map is None else evaluation.map.json,
         None if evaluation.map is None else evaluation.map.errors,
@@ -150,7 +151,7 @@ def _evaluate_map(
     if request.reference_map is not None:
         reference = load_reference_map(request.reference_map)
     elif request.needs_reference:
-        sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
+        sources = [path for path in (estimate.source, request.reference) if isinstance(path, Path) and path.exists()]
         reference = next((found for found in map(find_reference_map, sources) if found is not None), None)
         if reference is not None and estimate.map_file is None:
             if estimate.run is not None:
