@@ -8,7 +8,7 @@ from lidarslam.core.plain_text import count
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
-from lidarslam.storage.directory import SCANS_CSV, SUMMARY
+from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # Stretches of lost scans that are listed; summary.json has them all.
 _LISTED = 3
@@ -33,7 +33,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     for warning in summary.warnings:
         yield f"warning: {warning}"
     yield from _lost(summary)
-    yield f"written to {out}"
+    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
     yield f"next: {shlex.join(['lidarslam', 'view', str(out)])}"
     if outcome.metrics is not None:
         yield f"      {shlex.join(['lidarslam', 'evaluate', str(out)])}"
