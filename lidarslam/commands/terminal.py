@@ -1,4 +1,6 @@
-"""Output of the commands on the terminal, and their exit status."""
+"""Output of the commands on the terminal, `-v`, and their exit status."""
+
+import logging
 
 import click
 
@@ -16,3 +18,29 @@ def say(text: str) -> None:
 def note(line: str) -> None:
     """A warning or an error, a line on standard error."""
     click.echo(f"lidarslam: {one_line(line)}", err=True)
+
+
+class _StandardError(logging.Handler):
+    """Log lines as the other lines of the program; above a progress bar, where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(printable(self.format(record)), err=True)
+
+
+def prepare_log() -> None:
+    """Send warnings to standard error; may be called again."""
+    handler = _StandardError()
+    handler.setFormatter(logging.Formatter("lidarslam: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+
+
+def _log_more(_ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
+    if is_asked:
+        logging.getLogger("lidarslam").setLevel(logging.INFO)
+
+
+def verbose_option() -> click.Option:
+    """The option `-v`, of the program and of each command."""
+    return click.Option(
+        ["-v", "--verbose"], is_flag=True, expose_value=False, callback=_log_more, help="Log what is chosen and done."
+    )

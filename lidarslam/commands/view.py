@@ -7,6 +7,7 @@ import click
 
 from lidarslam.commands.options import PATH, CommandWithExample, config_options, latest_run
 from lidarslam.commands.terminal import say
+from lidarslam.core.errors import InputError
 
 
 @click.command(
@@ -45,6 +46,8 @@ def view(
     if picture is not None:
         _draw(runs, picture, oblique)
         return
+    if save is not None and save.suffix.lower() != ".rrd":
+        raise InputError(f"{save}: a Rerun recording must end in .rrd; for a picture use --picture {save}")
     config = load_config(config_file, settings).viewer
     finished = [load_run(path) for path in runs]
     from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs

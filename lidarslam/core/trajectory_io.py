@@ -8,7 +8,6 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
@@ -18,6 +17,19 @@ from lidarslam.core.trajectory import Trajectory
 _LONGEST_BYTES = 1 << 30
 # Survey coordinates are far below; squares of much larger numbers overflow.
 _FARTHEST_M = 1e9
+
+_FORMATS = {
+    8: "; a TUM trajectory has lines `stamp tx ty tz qx qy qz qw`",
+    12: "; a KITTI trajectory has the first three rows of a pose matrix a line",
+}
+# By the columns that were expected and those that came.
+_OTHER_FORMAT = {
+    (8, 12): (
+        "; it is in KITTI's format, which has no stamps, and often holds the poses of a camera: give the LiDAR's as TUM"
+        " text, a line `stamp tx ty tz qx qy qz qw` for each scan"
+    ),
+    (12, 8): "; it looks like a TUM trajectory, `stamp tx ty tz qx qy qz qw`",
+}
 
 
 def parse_numbers(path: Path, columns: int) -> FloatArray:
@@ -42,9 +54,12 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
         try:
             row = [float(word) for word in words]
         except ValueError:
-            raise InputError(f"{path}:{number}: expected {columns} numbers, got {line.strip()[:60]!r}") from None
+            raise InputError(
+                f"{path}:{number}: expected {columns} numbers, got {line.strip()[:60]!r}{_FORMATS.get(columns, '')}"
+            ) from None
         if len(row) != columns:
-            raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}")
+            hint = _OTHER_FORMAT.get((columns, len(row)), _FORMATS.get(columns, ""))
+            raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}{hint}")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
 
@@ -64,12 +79,16 @@ def read_tum(path: Path) -> Trajectory:
     _require_near(path, table[:, 1:4])
     _, first = np.unique(table[:, 0], return_index=True)
     table = table[first]
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     R = Rotation.from_quat(table[:, 4:]).as_matrix()
     return Trajectory(table[:, 0], make_transform(R, table[:, 1:4]))
 
 
 def format_tum(trajectory: Trajectory) -> str:
     """The trajectory as TUM text, nine decimals, quaternions with qw >= 0."""
+    from scipy.spatial.transform import Rotation
+
     quaternions = Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_quat(canonical=True)
     table = np.column_stack([trajectory.stamps, trajectory.positions, quaternions])
     out = StringIO()
