@@ -40,6 +40,7 @@ $(VENV)/.base: pyproject.toml constraints.txt scripts/system_libraries.sh
 $(VENV)/.installed: $(VENV)/.base
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m lidarslam.pipeline.compile_ahead
 	touch $@
 
 clean:

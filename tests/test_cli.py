@@ -332,3 +332,23 @@ def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path: Path, record
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_verbose_says_what_is_chosen_before_the_command_or_after(recording: Path, tmp_path: Path, before: bool) -> None:
+    command = ["run", recording, "--out", tmp_path / "run", "--odometry", "constant-velocity"]
+    lidarslam(*(["-v", *command] if before else [*command, "-v"]), "--stop", 3)
+    said = [record.message for record in caplog.records]
+    for words in (
+        "reader: scan-folder, because the names fit",
+        "time of a point: none is known",
+        "3 scans of 5, to ",
+        "odometry: constant-velocity; mapping: surfels; pose graph: off",
+        "new surfel map at ",
+        "voxels of the map: ",
+        "writing the results of 3 scans",
+    ):
+        assert sum(line.startswith(words) for line in said) == 1, words
+    caplog.clear()
+    lidarslam(*command, "--stop", 3, "--overwrite")
+    assert not caplog.records

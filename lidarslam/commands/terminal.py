@@ -1,4 +1,4 @@
-"""Output of the commands on the terminal, `-v`, and their exit status."""
+"""Output of the commands on the terminal, and their exit status; `-v`, before the command or after it."""
 
 import logging
 
@@ -34,13 +34,13 @@ def prepare_log() -> None:
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
 
 
-def _log_more(_ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
-    if is_asked:
-        logging.getLogger("lidarslam").setLevel(logging.INFO)
+def _log_more(ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
+    if is_asked or ctx.parent is None:  # before the command, where one that comes after it is not known yet
+        logging.getLogger("lidarslam").setLevel(logging.INFO if is_asked else logging.NOTSET)
 
 
 def verbose_option() -> click.Option:
-    """The option `-v`, of the program and of each command."""
+    """The option, of the program and of each command."""
     return click.Option(
         ["-v", "--verbose"], is_flag=True, expose_value=False, callback=_log_more, help="Log what is chosen and done."
     )

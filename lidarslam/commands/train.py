@@ -49,10 +49,7 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
     """
     from lidarslam.odometry.train_extra import require_train_extra
-
-    require_train_extra("training")
     from lidarslam.storage.default_places import source_name
-    from lidarslam.train.command import run_train
 
     if out is None:
         if options["resume"]:
@@ -60,5 +57,8 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
         if "WORLD_SIZE" in os.environ:
             raise click.UsageError("the processes of torchrun share a directory; name it with --out")
         out = default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
+    require_train_extra("training")
+    from lidarslam.train.command import run_train
+
     if not run_train(sources, say, out=out, **options):
         ctx.exit(EXIT_MENDABLE)

@@ -7,7 +7,6 @@ import click
 
 from lidarslam.commands.options import PATH, CommandWithExample, config_options, latest_run
 from lidarslam.commands.terminal import say
-from lidarslam.core.errors import InputError
 
 
 @click.command(
@@ -47,7 +46,7 @@ def view(
         _draw(runs, picture, oblique)
         return
     if save is not None and save.suffix.lower() != ".rrd":
-        raise InputError(f"{save}: a Rerun recording must end in .rrd; for a picture use --picture {save}")
+        raise click.UsageError(f"{save}: a Rerun recording must end in .rrd; for a picture use --picture {save}")
     config = load_config(config_file, settings).viewer
     finished = [load_run(path) for path in runs]
     from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs

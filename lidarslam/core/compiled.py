@@ -20,6 +20,8 @@ _log = logging.getLogger(__name__)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_njit: Any = numba.njit
+_config: Any = numba.config
 # Nothing calls these loops by their addresses: an entry less to compile.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
@@ -45,7 +47,7 @@ def compiled(function: Function) -> Function:
 
 def compiled_part(function: Function) -> Function:
     """A part of compiled functions: compiled and kept along with them, and never called from the interpreter."""
-    dispatcher: Any = numba.njit(function, no_cpython_wrapper=True, **_OPTIONS)
+    dispatcher: Any = _njit(function, no_cpython_wrapper=True, **_OPTIONS)
     if hasattr(dispatcher, "_cache"):
         _watch_callees(dispatcher)
     return cast(Function, dispatcher)
@@ -60,16 +62,16 @@ def is_compiled(module: ModuleType) -> bool:
 
 def _kept_on_disk(function: Function) -> Any:
     try:
-        return numba.njit(function, cache=True, **_OPTIONS)
+        return _njit(function, cache=True, **_OPTIONS)
     except RuntimeError as reason:  # neither beside the source nor in a cache folder of the user
         _log.info("%s", reason)
-    numba.config.CACHE_DIR = _temporary_folder()
+    configured, _config.CACHE_DIR = _config.CACHE_DIR, _temporary_folder()
     try:
-        return numba.njit(function, cache=True, **_OPTIONS)
+        return _njit(function, cache=True, **_OPTIONS)
     except RuntimeError:
-        return numba.njit(function, **_OPTIONS)
+        return _njit(function, **_OPTIONS)
     finally:
-        numba.config.CACHE_DIR = ""
+        _config.CACHE_DIR = configured
 
 
 @lru_cache(maxsize=1)

@@ -75,12 +75,10 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     if name is not None:
         if name not in READERS:
             raise InputError(f"no reader is called {name!r}; there are: {', '.join(READERS)}")
-        logger.info("reader: %s, as it was named", name)
         return name
     if (result := result_of_program(source)) is not None:
         raise InputError(result)
     if (found := _recognise(source)) is not None:
-        logger.info("reader: %s, because the names fit: %s", found, READERS[found].reads)
         return found
     if source.is_dir() and all(entry.name.startswith(".") for entry in source.iterdir()):
         raise InputError(f"{source}: the folder is empty; name the one with the recording")
@@ -107,6 +105,8 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     """
     config = config or ReaderConfig()
     name = choose_reader(source, config.name)
+    why = "because the names fit" if config.name is None else "as it was named"
+    logger.info("reader: %s, %s: %s", name, why, READERS[name].reads)
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
     return cast(Recording, import_module(READERS[name].module).open_recording(source, config))

@@ -20,6 +20,8 @@ _URL = re.compile(r"[a-z][a-z0-9+]+:/", re.IGNORECASE)
 # Of a run's config.yaml.
 _SOURCE = re.compile(r"^  source: (.+?)(?: +#.*)?$", re.MULTILINE)
 
+# Readers of recordings of many folders; scans and bags may lie anywhere.
+_LAYOUTS = ("kitti-odometry", "kitti-raw")
 _CONVERT = "convert each scan to .ply, .pcd or .npy"
 _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), "images", "name the folder with the LiDAR's scans"),
@@ -31,10 +33,10 @@ _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ),
     (
         (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar", ".zst"),
-        "an archive",
+        "packed",
         "unpack it and name the result",
     ),
-    ((".las", ".laz", ".e57"), "survey point clouds, which are not read as scans", _CONVERT),
+    ((".las", ".laz", ".e57"), "survey formats, which are not read as scans", _CONVERT),
     ((".csv", ".xyz", ".pts", ".asc"), "points as text, which are not read as scans", _CONVERT),
     ((".tum", ".g2o"), "poses, not scans", "name the recording; lidarslam evaluate compares trajectories"),
     ((".rrd",), "a Rerun recording", "open it with `rerun FILE`"),
@@ -88,14 +90,19 @@ def result_of_program(source: Path) -> str | None:
 def unrecognised(source: Path, reader_of: ReaderOf) -> str | None:
     """What else it is and what to do, as far as names alone show it; None where they do not."""
     for above in islice(source.resolve().parents, 2):
-        reader = reader_of(above)
-        if reader is not None and reader != "scan-folder":
+        reader = _reader(above, reader_of)
+        if reader in _LAYOUTS or (reader == "rosbag" and source.name == "metadata.yaml"):
             return f"{source}: lies in a recording ({reader}); name that: {above}"
     if source.is_dir() and (found := _recordings_in(source, reader_of)):
         reader = reader_of(found[0])
+        if len(found) == 1:
+            return f"{source}: holds the recording {found[0]} ({reader}); name that"
         more = f" and {len(found) - _LISTED:,} more" if len(found) > _LISTED else ""
         listed = ", ".join(str(path) for path in found[:_LISTED])
         return f"{source}: holds {count(len(found), 'recording')} ({reader}); name one: {listed}{more}"
+    results = [entry for entry in _entries(source) if entry.is_dir() and result_of_program(entry) is not None]
+    if results:
+        return f"{source}: holds results of lidarslam, such as {results[0]}, and no recording; name the recording"
     return _other_kind(source)
 
 
@@ -128,5 +135,6 @@ def _other_kind(source: Path) -> str | None:
     for suffixes, kind, remedy in _KINDS:
         suffix = max(suffixes, key=lambda suffix: counts[suffix])
         if 2 * counts[suffix] >= max(1, len(files)):
-            return f"{source}: {'holds' if source.is_dir() else 'is'} {kind} ({suffix}); {remedy}"
+            is_what = f"holds {suffix} files" if source.is_dir() else f"is a {suffix} file"
+            return f"{source}: {is_what}, {kind}; {remedy}"
     return None

@@ -1,13 +1,14 @@
 """On a machine's first run: loops are compiled side by side in other processes, and kept on disk for this one.
 
-A process compiles one function at a time; one for each part of the pipeline makes use of the other cores.
+A process compiles one function at a time; one for each part of the pipeline makes use of the other cores. After an
+installation, `python -m lidarslam.pipeline.compile_ahead` compiles all parts, so that the first run need not.
 """
 
 import os
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -18,7 +19,6 @@ from lidarslam.config.settings import Config
 from lidarslam.core.compiled import is_compiled
 from lidarslam.pipeline.rehearsal import PARTS
 
-_POLL_S = 0.1
 # The processes start here, so that no package in the user's folder is found first.
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,19 +32,22 @@ def parts_of(config: Config) -> list[str]:
 
 
 def uncompiled(names: list[str]) -> list[str]:
-    """Those of the parts with a loop that is not on disk; one that is at work elsewhere counts."""
+    """Those of the parts with a loop that is not on disk."""
     modules = {name: [import_module(f"lidarslam.{module}") for module in PARTS[name].modules] for name in names}
     return [name for name in names if not all(is_compiled(module) for module in modules[name])]
 
 
 class CompileAhead:
-    """Compiles the loops of a run that are not on disk yet; a context that ends its processes.
+    """Compiles the loops that are not on disk yet; a context that ends its processes.
 
-    A part that fails to compile here is compiled by the run itself, on its first call.
+    What fails to compile here is compiled in this process, on its first call.
+
+    Args:
+        parts: names of the parts whose loops are compiled.
     """
 
-    def __init__(self, config: Config) -> None:
-        self._parts = uncompiled(parts_of(config))
+    def __init__(self, parts: list[str]) -> None:
+        self._parts = uncompiled(parts)
         self._running: list[subprocess.Popen[bytes]] = []
         self._is_closed = False
         self._pool = ThreadPoolExecutor(max_workers=_cores(), thread_name_prefix="compile")
@@ -73,14 +76,13 @@ class CompileAhead:
     def _wait(self, parts: list[str], report: Callable[[str], None]) -> None:
         pending = {self._done[part] for part in parts}
         while pending:
-            done = len(parts) - len(pending)
-            report(f"compiling loops, once on this machine ({done} of {len(parts)})")
-            _, pending = wait(pending, timeout=_POLL_S)
+            report(f"compiling loops, once on this machine ({len(parts) - len(pending)} of {len(parts)})")
+            _, pending = wait(pending, return_when=FIRST_COMPLETED)
 
     def _compile(self, part: str) -> None:
         command = [sys.executable, "-m", "lidarslam.pipeline.rehearsal", part]
-        silent = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = subprocess.Popen(command, cwd=_ROOT, **silent)
+        none = subprocess.DEVNULL
+        process = subprocess.Popen(command, cwd=_ROOT, stdin=none, stdout=none, stderr=none)
         self._running.append(process)
         if self._is_closed:
             process.kill()
@@ -89,3 +91,13 @@ class CompileAhead:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1  # not on macOS
+
+
+def main() -> None:
+    """Compile everything."""
+    with CompileAhead(list(PARTS)) as compiling:
+        compiling.wait_for_all(print)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,6 +1,6 @@
 """Short runs of the parts of the pipeline on a made-up room: their loops are compiled, and kept on disk.
 
-`python -m lidarslam.pipeline.rehearsal` compiles all of them, as after an installation; with the names of parts, these.
+`python -m lidarslam.pipeline.rehearsal surfels` runs one of them, `lidarslam.pipeline.compile_ahead` each in a process.
 """
 
 import sys

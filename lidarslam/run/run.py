@@ -12,7 +12,7 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline.compile_ahead import CompileAhead
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest, describe_run, log_choices
@@ -55,7 +55,7 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
     log_choices(request, chosen, len(recording))
     with Interruptions() as interruptions:
         with ExitStack() as stack:
-            compiling = stack.enter_context(CompileAhead(config))
+            compiling = stack.enter_context(CompileAhead(parts_of(config)))
             phase("loading the odometry")
             odometry = open_odometry(config, request.prior)
             stack.callback(odometry.close)
@@ -78,17 +78,17 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
                 drawn = final_map(tracked, closed, config.global_map)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
-            described = describe_run(request)
-            outcome = write_results(directory, config, described, tracked, closed, drawn, request.map_formats)
+            formats = request.map_formats
+            outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, formats)
         if unfinished is not None:
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
-    if request.report:
-        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+        if request.report:
+            from lidarslam.viewer.page.run_report import Accuracy, leave_report
 
-        phase("drawing the report")
-        leave_report(request.out, Accuracy(outcome.metrics))
+            phase("drawing the report")
+            leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 

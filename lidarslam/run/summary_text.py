@@ -8,7 +8,7 @@ from lidarslam.core.plain_text import as_typed, count, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
-from lidarslam.storage.directory import SCANS_CSV, SUMMARY
+from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # A speed that differs less is that of the recording.
 _ALIKE = 1.05
@@ -33,8 +33,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     total = summary.ms_per_scan["total"]
-    speed = _speed(summary.realtime_factor)
-    memory = f"{summary.peak_rss_mb:,.0f} MB of memory"
+    speed, memory = _speed(summary.realtime_factor), f"{summary.peak_rss_mb:,.0f} MB of memory"
     yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms){speed}, {memory}"
     yield format_map(summary.map)
     if summary.graph is not None:
@@ -44,7 +43,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     for warning in summary.warnings:
         yield f"warning: {warning}"
     yield from _lost(summary)
-    yield f"written to {out}"
+    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
     yield f"next: {shlex.join([as_typed('lidarslam'), 'view', str(out)])}"
     if outcome.metrics is not None:
         yield f"      {shlex.join([as_typed('lidarslam'), 'evaluate', str(out)])}"
@@ -64,11 +63,11 @@ def format_map(written: WrittenMap) -> str:
     """A line about a map."""
     if written.voxel_size_m is None:
         return "no map: no scan was registered"
+    voxel = small_length(written.voxel_size_m)
     fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    voxels = f"voxels of {small_length(written.voxel_size_m)}"
-    return f"map of {count(written.points, 'point')}, {voxels}{fields}{moved}{entropy}"
+    return f"map of {count(written.points, 'point')}, voxels of {voxel}{fields}{moved}{entropy}"
 
 
 def _loops(graph: GraphSummary) -> str:

@@ -22,12 +22,12 @@ def format_step(step: int, steps: int, losses: Mapping[str, float], pairs_per_s:
 
 def format_validation(step: int, result: Validation, is_best: bool) -> str:
     """Errors on held-out recordings."""
-    validation = f"validation after {count(step, 'step')}"
+    after = f"validation after {count(step, 'step')}"
     if not result.pairs:
-        return f"{validation}: no held-out pair could be aligned, so there is nothing to compare with"
+        return f"{after}: no held-out pair could be aligned, so there is nothing to compare with"
     covered = ", ".join(f"{percent:.0f}" for percent in result.covered_percent)
     return (
-        f"{validation}: {format_errors(result)} from scan to scan, over {count(result.pairs, 'pair')};"
+        f"{after}: {format_errors(result)} from scan to scan, over {count(result.pairs, 'pair')};"
         f" {covered} % of the errors within 1, 2, 3 standard deviations{'; the best so far' if is_best else ''}"
     )
 

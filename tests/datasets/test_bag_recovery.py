@@ -136,6 +136,14 @@ def test_a_folder_without_usable_metadata_is_its_file(write_drive, kind, content
         open_recording(folder)
 
 
+def test_a_part_of_a_bag_says_that_there_are_others(write_drive):
+    file, folder, _ = write_drive("mcap")
+    assert open_recording(file).warnings == ()
+    (folder / "drive_1.mcap").write_bytes(b"-")
+    (warning,) = open_recording(file).warnings
+    assert warning == f"This file is one of 2 parts of the bag {folder}; name the folder for all."
+
+
 def test_metadata_that_names_a_file_outside_reads_none_there(write_drive):
     file, folder, _ = write_drive("db3")
     file.rename(folder.parent / "elsewhere.db3")

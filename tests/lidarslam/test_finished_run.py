@@ -1,6 +1,7 @@
 """Runs read back: what is damaged is named."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -70,3 +71,22 @@ def test_loops_are_those_that_were_closed(tmp_path: Path) -> None:
         (tmp_path / "summary.json").write_text(damaged)
         with pytest.raises(InputError, match="not a run's summary"):
             load_run(tmp_path)
+
+
+def test_what_is_no_run_is_told(tmp_path: Path, whole_run: Path, small_recording: Path) -> None:
+    runs = tmp_path / "runs"
+    shutil.copytree(whole_run, runs / "one")
+    (tmp_path / "notes.txt").write_text("-")
+    for path, words in (
+        (runs / "one" / "trajectory.tum", f"is a file of the run {runs / 'one'}; name the directory"),
+        (runs, f"is no run, but holds some; name them: {runs / 'one'}"),
+        (runs / "on", f"no such file or folder; did you mean {runs / 'one'}?"),
+        (
+            small_recording,
+            f"is a recording, not a run directory (no trajectory.tum); make one with lidarslam run {small_recording}",
+        ),
+        (tmp_path / "notes.txt", "is a file, expected a run directory"),
+    ):
+        with pytest.raises(InputError) as error:
+            load_run(path)
+        assert words in str(error.value)

@@ -1,14 +1,16 @@
 """What is printed at the end of a run."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.run.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
-from lidarslam.run.summary_text import format_outcome
+from lidarslam.run.summary_text import format_map, format_outcome
 
 
 def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
@@ -57,3 +59,24 @@ def test_loops_are_counted_and_their_effect_is_said() -> None:
         assert words in format_outcome(Path("out"), RunOutcome(summary, None))
         assert summary.to_json()["loop_closures"] == sum(loop.accepted for loop in chosen)
         assert len(summary.to_json()["pose_graph"]["loops"]) == len(chosen)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (None, "(95 % under 1 ms), 1 MB of memory"),
+        (0.6, ", 1.7 times slower than recorded, "),
+        (1.02, ", as fast as recorded, "),
+        (1.7, ", 1.7 times faster than recorded, "),
+    ],
+)
+def test_speed_is_faster_or_slower(factor: float | None, words: str) -> None:
+    summary = replace(summary_of(), realtime_factor=factor)
+    assert words in format_outcome(Path("out"), RunOutcome(summary, None))
+
+
+@pytest.mark.parametrize(
+    ("voxel_m", "words"), [(1.2, "1.2 m"), (0.24, "24 cm"), (0.01, "1 cm"), (0.002, "2 mm"), (0.00005, "0.05 mm")]
+)
+def test_no_voxel_is_of_0_cm(voxel_m: float, words: str) -> None:
+    assert f"voxels of {words};" in format_map(WrittenMap(10, voxel_m, 1))

@@ -57,6 +57,11 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
         if named is not None:
             warnings.append("The file names look like stamps, but some are equal.")
         notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
+    whole = (
+        folder.resolve().parent.parent if folder.resolve().parent.name == "velodyne_points" else folder.resolve().parent
+    )
+    if folder.resolve().name == "velodyne" or whole != folder.resolve().parent:
+        warnings.append(f"The folder is part of a KITTI recording; name {whole} for its times, poses and calibration.")
     return FolderLayout(tuple(files), stamps, from_clock, find_truth_file(places), tuple(notes), tuple(warnings))
 
 

@@ -15,9 +15,8 @@ def format_merge(out: Path, outcome: MergeOutcome) -> str:
     lines = [_recording(recording, run) for recording, run in zip(summary.recordings, outcome.runs, strict=True)]
     lines += [_joined(summary), format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
     if summary.lost_scans:
-        lines.append(
-            f"tracking was lost on {count(summary.lost_scans, 'scan')}; the summaries of the recordings say where"
-        )
+        lost = count(summary.lost_scans, "scan")
+        lines.append(f"tracking was lost on {lost}; the summaries of the recordings say where")
     return "\n".join([*lines, f"written to {out}"])
 
 

@@ -1,0 +1,118 @@
+"""What is named in place of a recording, and what the error says about it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.registry import choose_reader, open_recording
+
+SYNC = "2011_09_26_drive_0005_sync"
+
+
+def write(*paths: Path, content: bytes = b"-") -> None:
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def refused(source: Path) -> str:
+    with pytest.raises(InputError) as error:
+        choose_reader(source)
+    return str(error.value)
+
+
+def scans(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    for index in range(3):
+        np.zeros((4, 4), dtype="<f4").tofile(folder / f"{index:06d}.bin")
+    return folder
+
+
+def of_run(folder: Path) -> Path:
+    write(folder / "map.ply", folder / "trajectory.tum")
+    write(folder / "config.yaml", content=b"run:\n  version: 0.1.0\n  source: /data/office.mcap\nreader:\n")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "map.ply", "trajectory.tum"])
+def test_a_run_is_no_recording_and_its_recording_is_named(tmp_path: Path, name: str) -> None:
+    said = refused(of_run(tmp_path / "run") / name)
+    assert "not a recording; its recording is /data/office.mcap." in said
+    assert f"lidarslam view {tmp_path / 'run'} shows it" in said
+
+
+def test_results_are_no_recordings(tmp_path: Path) -> None:
+    of_run(tmp_path / "runs" / "one")
+    assert "holds results of lidarslam" in refused(tmp_path / "runs")
+    write(tmp_path / "compared" / "comparison.json")
+    assert "is a comparison, not a recording" in refused(tmp_path / "compared")
+
+
+def test_the_drives_of_a_date_are_named(tmp_path: Path) -> None:
+    drives = [scans(tmp_path / "2011_09_26" / name / "velodyne_points" / "data").parents[1] for name in (SYNC, "other")]
+    for folder in (tmp_path / "2011_09_26", tmp_path):
+        said = refused(folder)
+        assert "holds 2 recordings (kitti-raw); name one: " in said
+        assert all(str(drive) in said for drive in drives)
+    assert f"lies in a recording (kitti-raw); name that: {drives[0]}" in refused(drives[0] / "velodyne_points")
+    assert f"name {drives[0]} for its times" in open_recording(drives[0] / "velodyne_points" / "data").warnings[0]
+
+
+def test_a_folder_within_kittis_odometry_names_the_root(tmp_path: Path) -> None:
+    scans(tmp_path / "sequences" / "04" / "velodyne")
+    (tmp_path / "poses").mkdir()
+    write(tmp_path / "poses" / "04.txt")
+    for name in ("poses", "poses/04.txt", "sequences"):
+        assert f"lies in a recording (kitti-odometry); name that: {tmp_path}" in refused(tmp_path / name)
+
+
+def test_recordings_in_a_folder_are_named(tmp_path: Path) -> None:
+    write(tmp_path / "bags" / "a.bag", tmp_path / "bags" / "b.bag")
+    assert "holds 2 recordings (rosbag); name one: " in refused(tmp_path / "bags")
+    inner = scans(tmp_path / "outer" / "middle" / "inner")
+    assert f"holds the recording {inner} (scan-folder); name that" in refused(tmp_path / "outer")
+
+
+def test_a_bag_beside_it_is_not_what_a_folder_belongs_to(tmp_path: Path) -> None:
+    write(tmp_path / "other.mcap", tmp_path / "images" / "0.png")
+    assert "images" in refused(tmp_path / "images").split(": ", 1)[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("0.png", "images; name the folder with the LiDAR's scans"),
+        ("drive.pcap", "packets of a sensor; decode them with the sensor's driver"),
+        ("drive.zip", "packed; unpack it"),
+        ("drive.laz", "survey formats, which are not read as scans; convert each scan to .ply, .pcd or .npy"),
+        ("0.csv", "points as text, which are not read as scans; convert"),
+        ("path.tum", "poses, not scans"),
+        ("notes.txt", "name the folder or the bag with the scans"),
+    ],
+)
+def test_other_files_are_told_by_their_endings(tmp_path: Path, name: str, words: str) -> None:
+    write(tmp_path / "folder" / name)
+    suffix = Path(name).suffix
+    assert f"folder: holds {suffix} files, " in refused(tmp_path / "folder")
+    assert words in refused(tmp_path / "folder")
+    assert f"{name}: is a {suffix} file, " in refused(tmp_path / "folder" / name)
+    assert words in refused(tmp_path / "folder" / name)
+
+
+def test_a_name_that_is_misspelt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "recordings" / "office").mkdir(parents=True)
+    assert f"did you mean {tmp_path / 'recordings' / 'office'}?" in refused(tmp_path / "recordings" / "ofice")
+    said = refused(tmp_path / "recording" / "office")
+    assert f"there is no {tmp_path / 'recording'}; did you mean {tmp_path / 'recordings'}?" in said
+    assert "is an address; download" in refused(Path("https://example.org/a.bag"))
+    monkeypatch.chdir(tmp_path)
+    assert refused(Path("record")).startswith("record: no such file or folder; did you mean recordings?")
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
+def test_an_empty_bag(tmp_path: Path, suffix: str) -> None:
+    write(tmp_path / f"drive{suffix}", content=b"")
+    with pytest.raises(InputError, match="is empty, 0 bytes; copy the bag again"):
+        open_recording(tmp_path / f"drive{suffix}")

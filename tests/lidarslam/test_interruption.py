@@ -1,0 +1,159 @@
+"""Ctrl-C at any time of a run, once and several times."""
+
+import logging
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.run import interruption
+from lidarslam.run.interruption import Interruptions
+
+pytestmark = pytest.mark.usefixtures("interruptible")
+
+WRITING = "the results so far are being written"
+
+
+def press() -> None:
+    """Ctrl-C."""
+    signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every press counts, however soon after the one before."""
+    monkeypatch.setattr(interruption, "_APART_S", 0.0)
+
+
+@pytest.fixture
+def run(tmp_path: Path, small_recording: Path) -> Callable[..., Result]:
+    def run(*options: str) -> Result:
+        command = ["run", str(small_recording), "--out", str(tmp_path / "run"), "--odometry", "constant-velocity"]
+        return CliRunner().invoke(main, [*command, *options])
+
+    return run
+
+
+def pressed_at(monkeypatch: pytest.MonkeyPatch, place: str, times: int) -> None:
+    """Press Ctrl-C so many times where a function of the program is called."""
+    module, name = place.rsplit(".", 1)
+    original = getattr(__import__(module, fromlist=[name]), name)
+
+    def pressing(*given: object, **named: object) -> object:
+        for _ in range(times):
+            press()
+        return original(*given, **named)
+
+    monkeypatch.setattr(place, pressing)
+
+
+def at_scan(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Press Ctrl-C after a scan."""
+    from lidarslam.run.scan_log import ScanLog
+
+    add = ScanLog.add
+
+    def pressing(self: ScanLog, *given: object) -> None:
+        add(self, *given)  # type: ignore[arg-type]
+        if len(self) == number:
+            press()
+
+    monkeypatch.setattr(ScanLog, "add", pressing)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_the_second_and_third_wait_for_the_results(
+    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    at_scan(monkeypatch, 4)
+    pressed_at(monkeypatch, "lidarslam.run.run.write_results", 2)
+    result = run()
+    assert result.exit_code == 1
+    told = [record.message for record in caplog.records if WRITING in record.message]
+    assert [line.split("; ")[1] for line in told] == [
+        "2 more Ctrl-C, half a second apart, abandon them",
+        "1 more Ctrl-C, half a second apart, abandons them",
+    ]
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 4
+    assert (tmp_path / "run" / "map.ply").is_file()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_the_last_scan_is_done_and_ctrl_c_only_waits(
+    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pressed_at(monkeypatch, "lidarslam.run.run.final_map", 1)
+    assert run().exit_code == 0
+    assert sum(WRITING in record.message for record in caplog.records) == 1
+    assert not (tmp_path / "run" / "unfinished").exists()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_who_insists_abandons_the_results_and_can_resume(
+    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_scan(monkeypatch, 4)
+    pressed_at(monkeypatch, "lidarslam.run.run.write_results", 3)
+    result = run("--set", "checkpoints.every_scans=2")
+    assert result.exit_code == 1
+    assert "interrupted, no results were written; continue from the last checkpoint with --resume" in result.output
+    assert not (tmp_path / "run" / "trajectory.tum").exists()
+    monkeypatch.undo()
+    result = run("--set", "checkpoints.every_scans=2", "--resume")
+    assert result.exit_code == 0, result.output
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 6
+
+
+def test_resuming_is_promised_where_there_is_a_checkpoint(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_scan(monkeypatch, 4)
+    result = run("--set", "checkpoints.every_scans=2")
+    assert "stopped after 4 scans: interrupted; continue with --resume" in result.output
+
+
+def test_resuming_is_not_promised_without_a_checkpoint(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_scan(monkeypatch, 1)
+    result = run()
+    assert result.exit_code == 1
+    assert "stopped after 1 scan: interrupted; " in result.output
+    assert "no checkpoint to continue from; --overwrite begins again" in result.output
+    assert "--resume" not in result.output
+
+
+def test_before_the_first_scan_nothing_is_kept(
+    run: Callable[..., Result], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place in ("lidarslam.run.run.open_odometry", "lidarslam.run.tracking.prefetch"):
+        with monkeypatch.context() as patch:
+            pressed_at(patch, place, 1)
+            result = run()
+        assert result.exit_code == 1
+        assert "nothing was kept" in result.output
+        assert "--resume" not in result.output
+        assert not (tmp_path / "run").exists()
+
+
+def test_presses_in_quick_succession_are_one(caplog: pytest.LogCaptureFixture) -> None:
+    with Interruptions() as interruptions:
+        interruptions.protect_results()
+        for _ in range(20):
+            press()
+    assert len(caplog.records) <= 1
+
+
+def test_the_handlers_are_as_before() -> None:
+    def handlers() -> Iterator[object]:
+        return (signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
+
+    before = list(handlers())
+    with Interruptions():
+        assert list(handlers()) != before
+    assert list(handlers()) == before
+    assert logging.getLogger("lidarslam.run.interruption").level == logging.NOTSET
