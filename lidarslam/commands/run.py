@@ -1,5 +1,6 @@
 """`lidarslam run`: trajectory and map of a recording."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from lidarslam.commands.options import (
     scan_options,
     take_config,
 )
+from lidarslam.commands.serving import serving, wait_for_interrupt
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
@@ -37,10 +39,10 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 @scan_options
 @click.option(
     "--rerun",
-    type=click.Choice(["off", "save", "spawn"]),
+    type=click.Choice(["off", "save", "web", "spawn"]),
     default="off",
     show_default=True,
-    help="Save a Rerun recording; spawn opens a window too.",
+    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
 )
 @click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
@@ -55,6 +57,7 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     from lidarslam.run.resuming import lost_when_finished
     from lidarslam.run.run import execute
     from lidarslam.run.summary_text import format_outcome
+    from lidarslam.storage.directory import RERUN
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
@@ -63,9 +66,13 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished already")
         ctx.exit(EXIT_LOST if lost else 0)
-    with show_progress(source.name) as progress:
-        outcome = execute(request, progress)
-    say(format_outcome(out, outcome))
+    with serving() if request.rerun == "web" else contextlib.nullcontext() as page:
+        with show_progress(source.name) as progress:
+            outcome = execute(request, progress, page)
+        say(format_outcome(out, outcome))
+        if page is not None and outcome.stopped is None:
+            say(f"serving {page.address} until Ctrl-C; later: lidarslam view {out / RERUN} --web")
+            wait_for_interrupt()
     if outcome.stopped is not None:
         note(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; continue with --resume")
         ctx.exit(EXIT_MENDABLE)

@@ -15,6 +15,7 @@ from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
+from lidarslam.evaluate.inputs import truth_of_run
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
@@ -61,9 +62,11 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
     (sequence,) = outcome.comparison.sequences
     runs = [out / result.run for result in sequence.methods if result.run and result.trajectory is not None]
     if runs:
-        from lidarslam.viewer.rerun_runs import save_runs
+        from lidarslam.viewer.rerun_output import save
+        from lidarslam.viewer.rerun_runs import show_runs
 
-        save_runs([load_run(run) for run in runs], ViewerConfig(), out / REPLAY)
+        finished, truth = [load_run(run) for run in runs], truth_of_run(runs[0])
+        save(show_runs(finished, truth, ViewerConfig()), out / REPLAY)
     return Demo(out, outcome, tuple(_picture(out, place) for place in (source, *runs)))
 
 
@@ -79,7 +82,7 @@ def format_demo(demo: Demo) -> str:
     return f"""
 {format_comparison(demo.outcome.comparison, demo.out)}
 maps      {", ".join(str(picture) for picture in demo.pictures)}
-replay    rerun {demo.out / REPLAY}
+replay    lidarslam view {demo.out / REPLAY} --web
 
 Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that; the
 network measures a turn whatever its size, and the map corrects the rest."""

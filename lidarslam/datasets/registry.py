@@ -83,6 +83,11 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
 
 
+def is_recording(source: Path, name: str | None = None) -> bool:
+    """Whether a reader was named for an existing source, or one recognises it."""
+    return source.exists() and (name is not None or any(reader.recognises(source) for reader in READERS.values()))
+
+
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
     """Open a recording; scans are read later, one at a time.
 

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config
-from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.errors import ConfigError, OutputError
 from lidarslam.core.trajectory_io import read_tum
+from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
@@ -19,30 +20,35 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Progress, track
 from lidarslam.storage.directory import RERUN, RunDirectory
 from lidarslam.storage.unfinished import Unfinished
+from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.viewer import Viewer
+from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 
-def execute(request: RunRequest, progress: Progress) -> RunOutcome:
+def execute(request: RunRequest, progress: Progress, page: WebPage | None = None) -> RunOutcome:
     """Run, and write the run directory.
 
     A damaged recording or an interruption ends the run early, with the results so far. A run that is killed can be
     resumed, to the same results.
+
+    Args:
+        request: of the run.
+        progress: called after every scan.
+        page: shows the run in browsers, with `rerun="web"`.
 
     Raises:
         LidarSlamError: the source, the configuration or the output directory is not usable, or there is nothing to
             resume.
     """
     require_apart(request.out, request.source)
+    if request.rerun == "spawn":
+        require_window("serve a browser with --rerun web, or write a file with --rerun save")
     config = request.config
     recording = open_recording(request.source, config.reader)
-    chosen = range(len(recording))[request.start : request.stop : request.step]
-    if not chosen:
-        raise InputError(
-            f"{request.source}: none of its {len(recording)} scans is left after --start, --stop and --step"
-        )
+    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
     with ExitStack() as stack:
         odometry = open_odometry(config, request.prior)
         stack.callback(odometry.close)
@@ -54,7 +60,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         log, graph = ScanLog(), _open_graph(config, directory, unfinished)
         if graph is not None:
             stack.callback(graph.close)
-        with _viewing(request, recording.name, directory, log) as viewer:
+        with _viewing(request, recording.name, directory, log, page) as viewer:
             tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
             closed = close_loops(graph, tracked.global_map, log, viewer)
             drawn = final_map(tracked, closed, config.global_map)
@@ -81,7 +87,9 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
 
 
 @contextmanager
-def _viewing(request: RunRequest, name: str, directory: RunDirectory, log: ScanLog) -> Iterator[Viewer]:
+def _viewing(
+    request: RunRequest, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
+) -> Iterator[Viewer]:
     """The viewer of a run; a Rerun recording that cannot be written is a warning."""
     if request.rerun == "off":
         yield Viewer()
@@ -92,7 +100,7 @@ def _viewing(request: RunRequest, name: str, directory: RunDirectory, log: ScanL
     try:
         with (
             directory.replacing(RERUN) as path,
-            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn") as viewer,
+            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn", page) as viewer,
         ):
             yield viewer
     except IncompleteRecordingError as error:

@@ -38,6 +38,11 @@ class FinishedRun:
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
 
 
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, finished or not."""
+    return (path / files.TRAJECTORY_TUM).is_file() or (path / files.ABOUT).is_file()
+
+
 def load_run(path: Path) -> FinishedRun:
     """Read a run directory.
 

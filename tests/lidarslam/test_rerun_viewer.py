@@ -109,7 +109,7 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
 
 def test_a_recording_that_cannot_be_begun_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where there is no /dev/fd."""
-    monkeypatch.setattr("lidarslam.viewer.rerun_recording._OPEN_FILES", tmp_path / "none")
+    monkeypatch.setattr("lidarslam.viewer.rerun_recording.OPEN_FILES", tmp_path / "none")
     with pytest.raises(OutputError, match=r"cannot be begun \(.*\)") as caught:
         save_runs([], ViewerConfig(), tmp_path / "recording.rrd")
     assert "\n" not in str(caught.value)
