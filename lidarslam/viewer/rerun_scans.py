@@ -23,6 +23,8 @@ from lidarslam.viewer.rerun_recording import (
 )
 
 _LIDAR = "world/lidar"
+# Where the eye begins to follow the sensor, metres.
+_BEHIND = (-40.0, 0.0, 25.0)
 
 
 def show_scans(name: str, scans: Iterable[Scan], truth: Trajectory | None, config: ViewerConfig) -> Show:
@@ -41,6 +43,9 @@ def show_scans(name: str, scans: Iterable[Scan], truth: Trajectory | None, confi
         if truth is not None:
             path = rr.LineStrips3D([truth.positions], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
             recording.log("world/ground truth", path, static=True)
+            # The eye follows only what is drawn.
+            place = rr.Points3D([[0.0, 0.0, 0.0]], colors=[REFERENCE_COLOUR], radii=2.0 * PATH_RADIUS)
+            recording.log(_LIDAR, place, static=True)
         for index, scan in enumerate(scans):
             _log_scan(recording, index, scan, truth, config.scan_points)
 
@@ -62,7 +67,7 @@ def _blueprint(has_truth: bool) -> rrb.Blueprint:
     scan = rrb.Spatial3DView(origin=f"/{_LIDAR}", name="Scan", background=BACKGROUND)
     views = [scan]
     if has_truth:
-        eye = rrb.EyeControls3D(tracking_entity=f"/{_LIDAR}")
+        eye = rrb.EyeControls3D(position=_BEHIND, look_target=(0.0, 0.0, 0.0), tracking_entity=f"/{_LIDAR}")
         on_path = rrb.Spatial3DView(origin="/world", name="On the true path", background=BACKGROUND, eye_controls=eye)
         views.append(on_path)
     panel = rrb.TimePanel(timeline=TIME, play_state="playing", loop_mode="all", state="collapsed")

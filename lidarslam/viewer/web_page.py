@@ -20,6 +20,8 @@ LOCAL = "127.0.0.1"
 # The first free one of these; Rerun's own default comes first.
 _PORTS = range(9090, 9110)
 _INDEX, _RECORDING = "/", "/recording.rrd"
+# Of the viewer: our colours are chosen for a dark ground, and nothing is kept in the browser.
+_OPTIONS = "&theme=dark&persist=false&hide_welcome_screen"
 _PIECE, _POLL_S = 1 << 20, 0.1
 _TYPES = {".js": "text/javascript", ".wasm": "application/wasm", ".ico": "image/x-icon", ".png": "image/png"}
 _HEADERS = {
@@ -112,7 +114,7 @@ class _Request(BaseHTTPRequestHandler):
         elif place.path == _INDEX and "url=" not in place.query:
             # The address as the browser knows it, which at the end of a tunnel may be another.
             recording = quote(f"http://{host}{_RECORDING}", safe="")
-            self._begin(HTTPStatus.FOUND, {"Location": f"/?url={recording}&theme=dark", "Content-Length": "0"})
+            self._begin(HTTPStatus.FOUND, {"Location": f"/?url={recording}{_OPTIONS}", "Content-Length": "0"})
         elif place.path == _RECORDING:
             self._send_recording()
         elif (content := self.server.files.get(place.path)) is not None:
