@@ -54,14 +54,14 @@ def test_a_run_is_served_while_it_goes_on_and_afterwards(serve: Serve, small_rec
     process, address = serve("run", small_recording, "--out", out, "--odometry", "constant-velocity", "--rerun", "web")
     with urlopen(f"{address}/recording.rrd", timeout=60) as recording:
         seen = recording.read()
-    require_complete(out / "recording.rrd")
-    assert seen == (out / "recording.rrd").read_bytes()
     assert process.stdout is not None
     lines = []
     while "until Ctrl-C; later" not in (line := process.stdout.readline()):
         assert line or process.poll() is None, "ended early"
         lines.append(line)
     assert "written to" in "".join(lines)
+    require_complete(out / "recording.rrd")
+    assert seen == (out / "recording.rrd").read_bytes()
     assert f"lidarslam view {out / 'recording.rrd'} --web" in line
     with urlopen(f"{address}/?url=there", timeout=20) as page:
         assert page.status == 200
