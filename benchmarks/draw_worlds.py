@@ -9,13 +9,14 @@ r"""Draw the exact map of every simulated world, as one lap of its route sees it
 import argparse
 from pathlib import Path
 
+from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.recording.reference_map import reference_map
 from lidarslam.simulation.sensors.table import find_sensor
 from lidarslam.simulation.worlds.registry import WORLDS, build_world
-from lidarslam.viewer.picture import Camera, draw, height_colours, save_picture
+from lidarslam.viewer.picture import OBLIQUE, DrawnRun, draw_runs, save_picture
 
 
 def simulate(name: str, seed: int, motion: str, sensor: str, scans: int | None) -> Simulation:
@@ -31,8 +32,9 @@ def simulate(name: str, seed: int, motion: str, sensor: str, scans: int | None) 
 def draw_map(simulation: Simulation, path: Path, width: int) -> int:
     """Draw what a simulation sees; how many points its map has."""
     seen = reference_map(simulation, step=max(1, len(simulation) // 200))
-    camera = Camera(azimuth_deg=-60.0, elevation_deg=38.0, width=width, height=9 * width // 16)
-    save_picture(path, draw(seen.points, height_colours(seen.points), seen.normals, camera))
+    save_picture(
+        path, draw_runs([DrawnRun(path.stem, PointCloud(seen.points, seen.normals))], OBLIQUE, width=width).pixels
+    )
     return len(seen.points)
 
 

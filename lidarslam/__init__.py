@@ -1,1 +1,59 @@
-"""The application: recordings in, trajectories and maps out."""
+"""LiDAR SLAM: trajectories and maps of recorded runs and in a program's own loop, and how good they are.
+
+The names below are loaded when they are first used; `docs/python.md` shows them at work.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lidarslam.api.evaluation import evaluate
+    from lidarslam.api.recordings import OpenRecording, open
+    from lidarslam.api.registered_scan import RegisteredScan
+    from lidarslam.api.slam import Slam
+    from lidarslam.config.settings import Config
+    from lidarslam.core.errors import LidarSlamError
+    from lidarslam.core.scan import Scan
+    from lidarslam.core.tracking import Status
+    from lidarslam.core.trajectory import Trajectory
+    from lidarslam.mapping.global_map.global_map import PointCloud
+
+__all__ = [
+    "Config",
+    "LidarSlamError",
+    "OpenRecording",
+    "PointCloud",
+    "RegisteredScan",
+    "Scan",
+    "Slam",
+    "Status",
+    "Trajectory",
+    "evaluate",
+    "open",
+]
+
+_MODULES = {
+    "Config": "lidarslam.config.settings",
+    "LidarSlamError": "lidarslam.core.errors",
+    "OpenRecording": "lidarslam.api.recordings",
+    "PointCloud": "lidarslam.mapping.global_map.global_map",
+    "RegisteredScan": "lidarslam.api.registered_scan",
+    "Scan": "lidarslam.core.scan",
+    "Slam": "lidarslam.api.slam",
+    "Status": "lidarslam.core.tracking",
+    "Trajectory": "lidarslam.core.trajectory",
+    "evaluate": "lidarslam.api.evaluation",
+    "open": "lidarslam.api.recordings",
+}
+
+if not TYPE_CHECKING:  # a type checker would take any name for one of these
+
+    def __getattr__(name):
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module
+
+        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        return value
+
+    def __dir__():
+        return sorted({*globals(), *__all__})

@@ -9,6 +9,10 @@ from typing_extensions import Self
 from lidarslam.core.limits import require_lost_worse, require_range_left
 
 MappingName = Literal["surfels", "loam", "off"]
+MapField = Literal["intensity", "rgb", "ring", "time"]
+"""An attribute of the points of a map."""
+MapFormat = Literal["pcd", "laz", "e57"]
+"""What a map can be written as beside .ply."""
 
 
 class TrackingConfig(BaseModel):
@@ -108,6 +112,10 @@ class GlobalMapConfig(BaseModel):
     min_hits: int = Field(1, ge=1, description="scans' points a voxel needs before it is written")
     leave_out_moved: bool = Field(
         True, description="leave out what other scans saw through where it was: people and vehicles that passed"
+    )
+    fields: tuple[MapField, ...] = Field(
+        ("intensity", "rgb"),
+        description="attributes of points that the map has where scans have them: intensity, rgb, ring, time",
     )
 
     @model_validator(mode="after")

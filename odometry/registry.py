@@ -4,6 +4,7 @@ from lidarslam.core.errors import ConfigError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.config import LearnedConfig, OdometryConfig
 from lidarslam.odometry.interface import Odometry
+from lidarslam.odometry.train_extra import require_train_extra
 
 
 def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Odometry:
@@ -15,7 +16,7 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
 
     Raises:
         ConfigError: the method is `external` and there is no prior, or the other way round; or the learned odometry's
-            device or its shipped weights are missing.
+            device, its shipped weights or the libraries for a file of weights are missing.
         InputError: the learned odometry's weights are no weights.
     """
     if (config.method == "external") != (prior is not None):
@@ -45,6 +46,7 @@ def _make_learned(config: LearnedConfig) -> Odometry:
 
         exported = read_exported(config.weights or shipped_folder())
         return LearnedOdometry(onnx_search(exported, config.threads), exported.images, config.alignment)
+    require_train_extra(f"odometry.learned.device={config.device}" if config.device != "cpu" else "a file of weights")
     from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
     from lidarslam.odometry.network.shipped import default_weights
     from lidarslam.odometry.network.torch_graphs import torch_search

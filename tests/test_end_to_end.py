@@ -23,7 +23,7 @@ from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.scan_stream import in_order
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
-from lidarslam.storage.directory import FILES
+from lidarslam.storage.directory import FILES, MAPS
 from lidarslam.storage.finished_run import load_run
 
 KISS_ICP = [
@@ -61,7 +61,7 @@ def test_a_run_writes_what_the_contract_names(
     recording: Path, tmp_path: Path, room: Any, room_truth: Trajectory
 ) -> None:
     out = tmp_path / "run"
-    outcome = execute(RunRequest(recording, out, load_config(None, KISS_ICP), pcd=True), quiet)
+    outcome = execute(RunRequest(recording, out, load_config(None, KISS_ICP), map_formats=("pcd",)), quiet)
 
     trajectory = read_tum(out / "trajectory.tum")
     np.testing.assert_allclose(trajectory.stamps, room_truth.stamps, atol=1e-9)
@@ -146,7 +146,7 @@ def test_a_pose_graph_is_built_when_it_is_asked_for(
     cloud = o3d.io.read_point_cloud(str(out / "map.ply"))
     distance = room.distance_to_surface(transform_points(room_truth.T_world_lidar[0], np.asarray(cloud.points)))
     assert np.percentile(distance, 95) < 0.02
-    assert sorted(path.name for path in out.iterdir()) == sorted(set(FILES) - {"map.pcd"})
+    assert sorted(path.name for path in out.iterdir()) == sorted(set(FILES) - set(MAPS.values()))
     run = load_run(out)
     assert not len(run.loops)
 

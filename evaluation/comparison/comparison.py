@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.comparison.table import Table
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_json
@@ -26,6 +27,17 @@ class MapErrors:
 
     points: FloatArray  # (K, 3) points of the method's map, in the reference map's frame
     distances_m: FloatArray  # (K,) to the nearest point of the reference map
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSeries:
+    """The registration of each scan of a run, NaN where there was none."""
+
+    times_s: FloatArray  # (N,) since the first scan
+    statuses: Sequence[Status]  # N
+    residual_m: FloatArray  # (N,) median distance of the matched points from their surfaces
+    inlier_ratio: FloatArray  # (N,)
+    points_used: FloatArray  # (N,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +64,7 @@ class MethodResult:
     peak_rss_mb: float | None = None  # of its process and its children
     wall_s: float | None = None  # of the whole process, from start to end
     settings: str = ""  # the method's resolved configuration as YAML
+    series: ScanSeries | None = None  # of each scan, for the page of a run
     run: str = ""  # its run directory, relative to the report's folder; empty when there is none
 
     @property

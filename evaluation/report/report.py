@@ -2,7 +2,7 @@
 
 import re
 from base64 import b64encode
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from importlib.resources import files
@@ -18,6 +18,7 @@ from lidarslam.evaluation.report.figures.errors import deviation_figure, error_f
 from lidarslam.evaluation.report.figures.figure import Figure, Styles, method_styles
 from lidarslam.evaluation.report.figures.maps import entropy_figure, map_figure
 from lidarslam.evaluation.report.figures.resources import resources_figure
+from lidarslam.evaluation.report.figures.scans import scan_figure
 from lidarslam.evaluation.report.figures.tracking import tracking_figure
 from lidarslam.evaluation.report.figures.trajectories import trajectory_figure
 from lidarslam.evaluation.report.tables import published_table, sequence_tables
@@ -36,25 +37,39 @@ class Section:
 
 
 def render_html(comparison: Comparison) -> str:
-    """The report as one page that fetches nothing and runs no script but its own two.
+    """The report as one page; see `render_page`."""
+    styles = method_styles(method.name for sequence in comparison.sequences for method in sequence.methods)
+    sections = [Section(sequence, list(sequence_blocks(sequence, styles))) for sequence in comparison.sequences]
+    return render_page(
+        "report.html.j2",
+        comparison.title,
+        styles,
+        [block for section in sections for block in section.blocks],
+        comparison=comparison,
+        overview=_overview(comparison),
+        sections=sections,
+        settings=_settings(comparison),
+    )
+
+
+def render_page(template: str, title: str, styles: Styles, blocks: Sequence[Table | Figure], **content: object) -> str:
+    """A page that fetches nothing and runs no script but its own two, which it holds if it has a figure.
 
     Text is escaped by Jinja2, data of figures by plotly; the content security policy names both scripts by their hash,
     so that no other can run.
     """
-    styles = method_styles(method.name for sequence in comparison.sequences for method in sequence.methods)
-    scripts = [get_plotlyjs(), _file("report.js")]
+    has_figures = any(isinstance(block, Figure) for block in blocks)
+    scripts = [get_plotlyjs(), _file("report.js")] if has_figures else []
     return (
         _environment()
-        .get_template("report.html.j2")
+        .get_template(template)
         .render(
-            comparison=comparison,
-            overview=_overview(comparison),
-            sections=[Section(sequence, list(_html_blocks(sequence, styles))) for sequence in comparison.sequences],
-            settings=_settings(comparison),
+            title=title,
             styles=styles,
             style_sheet=_file("report.css"),
             scripts=scripts,
             hashes=[b64encode(sha256(script.encode()).digest()).decode() for script in scripts],
+            **content,
         )
     )
 
@@ -75,8 +90,10 @@ def _overview(comparison: Comparison) -> list[Table]:
     return [*comparison.tables, *([] if published is None else [published])]
 
 
-def _html_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table | Figure]:
+def sequence_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table | Figure]:
+    """Tables and figures of a recording, as far as there are values for them."""
     tables = sequence_tables(sequence)
+    several = len(sequence.methods) > 1
     order: list[Table | Figure | None] = [
         *tables["summary"],
         trajectory_figure(sequence, styles),
@@ -86,11 +103,12 @@ def _html_blocks(sequence: SequenceComparison, styles: Styles) -> Iterator[Table
         speed_figure(sequence, styles),
         *tables["drift"],
         map_figure(sequence),
-        entropy_figure(sequence, styles),
+        entropy_figure(sequence, styles) if several else None,
         *tables["map"],
-        resources_figure(sequence, styles),
+        scan_figure(sequence, styles),
+        resources_figure(sequence, styles) if several else None,
         *tables["time"],
-        tracking_figure(sequence, styles),
+        tracking_figure(sequence, styles) if several else None,
         *tables["tracking"],
     ]
     return (block for block in order if block is not None)

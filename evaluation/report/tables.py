@@ -76,7 +76,9 @@ def _summary_table(sequence: SequenceComparison) -> Table:
     ]
     partial = any(method.status not in WHOLE and method.metrics is not None for method in sequence.methods)
     note = "The errors of a method that ended early are those of its part, and are not ranked." if partial else ""
-    return Table(f"{sequence.sequence}: all methods", columns, rows, note).without_empty()
+    return Table(
+        f"{sequence.sequence}: {'all methods' if len(sequence.methods) > 1 else 'summary'}", columns, rows, note
+    ).without_empty()
 
 
 def _drift_table(

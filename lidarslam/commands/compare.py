@@ -6,12 +6,15 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from lidarslam.commands.names import ShippedFile
 from lidarslam.commands.options import (
     FILE,
     PATH,
     POSITIVE,
     CommandWithExample,
     config_options,
+    default_out,
+    out_option,
     reader_options,
     scan_options,
 )
@@ -20,21 +23,26 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, note, say
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam compare KITTI --sequence 04 --out compared --methods learned,learned+map,kiss-icp
-    lidarslam compare office.mcap --out compared --methods learned+map,learned+loam
-    lidarslam compare office.mcap --out compared --methods kiss-icp,prior --prior wheel_odometry.tum
-    lidarslam compare --benchmark configs/benchmarks/kitti.yaml --data KITTI --out compared""",
+    epilog="""lidarslam compare office.mcap
+    lidarslam compare KITTI --sequence 04 -o compared/04 --methods learned,learned+map,kiss-icp
+    lidarslam compare office.mcap --methods learned+map,learned+loam
+    lidarslam compare office.mcap --methods kiss-icp,prior --prior wheel_odometry.tum
+    lidarslam compare --benchmark kitti --data KITTI""",
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder for runs and report.")
+@out_option("Folder for runs and report.", "compared/SOURCE_TIME, after the first, or the benchmark")
 @click.option(
     "--methods",
     metavar="NAME,...",
     help="BASE[@VOXEL][+map|+loam][+graph], BASE one of learned, kiss-icp, constant-velocity and prior.  "
     "[default: learned+map,kiss-icp, or the benchmark's]",
 )
-@click.option("--benchmark", type=FILE, metavar="FILE", help="Recordings and methods as in the file.")
-@click.option("--data", type=PATH, metavar="DIR", help="Root of the benchmark's paths.")
+@click.option(
+    "--benchmark",
+    type=ShippedFile("benchmark", "BENCHMARKS"),
+    help="Recordings and methods: a name of lidarslam config --list, or a YAML file.",
+)
+@click.option("--data", type=PATH, metavar="DIR", help="Root of the benchmark's paths.  [default: the current folder]")
 @click.option("--prior", type=FILE, metavar="TUM_FILE", help="Trajectory of prior, prior+map and prior+loam.")
 @click.option("--reference", metavar="METHOD|FILE", help="Reference.  [default: the ground truth]")
 @click.option("--reference-map", type=FILE, metavar="FILE", help="Point cloud to compare the maps with.")
@@ -46,13 +54,16 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, note, say
 @reader_options
 @config_options
 @click.pass_context
-def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, **options: Any) -> None:
+def compare(
+    ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | None, out: Path | None, **options: Any
+) -> None:
     """Compare several methods on one or more recordings in one report.
 
     Each method runs in a process of its own, one after another. A method that crashes or gets lost is a row of the
     table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes the report so far.
     """
     from lidarslam.compare.command import run_compare
+    from lidarslam.storage.default_places import source_name
 
     if (benchmark is None) == (not sources):
         raise click.UsageError("name a SOURCE, several, or a file with --benchmark")
@@ -64,5 +75,8 @@ def compare(ctx: click.Context, /, sources: tuple[Path, ...], benchmark: Path | 
         if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT and len(sources) != 1:
             flag = f"--{name.replace('_', '-')}"
             raise click.UsageError(f"{flag} belongs to one SOURCE; a benchmark file has one for each recording")
-    if not run_compare(say, note, sources=sources, benchmark=benchmark, **options):
+    if out is None:
+        name = source_name(sources[0], options["sequence"]) if benchmark is None else benchmark.stem
+        out = default_out("compared", name)
+    if not run_compare(say, note, sources=sources, benchmark=benchmark, out=out, **options):
         ctx.exit(EXIT_MENDABLE)

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import PATH, POSITIVE, CommandWithExample
+from lidarslam.commands.options import PATH, POSITIVE, CommandWithExample, latest_run
 from lidarslam.commands.terminal import say
 
 _SECONDS = click.FloatRange(min=0.0)
@@ -13,11 +13,12 @@ _SECONDS = click.FloatRange(min=0.0)
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam evaluate runs/04
+    epilog="""lidarslam evaluate
+    lidarslam evaluate runs/04
     lidarslam evaluate runs/site --reference-map survey.laz --errors errors.ply
     lidarslam evaluate kitti_00.txt --reference poses/00.txt""",
 )
-@click.argument("run", type=PATH)
+@click.argument("run", type=PATH, required=False)
 @click.option(
     "--reference",
     type=PATH,
@@ -66,20 +67,23 @@ _SECONDS = click.FloatRange(min=0.0)
     show_default=True,
     help="Error of the brightest colour, m.",
 )
-@click.option("--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
-def evaluate(run: Path, **options: Any) -> None:
+@click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.  [default: report]")
+@click.option("-o", "--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
+def evaluate(run: Path | None, **options: Any) -> None:
     """Evaluate a trajectory and its map.
 
-    RUN is a run directory, or a trajectory in TUM or KITTI text.
+    RUN is a run directory, or a trajectory in TUM or KITTI text.  [default: the latest run in runs]
     """
-    from lidarslam.evaluate.evaluate import EvaluateRequest, evaluate
-    from lidarslam.evaluate.map_evaluation import MapOptions
-    from lidarslam.evaluate.text import format_evaluation
+    from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
+    from lidarslam.compare.assessment.map_evaluation import MapOptions
+    from lidarslam.compare.assessment.text import format_evaluation
 
     given = {name: value for name, value in options.items() if value is not None}
     if given.get("reference") and given["no_reference"]:
         raise click.UsageError("--reference and --no-reference exclude each other; choose one")
     named = {"map_alignment": "alignment", "refine": "refine", "spacing_m": "spacing_m", "max_range_m": "max_range_m"}
     map_options = MapOptions(**{named[name]: given.pop(name) for name in named if name in given})
-    request = EvaluateRequest(run, needs_reference=not given.pop("no_reference"), map_options=map_options, **given)
+    request = EvaluateRequest(
+        run or latest_run(), needs_reference=not given.pop("no_reference"), map_options=map_options, **given
+    )
     say(format_evaluation(evaluate(request)))

@@ -9,23 +9,27 @@ from lidarslam.commands.options import (
     PATH,
     CommandWithExample,
     config_options,
+    default_out,
+    map_options,
     odometry_options,
+    out_option,
     reader_options,
     take_config,
+    take_map_formats,
 )
 from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
-@click.command(cls=CommandWithExample, epilog="lidarslam merge ground_floor.mcap stairs.mcap --out building")
+@click.command(cls=CommandWithExample, epilog="lidarslam merge ground_floor.mcap stairs.mcap -o building")
 @click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Directory of the merged map.")
+@out_option("Directory of the merged map.", "merged/SOURCE_TIME, after the first")
 @odometry_options
-@click.option("--pcd", is_flag=True, help="Write the maps as map.pcd too.")
+@map_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
 @reader_options
 @config_options
 @click.pass_context
-def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options: Any) -> None:
+def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Build one map of several recordings of a place.
 
     Each recording is run, and joined to the earlier ones by loop closures. DIR holds the common map, and for each
@@ -36,9 +40,11 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path, **options
     from lidarslam.run.merge.parts import MergeRequest
     from lidarslam.run.merge.text import format_merge
     from lidarslam.run.progress import show_progress
+    from lidarslam.storage.default_places import source_name
 
-    config = take_config(options, *sources)
-    outcome = execute(MergeRequest(sources, out, config, **options), show_progress)
+    config, map_formats = take_config(options, *sources), take_map_formats(options)
+    out = out or default_out("merged", source_name(sources[0], config.reader.sequence))
+    outcome = execute(MergeRequest(sources, out, config, map_formats, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:
         note(line)

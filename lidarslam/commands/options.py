@@ -1,17 +1,17 @@
 """Options that several commands share, and the configuration they result in."""
 
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.shell_completion import CompletionItem
 
+from lidarslam.commands.names import Registered, ShippedFile
 from lidarslam.commands.terminal import note
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
+    from lidarslam.mapping.config import MapFormat
 
 
 class CommandWithExample(click.Command):
@@ -32,27 +32,6 @@ class _Path(click.Path):
         if value == "":
             self.fail("the path is empty; name a file or a folder", param, ctx)
         return super().convert(value, param, ctx)
-
-
-class Registered(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
-    """One of the names in a registry, a dictionary in a module that is imported when needed."""
-
-    name = "name"
-
-    def __init__(self, module: str, registry: str) -> None:
-        self._module, self._registry = module, registry
-
-    def _choice(self) -> "click.Choice[str]":
-        return click.Choice(list(getattr(import_module(self._module), self._registry)))
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        return self._choice().convert(value, param, ctx)
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:  # noqa: ARG002
-        return f"[{'|'.join(self._choice().choices)}]"
-
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return self._choice().shell_complete(ctx, param, incomplete)
 
 
 PATH = _Path(path_type=Path)
@@ -76,7 +55,13 @@ def _together(*decorators: _Decorator) -> _Decorator:
 SOURCE = click.argument("source", type=PATH)
 
 config_options = _together(
-    click.option("--config", "config_file", type=FILE, help="YAML file of settings that differ from the defaults."),
+    click.option(
+        "-c",
+        "--config",
+        "config_file",
+        type=ShippedFile("configuration", "CONFIGS"),
+        help="Settings that differ from the defaults: a name of lidarslam config --list, or a YAML file.",
+    ),
     click.option("--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="One setting; may be repeated."),
 )
 reader_options = _together(
@@ -111,6 +96,58 @@ mapping_options = _together(
     ),
     click.option("--no-mapping", is_flag=True, help="The odometry alone, as --mapping off."),
 )
+map_options = _together(
+    click.option(
+        "--map-format",
+        type=click.Choice(["pcd", "laz", "e57"]),
+        multiple=True,
+        help="Write the map as map.pcd, map.laz or map.e57 too; may be repeated.",
+    ),
+    click.option("--pcd", is_flag=True, help="As --map-format pcd."),
+)
+
+
+def take_map_formats(options: dict[str, Any]) -> "tuple[MapFormat, ...]":
+    """The formats of the map beside .ply; the options they are made of are removed.
+
+    Raises:
+        OutputError: a library for one is not installed.
+    """
+    from lidarslam.mapping.global_map.map_io import require_format
+
+    formats = (*options.pop("map_format"), *(["pcd"] if options.pop("pcd") else []))
+    for one in formats:
+        require_format(one)
+    return tuple(dict.fromkeys(formats))
+
+
+def out_option(what: str, default: str) -> _Decorator:
+    """The option `--out`, and where `default_out` puts results without it."""
+    return click.option("-o", "--out", type=PATH, metavar="DIR", help=f"{what}  [default: {default}]")
+
+
+def default_out(folder: str, name: str) -> Path:
+    """A new directory FOLDER/NAME_TIME, which is noted."""
+    from lidarslam.storage.default_places import new_place
+
+    out = new_place(Path(folder), name)
+    note(f"results go to {out}")
+    return out
+
+
+def latest_run() -> Path:
+    """The latest run in `runs`, which is noted.
+
+    Raises:
+        UsageError: there is none.
+    """
+    from lidarslam.storage import default_places
+
+    run = default_places.latest_run()
+    if run is None:
+        raise click.UsageError(f"name a RUN; {default_places.RUNS} holds no finished one")
+    note(f"taking the latest run, {run}")
+    return run
 
 
 def take_config(options: dict[str, Any], *sources: Path) -> "Config":

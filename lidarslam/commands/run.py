@@ -8,30 +8,33 @@ import click
 
 from lidarslam.commands.options import (
     FILE,
-    PATH,
     SOURCE,
     CommandWithExample,
     config_options,
+    default_out,
+    map_options,
     mapping_options,
     odometry_options,
+    out_option,
     reader_options,
     scan_options,
     take_config,
+    take_map_formats,
 )
-from lidarslam.commands.serving import serving, wait_for_interrupt
-from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
 
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam run KITTI --sequence 04 --out runs/04
-    lidarslam run office.mcap --out runs/office --rerun save
-    lidarslam run office.mcap --out runs/loam --mapping loam
-    lidarslam run office.mcap --out runs/wheels --prior wheel_odometry.tum
-    lidarslam run office.mcap --out runs/office --rerun save --resume""",
+    epilog="""lidarslam run office.mcap
+    lidarslam run office.mcap --resume
+    lidarslam run KITTI --sequence 04 -o runs/04
+    lidarslam run office.mcap -o runs/loam --mapping loam --rerun save
+    lidarslam run office.mcap -o runs/wheels --prior wheel_odometry.tum
+    lidarslam run office.mcap --odometry kiss-icp --no-mapping -c indoor""",
 )
 @SOURCE
-@click.option("--out", type=PATH, required=True, metavar="RUN", help="Run directory for the results.")
+@out_option("Run directory for the results.", "runs/SOURCE_TIME; with --resume, the unfinished run of SOURCE in runs")
 @odometry_options
 @click.option("--prior", type=FILE, metavar="TUM_FILE", help="External trajectory to use as the odometry.")
 @mapping_options
@@ -44,13 +47,14 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
     show_default=True,
     help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
 )
-@click.option("--pcd", is_flag=True, help="Write the map as map.pcd too.")
+@map_options
+@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 @reader_options
 @config_options
 @click.pass_context
-def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
+def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.run.progress import show_progress
     from lidarslam.run.request import RunRequest
@@ -61,8 +65,9 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    config = take_config(options, source)
-    request = RunRequest(source, out, config, **options)
+    config, map_formats = take_config(options, source), take_map_formats(options)
+    out = out or _default_out(source, config.reader.sequence, options["resume"])
+    request = RunRequest(source, out, config, map_formats=map_formats, **options)
     if request.resume and (lost := lost_when_finished(request)) is not None:
         say(f"{out}: is finished already")
         ctx.exit(EXIT_LOST if lost else 0)
@@ -78,3 +83,18 @@ def run(ctx: click.Context, /, source: Path, out: Path, **options: Any) -> None:
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.went_astray:
         ctx.exit(EXIT_LOST)
+
+
+def _default_out(source: Path, sequence: str | None, resume: bool) -> Path:
+    """A new run directory, or that of the unfinished run.
+
+    Raises:
+        InputError: there is no run to resume, or there are several.
+    """
+    from lidarslam.storage.default_places import RUNS, source_name, unfinished_run
+
+    if not resume:
+        return default_out(str(RUNS), source_name(source, sequence))
+    out = unfinished_run(source, sequence)
+    note(f"resuming {out}")
+    return out

@@ -5,7 +5,8 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import FILE, PATH, CommandWithExample, Registered
+from lidarslam.commands.names import Registered
+from lidarslam.commands.options import FILE, CommandWithExample, default_out, out_option
 from lidarslam.commands.terminal import say
 
 _WORLD = Registered("lidarslam.simulation.worlds.registry", "WORLDS")
@@ -17,12 +18,12 @@ _FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam simulate --out recordings/office
-    lidarslam simulate --out recordings/street --world street --sensor hdl-64e --motion car --format kitti
-    lidarslam simulate --out recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
-    lidarslam simulate --out recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000""",
+    epilog="""lidarslam simulate
+    lidarslam simulate -o recordings/street --world street --sensor hdl-64e --motion car --format kitti
+    lidarslam simulate -o recordings/road --world fields --sensor hdl-64e-calibrated --motion car-fast --speed 25
+    lidarslam simulate -o recordings/kitti_07 --world street --trajectory poses/07.txt --scans 1000""",
 )
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Folder of the recording.")
+@out_option("Folder of the recording.", "recordings/WORLD_TIME")
 @click.option("--world", type=_WORLD, default="office", show_default=True, help="Scene.")
 @click.option("--sensor", type=_SENSOR, default="vlp-16", show_default=True, help="LiDAR model.")
 @click.option(
@@ -49,7 +50,7 @@ _FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
 @click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
-def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: Any) -> None:
+def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Simulate a recording, with the exact trajectory and the exact map."""
     from lidarslam.run.progress import show_count
     from lidarslam.simulation.recording.record import record
@@ -57,6 +58,7 @@ def simulate(out: Path, motion: str | None, trajectory: Path | None, **options: 
     from lidarslam.simulation.recording.text import format_summary
 
     motion = motion or ("handheld" if trajectory is None else "car")
+    out = out or default_out("recordings", options["world"])
     request = RecordRequest(out, motion=motion, trajectory=trajectory, **options)
     with show_count(out.name) as progress:
         summary = record(request, progress)

@@ -1,23 +1,24 @@
 """`lidarslam train`: weights of the learned odometry."""
 
+import os
 from pathlib import Path
 from typing import Any
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample, config_options, reader_options
+from lidarslam.commands.options import PATH, CommandWithExample, config_options, default_out, out_option, reader_options
 from lidarslam.commands.terminal import EXIT_MENDABLE, say
 
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam train office.mcap street.mcap --out trained
-    lidarslam train KITTI --sequence 00 --out trained --from shipped --steps 2000
-    lidarslam train --out trained --set simulated.recordings=100
-    lidarslam train --out trained --resume""",
+    epilog="""lidarslam train office.mcap street.mcap
+    lidarslam train KITTI --sequence 00 -o trained --from shipped --steps 2000
+    lidarslam train --set simulated.recordings=100
+    lidarslam train -o trained --resume""",
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
-@click.option("--out", type=PATH, required=True, metavar="DIR", help="Directory of the training.")
+@out_option("Directory of the training.", "trained/SOURCE_TIME, after the first")
 @click.option("--resume", is_flag=True, help="Continue the training in DIR, on the same recordings.")
 @click.option("--overwrite", is_flag=True, help="Replace the training in DIR.")
 @click.option(
@@ -42,12 +43,22 @@ from lidarslam.commands.terminal import EXIT_MENDABLE, say
 @reader_options
 @config_options
 @click.pass_context
-def train(ctx: click.Context, /, sources: tuple[Path, ...], **options: Any) -> None:
+def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Train the network of the learned odometry, self-supervised: recordings need no labels.
 
     Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
     """
+    from lidarslam.odometry.train_extra import require_train_extra
+
+    require_train_extra("training")
+    from lidarslam.storage.default_places import source_name
     from lidarslam.train.command import run_train
 
-    if not run_train(sources, say, **options):
+    if out is None:
+        if options["resume"]:
+            raise click.UsageError("--resume continues the training in --out; name it")
+        if "WORLD_SIZE" in os.environ:
+            raise click.UsageError("the processes of torchrun share a directory; name it with --out")
+        out = default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
+    if not run_train(sources, say, out=out, **options):
         ctx.exit(EXIT_MENDABLE)

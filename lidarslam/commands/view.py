@@ -1,4 +1,4 @@
-"""`lidarslam view`: finished runs, recordings and Rerun recordings in Rerun."""
+"""`lidarslam view`: finished runs, raw scans and Rerun recordings."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -12,12 +12,12 @@ from lidarslam.commands.options import (
     PATH,
     CommandWithExample,
     config_options,
+    latest_run,
     reader_options,
     scan_options,
     take_config,
 )
-from lidarslam.commands.serving import serving, wait_for_interrupt
-from lidarslam.commands.terminal import note, say
+from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
 from lidarslam.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,32 +31,43 @@ _RRD = ".rrd"
 
 @click.command(
     cls=CommandWithExample,
-    epilog="""lidarslam view runs/04
+    epilog="""lidarslam view
     lidarslam view runs/04 runs/wheels --web
     lidarslam view office.mcap --web
     lidarslam view runs/04/recording.rrd
-    lidarslam view runs/04 --picture map.png""",
+    lidarslam view runs/04 --picture map.png
+    lidarslam view compared/04 --picture maps.png""",
 )
-@click.argument("places", type=PATH, nargs=-1, required=True, metavar="RUN... | SOURCE | FILE.rrd")
+@click.argument("places", type=PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
 @click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
-@click.option("--picture", type=PATH, metavar="FILE.png", help="Draw the map of one run, or a .ply file, instead.")
+@click.option("--picture", type=PATH, metavar="FILE.png", help="Draw runs, or .ply files, in one picture instead.")
+@click.option("--oblique", is_flag=True, help="Draw the picture obliquely instead of from above.")
 @scan_options
 @reader_options
 @config_options
 @click.pass_context
 def view(
-    ctx: click.Context, /, places: tuple[Path, ...], web: bool, save: Path | None, picture: Path | None, **options: Any
+    ctx: click.Context,
+    /,
+    places: tuple[Path, ...],
+    web: bool,
+    save: Path | None,
+    picture: Path | None,
+    oblique: bool,
+    **options: Any,
 ) -> None:
-    """Show finished runs, the raw scans of a recording, or a Rerun recording, in Rerun.
+    """Show finished runs, the raw scans of a recording, or a Rerun recording.
 
-    Several runs appear in one space, aligned with the ground truth if there is one. --start, --stop and --step choose
-    the scans of a recording.
+    RUN is a run directory; several are shown in one space, aligned with the ground truth if there is one.  [default:
+    the latest run in runs]  SOURCE is a recording; --start, --stop and --step choose its scans. With --picture, RUN may
+    also be the folder of a comparison, or a cloud (.ply or .pcd).
     """
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
+    places = places or (latest_run(),)
     if picture is not None:
-        _draw_map(places, picture)
+        _draw(places, picture, oblique)
     elif any(place.suffix == _RRD for place in places):
         if len(places) > 1 or save is not None:
             raise click.UsageError(f"a {_RRD} file is shown alone, in a window or with --web")
@@ -93,9 +104,9 @@ def _serve(show: "Callable[[WebPage], None]") -> None:
 
 
 def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, Any]) -> "Show":
+    from lidarslam.compare.assessment.inputs import truth_of_run
     from lidarslam.config.settings import load_config
     from lidarslam.datasets.registry import is_recording
-    from lidarslam.evaluate.inputs import truth_of_run
     from lidarslam.storage.finished_run import is_run, load_run
 
     if len(places) == 1 and not is_run(places[0]) and is_recording(places[0], options["reader"]):
@@ -138,14 +149,9 @@ def _read(recording: "Recording", source: Path, chosen: range) -> "Iterator[Scan
         raise InputError(f"{source}: no scan can be read")
 
 
-def _draw_map(runs: tuple[Path, ...], picture: Path) -> None:
-    from lidarslam.storage.finished_run import load_map
-    from lidarslam.viewer.picture import draw, height_colours, save_picture
+def _draw(runs: tuple[Path, ...], picture: Path, oblique: bool) -> None:
+    from lidarslam.viewer.drawn_runs import load_drawn_runs
+    from lidarslam.viewer.picture import OBLIQUE, TOP, draw_runs, save_picture
 
-    if len(runs) != 1:
-        raise click.UsageError("--picture draws one map; name one run")
-    cloud = load_map(runs[0])
-    if not len(cloud):
-        raise InputError(f"{runs[0]}: holds no map to draw")
-    save_picture(picture, draw(cloud.points, height_colours(cloud.points), cloud.normals))
+    save_picture(picture, draw_runs(load_drawn_runs(runs), OBLIQUE if oblique else TOP).pixels)
     say(f"written to {picture}")

@@ -12,7 +12,7 @@ from lidarslam.compare.methods import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
-from lidarslam.core.errors import ConfigError
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 from lidarslam.evaluation.comparison.quantities import find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
@@ -81,6 +81,7 @@ class Benchmark(_Model):
     """The whole file; paths are relative to the data's folder."""
 
     title: str
+    data: str | None = Field(None, description="the user's data below --data, in words")
     recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
     methods: tuple[str | BenchmarkMethod, ...] = Field(min_length=1)
     set: tuple[str, ...] = Field((), description="settings for everything, key.path=value")
@@ -140,6 +141,19 @@ def fill_request(request: CompareRequest, benchmark: Benchmark, data: Path | Non
         title=benchmark.title,
         tables=tuple(table.plan() for table in benchmark.tables),
     )
+
+
+def require_data(request: CompareRequest, benchmark: Benchmark, data: Path | None) -> None:
+    """Refuse a benchmark none of whose recordings is there or can be simulated.
+
+    Raises:
+        InputError: it is one; the message has the data that it needs.
+    """
+    if any(entry.simulate or (entry.source and entry.source.exists()) for entry in request.recordings):
+        return
+    place = "the current folder" if data is None else str(data)
+    needed = "name their folder with --data" if benchmark.data is None else f"--data is {benchmark.data}"
+    raise InputError(f"{benchmark.title}: none of its recordings is in {place}; {needed}")
 
 
 def make_recordings(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from lidarslam.compare.benchmark import fill_request, load_benchmark, make_recordings
+from lidarslam.compare.benchmark import fill_request, load_benchmark, make_recordings, require_data
 from lidarslam.compare.comparison import Narrator, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
@@ -70,7 +70,9 @@ def run_compare(
     )
     with ended_like_interrupted():  # or the methods would outlive a request to end
         if benchmark is not None:
-            request = fill_request(request, load_benchmark(benchmark), data)
+            described = load_benchmark(benchmark)
+            request = fill_request(request, described, data)
+            require_data(request, described, data)
             make_recordings(request, show_count)
         outcome = compare(request, Narrator(show_count, tell))
     say(format_comparison(outcome.comparison, out))

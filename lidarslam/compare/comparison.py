@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from lidarslam.compare.method_run import COMMAND, finished_before, run_method
 from lidarslam.compare.metrics import measure
-from lidarslam.compare.plan import COMPARISON, REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
+from lidarslam.compare.plan import REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
 from lidarslam.compare.request import CompareRequest
 from lidarslam.compare.text import format_result
 from lidarslam.core.errors import OutputError
@@ -15,6 +15,7 @@ from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult,
 from lidarslam.evaluation.comparison.mean_table import mean_table
 from lidarslam.run.machine import machine, versions
 from lidarslam.run.request import RunRequest
+from lidarslam.storage.comparison_folder import COMPARISON
 from lidarslam.storage.directory import RunDirectory
 
 _INTERRUPTED = "the comparison was interrupted before its turn"

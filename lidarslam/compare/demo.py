@@ -9,18 +9,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lidarslam.compare.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.evaluate.inputs import truth_of_run
+from lidarslam.run.machine import as_typed
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
-from lidarslam.storage.finished_run import load_map, load_run
-from lidarslam.viewer.picture import draw, height_colours, save_picture
+from lidarslam.storage.finished_run import load_run
+from lidarslam.viewer.drawn_runs import load_drawn_runs
+from lidarslam.viewer.picture import draw_runs, save_picture
 
 RECORDING, REPLAY = "recording", "demo.rrd"
 METHODS = "learned+map+graph,kiss-icp"
@@ -71,9 +73,8 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
 
 
 def _picture(out: Path, place: Path) -> Path:
-    cloud = load_map(place)
     path = out / f"{place.name}.png"
-    save_picture(path, draw(cloud.points, height_colours(cloud.points), cloud.normals))
+    save_picture(path, draw_runs(load_drawn_runs([place])).pixels)
     return path
 
 
@@ -82,7 +83,7 @@ def format_demo(demo: Demo) -> str:
     return f"""
 {format_comparison(demo.outcome.comparison, demo.out)}
 maps      {", ".join(str(picture) for picture in demo.pictures)}
-replay    lidarslam view {demo.out / REPLAY} --web
+replay    {as_typed("lidarslam")} view {demo.out / REPLAY} --web
 
 Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that; the
 network measures a turn whatever its size, and the map corrects the rest."""

@@ -21,8 +21,8 @@ _REQUEST = TypeAdapter(RunRequest)
 
 
 def encode(request: RunRequest) -> tuple[str, str]:
-    """The arguments; the run overwrites and is not resumable, because saving its state would count as its time."""
-    request = replace(request, overwrite=True, resumable=False)
+    """The arguments; the run overwrites, and saves no state and draws no page, which would count as its time."""
+    request = replace(request, overwrite=True, resumable=False, report=False)
     return str(Path.cwd()), _REQUEST.dump_json(request).decode()
 
 

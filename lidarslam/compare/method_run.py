@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarslam.compare.method_ending import judge, read_summary
+from lidarslam.compare.method_ending import judge
 from lidarslam.compare.method_process import encode
 from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
@@ -17,7 +17,7 @@ from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.finished_run import load_run
+from lidarslam.viewer.page.run_result import with_run
 
 # Beside a run's own files: how its process went, and its standard error.
 PROCESS, LOG = "process.json", "process.log"
@@ -81,20 +81,6 @@ def _collect(run: RunRequest, result: MethodResult) -> MethodResult:
     if result.status not in (*WHOLE, "stopped"):
         return result
     try:
-        finished = load_run(run.out)
-        summary = read_summary(run.out)
-        ms = {stage: values["median"] for stage, values in summary["ms_per_scan"].items()}
-        return replace(
-            result,
-            scans=len(finished.trajectory),
-            trajectory=finished.trajectory,
-            lost=finished.lost,
-            lost_reasons=tuple(stretch["reason"] for stretch in summary["lost"]),
-            map_entropy=summary["map_entropy"],
-            ms_per_scan_median=ms.pop("total"),
-            ms_per_scan_p95=summary["ms_per_scan"]["total"]["p95"],
-            stage_ms=ms,
-            run=f"{run.out.parent.name}/{run.out.name}",
-        )
-    except (InputError, OSError, ValueError, KeyError) as error:
+        return replace(with_run(result, run.out), run=f"{run.out.parent.name}/{run.out.name}")
+    except (InputError, OSError) as error:
         return replace(result, status="failed", message=f"its run directory cannot be read: {error}")

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lidarslam.compare.assessment.inputs import read_estimate
+from lidarslam.compare.assessment.map_evaluation import evaluate_map
+from lidarslam.compare.assessment.reference_map import ReferenceMap, find_reference_map, load_reference_map
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
-from lidarslam.evaluate.inputs import read_estimate
-from lidarslam.evaluate.map_evaluation import evaluate_map
-from lidarslam.evaluate.reference_map import ReferenceMap, find_reference_map, load_reference_map
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 

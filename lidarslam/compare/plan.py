@@ -12,9 +12,10 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.comparison.comparison import MissingRecording
 from lidarslam.run.request import RunRequest
 from lidarslam.storage import directory as files
+from lidarslam.storage.comparison_folder import COMPARISON
 
 # In the comparison's folder; each recording's folder holds its own comparison.json.
-COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"
+REPORT_HTML, REPORT_MD = "report.html", "report.md"
 # Beside the recordings' folders: recordings that a benchmark has made.
 RECORDINGS = "recordings"
 

@@ -5,7 +5,8 @@ Defaults live in the code, beside what consumes them; a file or `--set` holds on
 
 import difflib
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -13,6 +14,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
 from lidarslam.datasets.config import ReaderConfig
@@ -80,6 +82,22 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
     return load_model(Config, path, switches_first, "odometry.kiss_icp.voxel_size_m=0.5")
 
 
+def make_config(given: Config | PathLike[str] | str | Mapping[str, Any] | None) -> Config:
+    """A configuration; the path or name of one in YAML; or settings: sections as dictionaries, keys with dots, or both.
+
+    Raises:
+        ConfigError: the file is not readable YAML, a key does not exist, or a value does not fit.
+    """
+    if given is None or isinstance(given, Config):
+        return given or Config()
+    if not isinstance(given, Mapping):
+        return load_config(shipped_files(CONFIGS).get(str(given), Path(given)))
+    tree: dict[str, Any] = {}
+    for dotted, value in given.items():
+        _put(tree, str(dotted), value, f"configuration: {dotted}")
+    return _validated(Config, tree, "settings")
+
+
 def load_model(model: type[M], path: Path | None, settings: Sequence[str], example: str) -> M:
     """Any configuration: its defaults, changed by a YAML file and then by settings like the example.
 
@@ -93,10 +111,14 @@ def load_model(model: type[M], path: Path | None, settings: Sequence[str], examp
         tree.pop(section, None)
     for setting in settings:
         _apply(tree, setting, example)
+    return _validated(model, tree, _origin(path, settings))
+
+
+def _validated(model: type[M], tree: dict[str, Any], origin: str) -> M:
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(_explain(error, model, _origin(path, settings))) from None
+        raise ConfigError(_explain(error, model, origin)) from None
 
 
 def reader_settings(**options: str | None) -> list[str]:
@@ -130,16 +152,28 @@ def _apply(tree: dict[str, Any], setting: str, example: str) -> None:
         if not error.is_syntax:
             raise ConfigError(f"--set {_short(setting)}: {error}") from error
         value = text
-    for key in keys[:-1]:
-        branch = tree.setdefault(key, {})
-        if not isinstance(branch, dict):
-            raise ConfigError(f"--set {_short(setting)}: {key} is a value, not a section")
-        tree = branch
-    tree[keys[-1]] = value
+    tree = _put(tree, dotted.strip(), value, f"--set {_short(setting)}")
     if _is_switch(dotted) and value in (False, "off"):
         tree["method"] = "off"
     elif _is_switch(dotted) and tree.get("method") in (False, "off"):
         del tree["method"]
+
+
+def _put(tree: dict[str, Any], dotted: str, value: Any, what: str) -> dict[str, Any]:
+    """Put a value into the tree, a section beside what is there; the section that holds it."""
+    *sections, last = dotted.split(".")
+    for key in sections:
+        branch = tree.setdefault(key, {})
+        if not isinstance(branch, dict):
+            raise ConfigError(f"{what}: {key} is a value, not a section")
+        tree = branch
+    if isinstance(value, Mapping):
+        section = tree.setdefault(last, {})
+        for key, part in value.items():
+            _put(section, str(key), part, what)
+    else:
+        tree[last] = value
+    return tree
 
 
 def _is_switch(dotted: str) -> bool:

@@ -1,7 +1,7 @@
-"""One sweep of a LiDAR, and the protocol of a recording."""
+"""One sweep of a LiDAR, the attributes of its points, and the protocol of a recording."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,38 @@ from lidarslam.core.trajectory import Trajectory
 _MAX_RANGE_M = 10_000.0
 # No LiDAR has more lasers; a number beyond is that of something else, or damaged.
 _MOST_RINGS = 4096
+# The fields of a scan with an entry for each point, beside the points.
+_COLUMNS = ("time_offsets", "rings", "intensities", "colours")
+
+
+@dataclass(frozen=True, eq=False)
+class PointAttributes:
+    """Attributes of N points; None where no point has one."""
+
+    intensity: NDArray[np.float32] | None = None  # (N,) on the scale of the recording; NaN where there is none
+    rgb: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue; black where there is none
+    ring: NDArray[np.int32] | None = None  # (N,) the laser; -1 where it is unknown
+    time: NDArray[np.float64] | None = None  # (N,) seconds, on the clock of the scans' stamps
+
+    def __post_init__(self) -> None:
+        lengths = {name: len(values) for name, values in self.present()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"attributes of the same points differ in length: {lengths}")
+        if self.rgb is not None and (self.rgb.ndim != 2 or self.rgb.shape[1] != 3):
+            raise ValueError(f"rgb must be (N, 3), got {self.rgb.shape}")
+
+    def present(self) -> Iterator[tuple[str, NDArray[np.generic]]]:
+        """Names and values of those that there are."""
+        named = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return ((name, values) for name, values in named if values is not None)
+
+    def only(self, names: Collection[str]) -> "PointAttributes":
+        """Those with some names."""
+        return PointAttributes(**{name: values for name, values in self.present() if name in names})  # type: ignore[arg-type]
+
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PointAttributes":
+        """Those of some of the points, by a mask or by indices."""
+        return PointAttributes(**{name: values[chosen] for name, values in self.present()})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +60,16 @@ class Scan:
     time_offsets: FloatArray | None = None
     rings: NDArray[np.int32] | None = None  # (N,) int32, the laser each point came from; None when unknown
     dropped: int = 0  # how many points of the raw sweep were left out as invalid
+    intensities: NDArray[np.float32] | None = None  # (N,) as recorded, on whatever scale; None when unknown
+    colours: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue; None when unknown
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"Scan.points must be (N, 3), got {self.points.shape}")
-        for name, values in (("time_offsets", self.time_offsets), ("rings", self.rings)):
-            if values is not None and values.shape != (len(self.points),):
-                raise ValueError(f"Scan.{name} must be ({len(self.points)},), got {values.shape}")
+        for name in _COLUMNS:
+            values, expected = getattr(self, name), (len(self), 3) if name == "colours" else (len(self),)
+            if values is not None and values.shape != expected:
+                raise ValueError(f"Scan.{name} must be {expected}, got {values.shape}")
         if not np.isfinite(self.stamp):
             raise ValueError(f"Scan.stamp must be finite, got {self.stamp}")
 
@@ -48,6 +83,19 @@ class Scan:
             return 0.0
         return float(0.5 * (self.time_offsets.min() + self.time_offsets.max()))
 
+    def attributes(self, wanted: Collection[str]) -> PointAttributes:
+        """The wanted attributes of the points, as far as there are any.
+
+        Rings come with times, by which a map chooses among points; without offsets the time is the stamp.
+        """
+        offsets = np.zeros(len(self)) if self.time_offsets is None else self.time_offsets
+        return PointAttributes(
+            intensity=self.intensities if "intensity" in wanted else None,
+            rgb=self.colours if "rgb" in wanted else None,
+            ring=self.rings if "ring" in wanted else None,
+            time=self.stamp + offsets if {"ring", "time"} & set(wanted) else None,
+        )
+
     @classmethod
     def from_raw(
         cls,
@@ -55,8 +103,10 @@ class Scan:
         stamp: float,
         time_offsets: ArrayLike | None = None,
         rings: ArrayLike | None = None,
+        intensities: ArrayLike | None = None,
+        colours: ArrayLike | None = None,
     ) -> Self:
-        """Make a scan of a driver's raw points, leaving out invalid ones with their times and rings.
+        """Make a scan of a driver's raw points, leaving out invalid ones with all that belongs to them.
 
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
         the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite; where
@@ -69,6 +119,9 @@ class Scan:
         xyz = raw.reshape(-1, 3)
         offsets = _column("time_offsets", time_offsets, len(xyz), np.float64)
         lasers = _column("rings", rings, len(xyz), None)
+        with np.errstate(over="ignore", invalid="ignore"):  # damaged bytes may be any number
+            brightness = _column("intensities", intensities, len(xyz), np.float32)
+        rgb = None if colours is None else _colours(colours, len(xyz))
         # NaN and infinity fail the comparisons too, so one pass finds every invalid point.
         size = np.abs(xyz)
         largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])  # ten times as fast as max(axis=1)
@@ -85,20 +138,23 @@ class Scan:
             xyz = xyz.take(kept, axis=0)  # four times as fast as indexing with the mask
             offsets = None if offsets is None else offsets[kept]
             lasers = None if lasers is None else lasers[kept]
+            brightness = None if brightness is None else brightness[kept]
+            rgb = None if rgb is None else rgb.take(kept, axis=0)
         # Invalid points may carry NaN for a ring, which no integer can hold: judge and cast what is left.
         if lasers is not None and not ((lasers >= 0) & (lasers < _MOST_RINGS)).all():
             lasers = None
-        return cls(xyz, float(stamp), offsets, None if lasers is None else lasers.astype(np.int32), dropped)
+        lasers = None if lasers is None else lasers.astype(np.int32)
+        return cls(xyz, float(stamp), offsets, lasers, dropped, brightness, rgb)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":
-        """The scan with only the chosen points (a mask or indices), times and rings in step."""
+        """The scan with only the chosen points (a mask or indices), and what belongs to them."""
         chosen = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
+        columns = {name: getattr(self, name) for name in _COLUMNS}
         return Scan(
             self.points.take(chosen, axis=0),  # four times as fast as indexing
             self.stamp,
-            None if self.time_offsets is None else self.time_offsets[chosen],
-            None if self.rings is None else self.rings[chosen],
-            self.dropped,
+            dropped=self.dropped,
+            **{name: None if values is None else values.take(chosen, axis=0) for name, values in columns.items()},
         )
 
 
@@ -110,6 +166,14 @@ def _column(name: str, values: ArrayLike | None, count: int, dtype: DTypeLike | 
     if len(column) != count:
         raise ValueError(f"{name} has {len(column)} entries for {count} points")
     return column
+
+
+def _colours(values: ArrayLike, count: int) -> NDArray[np.uint8]:
+    """Colours (N, 3) of N points."""
+    colours = np.asarray(values, dtype=np.uint8)
+    if colours.size != 3 * count or (colours.size and colours.shape[-1] != 3):
+        raise ValueError(f"colours must be (..., 3) for {count} points, got {colours.shape}")
+    return colours.reshape(-1, 3)
 
 
 class ScanSequence(Protocol):

@@ -1,16 +1,23 @@
 """Output of `lidarslam info`."""
 
+import json
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from lidarslam.core.plain_text import one_line
+from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import RecordingInfo, SeveralTopicsError, Topic
-from lidarslam.datasets.registry import open_recording
+from lidarslam.datasets.registry import choose_reader, open_recording
 
 # Between these a stamp is a date; else it counts from some start.
 _EPOCH_FROM_S, _EPOCH_UNTIL_S = 5e8, 5e9
+_CHOOSE = "Choose one of them with --topic, such as --topic {}"
 
 
 def describe_source(source: Path, config: ReaderConfig) -> str:
@@ -25,9 +32,73 @@ def describe_source(source: Path, config: ReaderConfig) -> str:
         rows = [
             ("source", str(source)),
             ("point clouds", ", ".join(topic.name for topic in error.clouds)),
-            ("note", f"Choose one of them with --topic, such as --topic {error.clouds[0].name}"),
+            ("note", _CHOOSE.format(error.clouds[0].name)),
         ]
         return _text(rows, error.topics, chosen=None)
+
+
+def describe_as_json(source: Path, config: ReaderConfig) -> str:
+    """The same as JSON with the keys of docs/command_line.md, all of them always; null for what is not known.
+
+    Raises:
+        InputError: the source cannot be read.
+    """
+    content = _content(source, choose_reader(source, config.name))
+    try:
+        content |= _known(open_recording(source, config).describe())
+    except SeveralTopicsError as error:
+        content["topics"] = _topics(error.topics)
+        content["topic_choices"] = [topic.name for topic in error.clouds]
+        content["notes"] = [_CHOOSE.format(error.clouds[0].name)]
+    # ASCII, so that no name can steer a terminal; DEL is the one such character that JSON leaves as it is.
+    return json.dumps(content, indent=2, allow_nan=False).replace("\x7f", "\\u007f")
+
+
+def _content(source: Path, reader: str) -> dict[str, Any]:
+    """All keys, with what is known before the recording is opened."""
+    names = ("topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan", "point_time")
+    unknown = dict.fromkeys((*names, "ground_truth"))
+    return {
+        "source": str(source),
+        "reader": reader,
+        **unknown,
+        "fields": [],
+        "notes": [],
+        "topics": [],
+        "topic_choices": [],
+    }
+
+
+def _known(info: RecordingInfo) -> dict[str, Any]:
+    return {
+        "topic": info.topic,
+        "scans": info.scans,
+        "first_stamp_s": info.first_stamp,
+        "last_stamp_s": info.last_stamp,
+        "duration_s": info.duration_s,
+        "rate_hz": info.rate_hz,
+        "first_scan": {
+            "points": len(info.first),
+            "dropped_points": info.first.dropped,
+            "has_rings": info.first.rings is not None,
+        },
+        "point_time": _known_point_time(info),
+        "ground_truth": None if info.ground_truth is None else str(info.ground_truth),
+        "fields": [{"name": field.name, "type": field.type_name} for field in info.fields],
+        "notes": list(info.notes),
+        "topics": _topics(info.topics),
+    }
+
+
+def _topics(topics: Sequence[Topic]) -> list[dict[str, Any]]:
+    return [{"name": topic.name, "type": topic.message_type, "messages": topic.messages} for topic in topics]
+
+
+def _known_point_time(info: RecordingInfo) -> dict[str, Any] | None:
+    model, offsets = info.point_time, info.first.time_offsets
+    if model is None or offsets is None or not len(offsets):
+        return None
+    return {**asdict(model), "first_s": float(offsets.min()), "last_s": float(offsets.max())}
 
 
 def format_info(source: Path, info: RecordingInfo) -> str:
@@ -54,6 +125,8 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
     yield "points", f"{len(info.first):,} in the first scan{dropped}"
     if info.fields:
         yield "fields", ", ".join(f"{field.name} {field.type_name}" for field in info.fields)
+    yield "intensity", _intensity(info.first)
+    yield "colour", "no" if info.first.colours is None else "yes"
     yield "rings", "no" if info.first.rings is None else "yes"
     yield "point time", _point_time(info)
     yield "ground truth", str(info.ground_truth) if info.ground_truth else "none"
@@ -65,6 +138,13 @@ def _instant(stamp: float) -> str:
     if not _EPOCH_FROM_S <= stamp < _EPOCH_UNTIL_S:
         return f"{stamp:.3f} s"
     return f"{datetime.fromtimestamp(stamp, timezone.utc):%Y-%m-%d %H:%M:%S} UTC ({stamp:.3f})"
+
+
+def _intensity(scan: Scan) -> str:
+    known = None if scan.intensities is None else scan.intensities[np.isfinite(scan.intensities)]
+    if known is None or not len(known):
+        return "no"
+    return f"{known.min():.4g} to {known.max():.4g} in the first scan"
 
 
 def _point_time(info: RecordingInfo) -> str:

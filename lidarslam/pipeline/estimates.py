@@ -38,6 +38,11 @@ class SweepMotion:
     before: Annotated[FloatArray, Shape(6)] | None
     after: Annotated[FloatArray, Shape(6)] | None
 
+    @property
+    def latest(self) -> FloatArray | None:
+        """The latest velocity (6,) that is known."""
+        return self.before if self.after is None else self.after
+
     def compensate(self, scan: Scan) -> FloatArray:
         """Deskew: the scan's points (N, 3) in the LiDAR frame at its stamp.
 
@@ -51,7 +56,7 @@ class SweepMotion:
     def mean(self, scan: Scan) -> FloatArray | None:
         """One velocity (6,) for the sweep: both, weighted by how much of it lies before and after the stamp."""
         if self.before is None or self.after is None or scan.time_offsets is None or not len(scan):
-            return self.before if self.after is None else self.after
+            return self.latest
         begin, end = float(scan.time_offsets.min()), float(scan.time_offsets.max())
         share_after = 1.0 if end <= begin else np.clip(end / (end - begin), 0.0, 1.0)
         return np.asarray(share_after * self.after + (1.0 - share_after) * self.before, dtype=np.float64)

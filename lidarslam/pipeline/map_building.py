@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.core.state import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
@@ -67,8 +67,8 @@ class MapBuilder(Stateful):
             self._pending = PendingScan(self._scans, thinned, localised.motion, points, localised.T_world_lidar)
         self._scans += 1
 
-    def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray] | None:
-        """Add the scan before; its points (N, 3) and pose as they were added, None where there is none.
+    def add_pending(self, next_is_lost: bool) -> tuple[FloatArray, FloatArray, float, PointAttributes] | None:
+        """Add the scan before; its points (N, 3), pose, voxel size and attributes as added, None where there is none.
 
         Where tracking was lost right after it, the motion after its stamp is unknown: it is deskewed again with the
         motion before.
@@ -79,8 +79,9 @@ class MapBuilder(Stateful):
         points = SweepMotion(scan.motion.before, None).compensate(scan.thinned) if next_is_lost else scan.points
         if self.global_map is None:
             self.global_map = GlobalMap(self.voxel_size_m)
-        self.global_map.add(points, scan.T_world_lidar)
+        attributes = scan.thinned.attributes(self._config.fields)
+        self.global_map.add(points, scan.T_world_lidar, attributes)
         self.slides.add(points, scan.number, scan.T_world_lidar)
         if self._config.leave_out_moved:
             self.views.add(points, scan.number)
-        return points, scan.T_world_lidar
+        return points, scan.T_world_lidar, self.voxel_size_m, attributes

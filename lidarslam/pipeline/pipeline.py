@@ -16,20 +16,18 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state import Stateful
-from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.interface import Odometry
-from lidarslam.pipeline.background_worker import BackgroundWorker
-from lidarslam.pipeline.estimates import Estimated, ScanResult, graph_scan
+from lidarslam.pipeline.estimates import Estimated, ScanResult
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
+from lidarslam.pipeline.stages import Stages
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
-# Scans that may wait for the map, which now and then takes as long as several scans, and calls that may wait for the
-# graph, which takes as long for a loop closure as for all scans up to the next keyframe.
-_SCANS_BEHIND, _GRAPH_CALLS_BEHIND = 8, 64
+# Scans that may wait for the map, which now and then takes as long as several scans.
+_SCANS_BEHIND = 8
 
 
 class Checkpointer(Protocol):
@@ -52,10 +50,8 @@ class Pipeline(Stateful):
         checkpointer: saves the state now and then, without that of odometry and graph.
     """
 
-    map: MapBuilder
-    _localiser: Localiser
+    _stages: Stages
     held: Estimated | None  # the last scan that was read: its result waits for the next one
-    _measured_stamp: float | None  # of the last scan, unless its motion was only predicted
 
     def __init__(
         self,
@@ -65,15 +61,15 @@ class Pipeline(Stateful):
         graph: "SlamGraph | None" = None,
         checkpointer: Checkpointer | None = None,
     ) -> None:
-        self._odometry = odometry
-        self._localiser = localiser
-        self._graph = graph
-        self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
+        self._stages = Stages(odometry, localiser, config, graph)
         self._checkpointer = checkpointer
         self.held = None
-        self._measured_stamp = None
         self._error: LidarSlamError | None = None  # that ended the scans
-        self.map = MapBuilder(config)
+
+    @property
+    def map(self) -> MapBuilder:
+        """The global map, and what is kept beside it."""
+        return self._stages.map
 
     def run(self, scans: Iterable[Scan]) -> Generator[ScanResult, None, None]:
         """Process the scans in order; each result comes while later scans' odometry is at work.
@@ -82,7 +78,7 @@ class Pipeline(Stateful):
         """
         jobs: deque[Future[ScanResult]] = deque()
         # Matrices are small: BLAS threads would mostly wait, and take the cores from the other threads.
-        with closing(self._graph_worker), threadpool_limits(1, "blas"), ThreadPoolExecutor(1, "map") as map_worker:
+        with closing(self._stages), threadpool_limits(1, "blas"), ThreadPoolExecutor(1, "map") as map_worker:
             for estimated in self._estimate(scans):
                 previous, self.held = self.held, estimated
                 if previous is None:
@@ -93,14 +89,13 @@ class Pipeline(Stateful):
                 if self._checkpointer is not None and self._checkpointer.is_due():
                     while jobs:
                         yield jobs.popleft().result()
-                    self._graph_worker.wait()
+                    self._stages.wait_for_graph()
                     self._checkpointer.save(self)
             if self.held is not None:
                 jobs.append(map_worker.submit(self._process, self.held, None))
             while jobs:
                 yield jobs.popleft().result()
-            self._add_pending(next_is_lost=False)
-            self.map.slides.finish()
+            self._stages.finish()
         if self._error is not None:
             raise self._error
 
@@ -109,43 +104,10 @@ class Pipeline(Stateful):
         started = time.perf_counter()
         try:
             for scan in scans:
-                read = time.perf_counter()
-                motion = self._odometry.estimate(scan)
-                stage_ms = {"read": _ms(started, read), "odometry": _ms(read, time.perf_counter())}
-                measured, previous = motion.failure is None, self._measured_stamp
-                interval_s = scan.stamp - previous if measured and previous is not None else None
-                self._measured_stamp = scan.stamp if measured else None
-                yield Estimated(scan, motion, interval_s, stage_ms)
+                yield self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
                 started = time.perf_counter()
         except LidarSlamError as error:
             self._error = error
 
     def _process(self, estimated: Estimated, following: Estimated | None) -> ScanResult:
-        """Find the pose of a scan, deskew it, add the scan before to the map, and both to the graph."""
-        scan = estimated.scan
-        localised = self._localiser.localise(estimated, following)
-        found = time.perf_counter()
-        thinned = self.map.thin(scan)
-        points = localised.motion.compensate(thinned)
-        deskewed = time.perf_counter()
-        self._add_pending(next_is_lost=localised.status is Status.LOST)
-        self.map.add(thinned, points, localised)
-        if self._graph is not None:
-            self._graph_worker.submit(self._graph.add, graph_scan(estimated, localised, points))
-        stage_ms = {"deskew": _ms(found, deskewed), "map": _ms(deskewed, time.perf_counter())}
-        return ScanResult(
-            **vars(localised) | {"stage_ms": estimated.stage_ms | localised.stage_ms | stage_ms},
-            stamp=scan.stamp,
-            points=points,
-            points_read=len(scan),
-            points_dropped=scan.dropped,
-        )
-
-    def _add_pending(self, next_is_lost: bool) -> None:
-        added = self.map.add_pending(next_is_lost)
-        if added is not None and self._graph is not None:
-            self._graph_worker.submit(self._graph.draw, *added, self.map.voxel_size_m)
-
-
-def _ms(start: float, end: float) -> float:
-    return 1e3 * (end - start)
+        return self._stages.build(estimated, self._stages.localise(estimated, following))

@@ -91,12 +91,27 @@ def close_loops(
     """Correct the log, and show it, once all scans are there; None where there is nothing to correct."""
     if graph is None or global_map is None:
         return None
-    finished = FinishedGraph.of_recordings(graph, [len(log)], global_map.voxel_size_m)
-    closed = None if finished is None else finished.outcome([0])
+    closed = _corrected(graph, graph.finish(), global_map.voxel_size_m, log)
     if closed is not None:
-        log.correct(closed.T_world_lidar)
         pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
+    return closed
+
+
+def loops_so_far(graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog) -> "GraphOutcome | None":
+    """Correct the log with the loops that are closed by now; more scans may follow."""
+    if graph is None or global_map is None:
+        return None
+    return _corrected(graph, graph.present(), global_map.voxel_size_m, log)
+
+
+def _corrected(
+    graph: "SlamGraph", result: "Corrected | None", voxel_size_m: float, log: ScanLog
+) -> "GraphOutcome | None":
+    """Correct the log of one recording."""
+    closed = None if result is None else FinishedGraph(graph, result, (len(log),), voxel_size_m).outcome([0])
+    if closed is not None:
+        log.correct(closed.T_world_lidar)
     return closed
 
 

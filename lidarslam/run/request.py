@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.config.settings import Config
+from lidarslam.mapping.config import MapFormat
 from lidarslam.viewer.viewer import RerunMode
 
 
@@ -22,10 +23,11 @@ class RunRequest:
     step: int = 1
     prior: Path | None = None  # TUM file of an external odometry, for `odometry.method: external`
     rerun: RerunMode = "off"  # no Rerun recording, one in the run directory, or that and a browser or a window
-    pcd: bool = False  # whether the map is written as .pcd too
+    map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
     resumable: bool = True  # whether checkpoints are saved
+    report: bool = False  # whether a page and pictures are drawn, once all else is written
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:

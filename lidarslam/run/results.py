@@ -1,20 +1,21 @@
 """The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
-from lidarslam.config.settings import dump_yaml
+from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import inverse
 from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
-from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.config import GlobalMapConfig, MapFormat
 from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
@@ -52,20 +53,34 @@ def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMa
         return DrawnMap(None, None)
     moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
     cloud = global_map.cloud(config.min_hits, moved)
+    cloud = replace(cloud, attributes=cloud.attributes.only(config.fields))
     return DrawnMap(cloud, global_map.voxel_size_m, int(moved.sum()))
 
 
 def write_results(
-    directory: RunDirectory, request: RunRequest, tracked: Tracked, closed: GraphOutcome | None, drawn: DrawnMap
+    directory: RunDirectory,
+    config: Config,
+    described: dict[str, Any],
+    tracked: Tracked,
+    closed: GraphOutcome | None,
+    drawn: DrawnMap,
+    map_formats: Sequence[MapFormat] = (),
 ) -> RunOutcome:
-    """Write everything; the poses are final."""
-    config, log = request.config, tracked.log
-    directory.write_text(files.CONFIG, dump_yaml(config, describe_run(request)))
+    """Write everything; the poses are final.
+
+    Args:
+        directory: of the run.
+        config, described: the settings, and what was run, for config.yaml.
+        tracked, closed, drawn: the results.
+        map_formats: further formats of the map.
+    """
+    log = tracked.log
+    directory.write_text(files.CONFIG, dump_yaml(config, described))
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))
     directory.write_text(files.SCANS_CSV, log.format_csv())
     metrics = _write_trajectories(directory, tracked)
-    written = write_map(directory, drawn, request.pcd)
+    written = write_map(directory, drawn, map_formats)
     log.warnings.extend(tracked.faults.warnings())
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
@@ -74,16 +89,17 @@ def write_results(
     return RunOutcome(summary, metrics, tracked.stopped)
 
 
-def write_map(directory: RunDirectory, drawn: DrawnMap, pcd: bool) -> WrittenMap:
-    """Write a map, unless it is empty."""
+def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFormat] = ()) -> WrittenMap:
+    """Write a map as .ply and in further formats, unless it is empty."""
     cloud = drawn.cloud
     if cloud is None or not len(cloud):
         return WrittenMap(0, drawn.voxel_size_m, drawn.moved)
-    for name in (files.MAP_PLY, files.MAP_PCD) if pcd else (files.MAP_PLY,):
+    for name in (files.MAP_PLY, *(files.MAPS[one] for one in formats)):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
     entropy = sampled_map_entropy(cloud.points)
-    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean)
+    fields = tuple(name for name, _ in cloud.attributes.present())
+    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean, fields)
 
 
 def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:
@@ -93,7 +109,9 @@ def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> Trajectory
     directory.write_text(files.TRAJECTORY_TUM, format_tum(trajectory))
     directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
     T_cam_lidar = unless_damaged(
-        lambda: recording.T_cam_lidar, log, f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame"
+        lambda: None if recording is None else recording.T_cam_lidar,
+        log,
+        f"{files.TRAJECTORY_KITTI} is in the LiDAR's frame",
     )
     poses = trajectory.T_world_lidar
     if T_cam_lidar is not None:  # the devkit compares camera poses

@@ -13,7 +13,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
-from lidarslam.run.request import RunRequest
+from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.resuming import describe_computed
 from lidarslam.run.scan_log import ScanLog
@@ -66,9 +66,13 @@ def execute(request: RunRequest, progress: Progress, page: WebPage | None = None
             drawn = final_map(tracked, closed, config.global_map)
             if drawn.cloud is not None:
                 viewer.show_final_map(drawn.cloud.points)
-        outcome = write_results(directory, request, tracked, closed, drawn)
+        outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, request.map_formats)
     if unfinished is not None:
         unfinished.end(outcome.stopped is not None)
+    if request.report:
+        from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+        leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 
 

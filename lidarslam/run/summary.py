@@ -87,6 +87,7 @@ class WrittenMap:
     voxel_size_m: float | None
     moved: int  # number of points that were removed as moving objects
     entropy: float | None = None  # mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed
+    fields: tuple[str, ...] = ()  # the attributes of its points
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,7 @@ def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings
         "map_voxel_size_m": written.voxel_size_m,
         "map_points_moved": written.moved,
         "map_entropy": written.entropy,
+        "map_fields": list(written.fields),
         "warnings": list(warnings),
     }
 

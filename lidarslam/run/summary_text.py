@@ -1,5 +1,6 @@
 """The text that `lidarslam run` prints at the end."""
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,6 +34,9 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield f"warning: {warning}"
     yield from _lost(summary)
     yield f"written to {out}"
+    yield f"next: {shlex.join(['lidarslam', 'view', str(out)])}"
+    if outcome.metrics is not None:
+        yield f"      {shlex.join(['lidarslam', 'evaluate', str(out)])}"
 
 
 def format_map(written: WrittenMap) -> str:
@@ -40,9 +44,10 @@ def format_map(written: WrittenMap) -> str:
     if written.voxel_size_m is None:
         return "no map: no scan was registered"
     voxel_cm = 100.0 * written.voxel_size_m
+    fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    return f"map of {count(written.points, 'point')}, voxels of {voxel_cm:.0f} cm{moved}{entropy}"
+    return f"map of {count(written.points, 'point')}, voxels of {voxel_cm:.0f} cm{fields}{moved}{entropy}"
 
 
 def _loops(graph: GraphSummary) -> str:

@@ -41,8 +41,8 @@ Progress = Callable[[int, int, ScanResult], None]
 class Tracked:
     """A recording after the pipeline."""
 
-    # recording, truth, log: the recording, its ground truth, its scans
-    recording: Recording
+    # recording, truth, log: the recording, its ground truth, its scans; scans may come from elsewhere
+    recording: Recording | None
     truth: Trajectory | None
     log: ScanLog
     asked: int  # number of scans that were asked for

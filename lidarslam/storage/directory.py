@@ -21,12 +21,16 @@ TRAJECTORY_TUM = "trajectory.tum"
 TRAJECTORY_KITTI = "trajectory.kitti"
 ODOMETRY_TUM = "odometry.tum"
 MAP_PLY = "map.ply"
-MAP_PCD = "map.pcd"
+# Further formats of the map, by their names in `--map-format`.
+MAPS = {"pcd": "map.pcd", "laz": "map.laz", "e57": "map.e57"}
 POSE_GRAPH = "pose_graph.g2o"
 SCANS_CSV = "scans.csv"
 SUMMARY = "summary.json"
 METRICS = "metrics.json"
 RERUN = "recording.rrd"
+REPORT = "report.html"
+MAP_PNG = "map.png"
+TRAJECTORY_PNG = "trajectory.png"
 
 FILES = (
     CONFIG,
@@ -34,12 +38,15 @@ FILES = (
     TRAJECTORY_KITTI,
     ODOMETRY_TUM,
     MAP_PLY,
-    MAP_PCD,
+    *MAPS.values(),
     POSE_GRAPH,
     SCANS_CSV,
     SUMMARY,
     METRICS,
     RERUN,
+    REPORT,
+    MAP_PNG,
+    TRAJECTORY_PNG,
 )
 
 # The checkpoint of a run that is at work or was stopped, see `lidarslam.storage.unfinished`.

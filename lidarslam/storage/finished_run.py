@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
-from lidarslam.datasets.folders.point_table import coordinates
+from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
+from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.unfinished import require_whole
@@ -36,6 +38,7 @@ class FinishedRun:
     lost: NDArray[np.bool_]  # (N,) which scans were lost
     map_points: FloatArray  # (M, 3) in the world, none when the map is missing
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
+    map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
 
 
 def is_run(path: Path) -> bool:
@@ -50,8 +53,10 @@ def load_run(path: Path) -> FinishedRun:
         InputError: there is no run, or a file of it is damaged.
     """
     trajectory = read_trajectory(path)
-    lost, loops = _lost(path / files.SCANS_CSV, len(trajectory)), _loops(path, len(trajectory))
-    return FinishedRun(path.resolve().name, trajectory, lost, load_map(path).points, loops)
+    statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
+    lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
+    cloud = load_map(path)
+    return FinishedRun(path.resolve().name, trajectory, lost, cloud.points, loops, cloud.attributes)
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -64,7 +69,7 @@ def read_trajectory(path: Path) -> Trajectory:
     file = path / files.TRAJECTORY_TUM
     if not file.is_file():
         raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
-    trajectory, scans = read_tum(file), _summary(path).get("scans")
+    trajectory, scans = read_tum(file), read_summary(path).get("scans")
     if scans not in (None, len(trajectory)):
         raise InputError(
             f"{file}: holds {len(trajectory):,} poses, {files.SUMMARY} says {scans:,} scans: one of them is cut off;"
@@ -74,7 +79,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def load_map(path: Path) -> PointCloud:
-    """The map of a run directory, or a .ply or .pcd file, with normals; empty when the run has none.
+    """The map of a run directory, or a .ply or .pcd file, with normals and attributes; empty when the run has none.
 
     Raises:
         InputError: there is no such file, or it cannot be read.
@@ -94,10 +99,10 @@ def load_map(path: Path) -> PointCloud:
     except ValueError as error:
         raise InputError(f"{file}: not a readable point cloud: {error}") from None
     normals = _normals(table)
-    usable = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
+    usable = np.asarray(np.isfinite(np.hstack([points, normals])).all(axis=1))
     if not usable.any():
         raise InputError(f"{file}: not a readable point cloud; no point is finite")
-    return PointCloud(points[usable], normals[usable])
+    return PointCloud(points[usable], normals[usable], _attributes(table).select(usable))
 
 
 def _normals(table: NDArray[np.void]) -> FloatArray:
@@ -108,8 +113,23 @@ def _normals(table: NDArray[np.void]) -> FloatArray:
     return np.tile([0.0, 0.0, 1.0], (len(table), 1))
 
 
-def _summary(path: Path) -> dict[str, Any]:
-    """The content of summary.json, empty when there is none."""
+def _attributes(table: NDArray[np.void]) -> PointAttributes:
+    """The attributes of N points, as this program names them and others do."""
+    names = scalar_fields(table)
+    return PointAttributes(
+        intensity=read_intensities(table, names),
+        rgb=read_colours(table, names),
+        ring=table["ring"].astype(np.int32) if "ring" in names else None,
+        time=table["time"].astype(np.float64) if "time" in names else None,
+    )
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """The content of a run's summary.json, empty when there is none.
+
+    Raises:
+        InputError: it is damaged.
+    """
     file = path / files.SUMMARY
     if not file.is_file():
         return {}
@@ -125,7 +145,7 @@ def _summary(path: Path) -> dict[str, Any]:
 def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     """The loops that a run closed; none for a run without a graph."""
     try:
-        loops = (_summary(path).get("pose_graph") or {"loops": []})["loops"]
+        loops = (read_summary(path).get("pose_graph") or {"loops": []})["loops"]
         pairs = [(loop["first_scan"], loop["second_scan"]) for loop in loops if loop["accepted"]]
         found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -133,19 +153,23 @@ def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     return found[((found >= 0) & (found < scans)).all(axis=1)]
 
 
-def _lost(scans_csv: Path, poses: int) -> NDArray[np.bool_]:
-    if not scans_csv.is_file():
-        return np.zeros(poses, dtype=np.bool_)
+def read_statuses(path: Path, poses: int) -> list[Status]:
+    """The status of each scan of a run; ok where no table has been kept.
+
+    Raises:
+        InputError: the table is damaged, or has not a row for each pose.
+    """
+    file = path / files.SCANS_CSV
+    if not file.is_file():
+        return [Status.OK] * poses
     try:
-        with scans_csv.open(encoding="utf-8", newline="") as rows:
-            statuses = [row["status"] for row in csv.DictReader(rows)]
-    except (KeyError, UnicodeDecodeError, csv.Error) as error:
-        raise _damaged(scans_csv, "a run's table", error) from error
+        with file.open(encoding="utf-8", newline="") as rows:
+            statuses = [Status(row["status"]) for row in csv.DictReader(rows)]
+    except (KeyError, ValueError, csv.Error) as error:  # not UTF-8 is a ValueError
+        raise _damaged(file, "a run's table", error) from error
     if len(statuses) != poses:
-        raise InputError(
-            f"{scans_csv}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again"
-        )
-    return np.array([status == Status.LOST.value for status in statuses], dtype=np.bool_)
+        raise InputError(f"{file}: has {len(statuses):,} rows for {poses:,} poses; it is cut off, make the run again")
+    return statuses
 
 
 def _damaged(file: Path, kind: str, error: Exception) -> InputError:

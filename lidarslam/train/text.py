@@ -6,6 +6,7 @@ from datetime import timedelta
 from pathlib import Path
 
 from lidarslam.odometry.training.training import Validation
+from lidarslam.run.machine import as_typed
 
 
 def format_step(step: int, steps: int, losses: Mapping[str, float], pairs_per_s: float, left_s: float) -> str:
@@ -45,9 +46,9 @@ def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None
     errors = "" if best is None else f", on held-out scans {format_errors(best)}"
     lines = [
         f"{steps:,} steps done; weights written to {weights}{errors}",
-        f"use them:   lidarslam run SOURCE --out RUN --odometry learned --weights {weights}",
-        f"curves:     tensorboard --logdir {out / 'tensorboard'}",
+        f"use them:   {as_typed('lidarslam')} run SOURCE --weights {weights}",
+        f"curves:     {as_typed('tensorboard')} --logdir {out / 'tensorboard'}",
     ]
     if is_interrupted:
-        lines.append(f"go on:      lidarslam train --out {out} --resume")
+        lines.append(f"go on:      {as_typed('lidarslam')} train --out {out} --resume")
     return "\n".join(lines)

@@ -2,32 +2,38 @@
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import State, Stateful
 from lidarslam.mapping.global_map import kernels
+from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys
-
-# Columns of the sums kept for every voxel.
-_POSITION, _VIEW, _COUNT = slice(0, 3), slice(3, 6), 6
-COLUMNS = 7
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 1_000_000
 # Nearest points that a normal is estimated from.
 _NORMAL_NEIGHBOURS = 20
 
-VoxelMeans = NDArray[np.float32]
-"""A map's voxels (M, 7), in its own frame: mean point, mean direction to the sensor, number of points."""
+
+@dataclass(frozen=True, eq=False)
+class VoxelMeans:
+    """A map's voxels, in its own frame."""
+
+    rows: Rows  # (M, width) mean point, mean direction to the sensor, number of points; sums of attributes
+    layout: Layout  # of the rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
 
 
 def means_points(means: VoxelMeans) -> FloatArray:
     """(M, 3) mean points."""
-    return means[:, _POSITION].astype(np.float64)
+    return means.rows[:, POSITION].astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,7 @@ class PointCloud:
 
     points: FloatArray  # (N, 3) float64, metres, in the world
     normals: FloatArray  # (N, 3) float64, unit length, towards the side it was seen from
+    attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points
 
     def __len__(self) -> int:
         return len(self.points)
@@ -43,32 +50,37 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """Sums over points of one voxel each: keys (M,) int64, sums (M, 7) float32; once reduced, sorted and unique."""
+    """Sums over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
 
     keys: NDArray[np.int64]
     sums: NDArray[np.float32]
+    layout: Layout
 
     def __post_init__(self) -> None:
-        if self.sums.shape != (len(self.keys), COLUMNS):
-            raise ValueError(f"expected sums ({len(self.keys)}, {COLUMNS}), got {self.sums.shape}")
+        if self.sums.shape != (len(self.keys), self.layout.width):
+            raise ValueError(f"expected sums ({len(self.keys)}, {self.layout.width}), got {self.sums.shape}")
 
     @classmethod
     def join(cls, parts: "Sequence[_Voxels]") -> "_Voxels":
         """All of them after one another, equal keys not added up."""
+        layout = Layout.union([part.layout for part in parts])
+        wide = (part.layout.widened(part.sums, layout) for part in parts)
         return cls(
             np.concatenate([np.empty(0, dtype=np.int64), *(part.keys for part in parts)]),
-            np.concatenate([np.empty((0, COLUMNS), dtype=np.float32), *(part.sums for part in parts)]),
+            np.concatenate([np.empty((0, layout.width), dtype=np.float32), *wide]),
+            layout,
         )
 
     def reduced(self) -> "_Voxels":
         """Rows of equal keys added up, in the order of keys."""
         unique, totals = np.empty_like(self.keys), np.empty_like(self.sums)
-        count = kernels.add_up(np.argsort(self.keys), self.keys, self.sums, unique, totals)
-        return _Voxels(unique[:count].copy(), totals[:count].copy())
+        order = np.argsort(self.keys)
+        count = kernels.add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
+        return _Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
 
     def chosen(self, rows: NDArray[np.bool_]) -> "_Voxels":
         """Some of them."""
-        return _Voxels(self.keys[rows], self.sums[rows])
+        return _Voxels(self.keys[rows], self.sums[rows], self.layout)
 
 
 class GlobalMap(Stateful):
@@ -97,41 +109,42 @@ class GlobalMap(Stateful):
             self._pending = [_Voxels.join(self._pending)]
             return super().state()
 
-    def add(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
-        """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp."""
-        keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), COLUMNS), dtype=np.float32)
+    def add(self, points: FloatArray, T_world_lidar: FloatArray, attributes: PointAttributes | None = None) -> None:
+        """Add the points (N, 3) of a scan, in the LiDAR frame at the scan's stamp, with what is known of them."""
+        attributes = attributes or PointAttributes()
+        layout = Layout.of(attributes)
+        keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
         T = np.ascontiguousarray(T_world_lidar)
         kernels.write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
-        self._wait(_Voxels(keys, sums))
+        layout.write(attributes, sums)
+        self._wait(_Voxels(keys, sums, layout))
 
     def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
         """Add the voxels of another map, as if its points were added here."""
         world = transform_points(T_world_map, means_points(means))
-        sums = np.empty((len(means), COLUMNS), dtype=np.float32)
+        sums = means.rows.copy()
         keys = point_keys(world, self.voxel_size_m)
-        sums[:, _POSITION] = (
+        sums[:, POSITION] = (
             world - key_cells(keys) * self.voxel_size_m
         )  # within the voxel, where float32 is exact enough
-        sums[:, _VIEW] = means[:, _VIEW].astype(np.float64) @ T_world_map[:3, :3].T
-        sums[:, :_COUNT] *= means[:, _COUNT, None]
-        sums[:, _COUNT] = means[:, _COUNT]
-        self._wait(_Voxels(keys, sums))
+        sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
+        sums[:, :COUNT] *= means.rows[:, COUNT, None]
+        self._wait(_Voxels(keys, sums, means.layout))
 
     def means(self) -> VoxelMeans:
         """The voxels so far."""
         voxels = self._voxels(1)
-        rows = np.empty_like(voxels.sums)
-        rows[:, _POSITION] = self._mean_points(voxels)
-        rows[:, _VIEW] = voxels.sums[:, _VIEW] / voxels.sums[:, _COUNT, None]
-        rows[:, _COUNT] = voxels.sums[:, _COUNT]
-        return rows
+        rows = voxels.sums.copy()
+        rows[:, POSITION] = self._mean_points(voxels)
+        rows[:, VIEW] = voxels.sums[:, VIEW] / voxels.sums[:, COUNT, None]
+        return VoxelMeans(rows, voxels.layout)
 
     def points(self, min_hits: int = 1) -> FloatArray:
         """The mean point (M, 3) of every voxel that holds at least `min_hits` points, in the world."""
         return self._mean_points(self._voxels(min_hits))
 
     def cloud(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> PointCloud:
-        """The map with normals, estimated from the nearest points and turned towards the sensor.
+        """The map, its normals estimated from the nearest points and turned towards the sensor.
 
         Args:
             min_hits: as in `points`.
@@ -142,8 +155,8 @@ class GlobalMap(Stateful):
             voxels = voxels.chosen(~left_out)
         points = self._mean_points(voxels)
         normals = estimate_normals(points)
-        normals[np.einsum("ij,ij->i", normals, voxels.sums[:, _VIEW]) < 0.0] *= -1.0
-        return PointCloud(points, normals)
+        normals[np.einsum("ij,ij->i", normals, voxels.sums[:, VIEW]) < 0.0] *= -1.0
+        return PointCloud(points, normals, voxels.layout.attributes(voxels.sums))
 
     def _wait(self, voxels: _Voxels) -> None:
         with self._lock:
@@ -162,10 +175,10 @@ class GlobalMap(Stateful):
         with self._lock:
             self._merge()
             merged = self._merged
-        return merged if min_hits <= 1 else merged.chosen(merged.sums[:, _COUNT] >= min_hits)
+        return merged if min_hits <= 1 else merged.chosen(merged.sums[:, COUNT] >= min_hits)
 
     def _mean_points(self, voxels: _Voxels) -> FloatArray:
-        within = voxels.sums[:, _POSITION] / voxels.sums[:, _COUNT, None]
+        within = voxels.sums[:, POSITION] / voxels.sums[:, COUNT, None]
         return key_cells(voxels.keys) * self.voxel_size_m + within
 
 

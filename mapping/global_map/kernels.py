@@ -1,6 +1,6 @@
 """Compiled loops over points and voxels behind `GlobalMap`.
 
-A row of sums is (7,) float32: position within the voxel, direction it was seen from, number of points. Keys are those
+Rows are float32, their columns those of `mapping.global_map.voxel_rows`; positions are within the voxel. Keys are those
 of `mapping.surfels.cell_kernels`.
 """
 
@@ -19,7 +19,7 @@ Sums = NDArray[np.float32]
 
 @compiled
 def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Sums) -> None:
-    """Write keys (N,) and rows (N, 7) of the points (N, 3) of a scan, in the LiDAR frame."""
+    """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame."""
     T, sensor = T_world_lidar, T_world_lidar[:3, 3]
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
@@ -36,13 +36,15 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
 
 
 @compiled
-def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, unique: Keys, totals: Sums) -> int:
-    """Write the keys (M,) and the sums (M, 7) of the rows of equal keys (N,), given an order that sorts these.
+def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, summed: int, unique: Keys, totals: Sums) -> int:
+    """Write the keys (M,) and the totals (M, C) of the rows (N, C) of equal keys (N,), given an order that sorts these.
+
+    The first columns are summed, so many; those behind are those of the earliest row, by the first two of them.
 
     Returns:
         M.
     """
-    count = 0
+    count, columns = 0, sums.shape[1]
     for n in range(len(order)):
         row = order[n]
         if count == 0 or keys[row] != unique[count - 1]:
@@ -50,6 +52,14 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, unique: Keys, totals
             totals[count] = sums[row]
             count += 1
         else:
-            for column in range(7):
+            for column in range(summed):
                 totals[count - 1, column] += sums[row, column]
+            if summed < columns and _is_earlier(sums[row, summed:], totals[count - 1, summed:]):
+                totals[count - 1, summed:] = sums[row, summed:]
     return count
+
+
+@compiled
+def _is_earlier(time: Sums, other: Sums) -> bool:
+    """Whether one time is before another, each the sum of its first two numbers, the second the rest of the first."""
+    return bool(time[0] < other[0] or (time[0] == other[0] and time[1] < other[1]))

@@ -1,6 +1,7 @@
 """The optimised graph, and the scans between keyframes corrected by it."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,30 @@ class Corrected:
 def recordings_of(scans: NDArray[np.intp], first_scans: NDArray[np.intp]) -> NDArray[np.intp]:
     """(N,) the recording of each scan (N,), given where recordings (R,) begin."""
     return np.searchsorted(first_scans, scans, side="right") - 1
+
+
+def in_frames(poses: FloatArray, frames: NDArray[np.intp], registered: FloatArray) -> FloatArray:
+    """Keyframe poses (K, 4, 4) moved rigidly for each frame (K,), its first keyframe to its registered pose (K, 4, 4).
+
+    An outlier closure may have moved a component that no edge takes back.
+    """
+    moved = poses.copy()
+    for frame in np.unique(frames):
+        keys = np.flatnonzero(frames == frame)
+        moved[keys] = registered[keys[0]] @ inverse(poses[keys[0]]) @ poses[keys]
+    return moved
+
+
+def corrected_recordings(
+    T_world_lidar: FloatArray, first_scans: NDArray[np.intp], keyframe_scans: NDArray[np.intp], poses: FloatArray
+) -> FloatArray:
+    """All scans (M, 4, 4), each recording's by the poses (K, 4, 4) of its own keyframes; as registered without."""
+    scans, of = T_world_lidar.copy(), recordings_of(keyframe_scans, first_scans)
+    for recording, (begin, end) in enumerate(pairwise([*first_scans, len(scans)])):
+        own = of == recording
+        if own.any():
+            scans[begin:end] = corrected(scans[begin:end], keyframe_scans[own] - begin, poses[own])
+    return scans
 
 
 def corrected(T_world_lidar: FloatArray, keyframe_scans: NDArray[np.intp], keyframe_poses: FloatArray) -> FloatArray:

@@ -10,22 +10,21 @@ in one frame.
 """
 
 import time
-from collections.abc import Collection
-from itertools import pairwise
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
-from lidarslam.mapping.global_map.global_map import GlobalMap, means_points
+from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.loops.revisits import as_registered
-from lidarslam.mapping.pose_graph.correction import Corrected, corrected, recordings_of
+from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, drift_covariance, first_connected, trajectory_edges
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
@@ -92,13 +91,19 @@ class SlamGraph(Stateful):
         self._selector = KeyframeSelector(self._config.keyframes)
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, self._segment + 1
 
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
+    def draw(
+        self,
+        points: FloatArray,
+        T_world_lidar: FloatArray,
+        voxel_size_m: float,
+        attributes: PointAttributes | None = None,
+    ) -> None:
         """Add points (N, 3) of the latest scan, at its pose as registered, to the submap of the last keyframe."""
         if not self._is_submap_open:
             return
         if self._submap is None:
             self._submap = GlobalMap(voxel_size_m)
-        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar)
+        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar, attributes)
 
     def add(self, scan: GraphScan) -> None:
         """Take the next scan; the points of the one before have been drawn by now."""
@@ -121,32 +126,46 @@ class SlamGraph(Stateful):
         self._close_submap()
         self._closures += self._detector.finish()
         self._refine_closures(until=len(self._keyframes))
-        optimised = optimise(np.array(self._poses), self._edges, self._accepted())
+        return self._corrected(self._closures)
+
+    def present(self) -> Corrected | None:
+        """Optimise what there is, and stay as it is; None when there is no keyframe.
+
+        Candidates that wait for others to agree are left out, and so are those of the last keyframe.
+        """
+        if not self._keyframes:
+            return None
+        waiting = set(self._unrefined)
+        return self._corrected([self._refined(c) if row in waiting else c for row, c in enumerate(self._closures)])
+
+    def _corrected(self, closures: Sequence[LoopClosure]) -> Corrected:
+        """All poses, optimised with these loop closures, of which rejected ones are only listed."""
+        accepted = [closure for closure in closures if closure.accepted]
+        optimised = optimise(np.array(self._poses), self._edges, accepted)
         kept = iter(optimised.inliers.tolist())
-        inliers = tuple(closure.accepted and next(kept) for closure in self._closures)
-        loops = [closure for closure, inlier in zip(self._closures, inliers, strict=True) if inlier]
+        inliers = tuple(closure.accepted and next(kept) for closure in closures)
+        loops = [closure for closure, inlier in zip(closures, inliers, strict=True) if inlier]
         scans, firsts = np.array([keyframe.scan for keyframe in self._keyframes]), np.array(self._first_scans)
         of = recordings_of(scans, firsts)
         frames = first_connected(len(firsts), [(int(of[loop.first]), int(of[loop.second])) for loop in loops])
-        poses = self._in_frames(optimised.poses, frames[of])
-        return Corrected(
-            self._correct_scans(poses, of),
-            scans,
-            poses,
-            tuple(self._closures),
-            inliers,
-            (*self._edges, *loops),
-            firsts,
-            frames,
-        )
+        registered = np.array(self.scan_poses)
+        poses = in_frames(optimised.poses, frames[of], registered[scans])
+        corrected, edges = corrected_recordings(registered, firsts, scans, poses), (*self._edges, *loops)
+        return Corrected(corrected, scans, poses, tuple(closures), inliers, edges, firsts, frames)
 
     def draw_map(self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None) -> GlobalMap:
         """The submaps of some recordings, or of all, at their keyframes' corrected poses."""
         drawn = GlobalMap(voxel_size_m)
         for index, (pose, recording) in enumerate(zip(result.keyframe_poses, result.keyframe_recordings, strict=True)):
             if recordings is None or recording in recordings:
-                drawn.add_means(self._store[index], pose)
+                drawn.add_means(self._means(index), pose)
         return drawn
+
+    def _means(self, index: int) -> VoxelMeans:
+        """The submap of a keyframe, be it the one that still grows."""
+        if index < len(self._store):
+            return self._store[index]
+        return (self._submap or GlobalMap(1.0)).means()
 
     def close(self) -> None:
         """Give up the submaps on disk."""
@@ -178,8 +197,7 @@ class SlamGraph(Stateful):
         if not self._is_submap_open:
             return
         index, keyframe = len(self._keyframes) - 1, self._keyframes[-1]
-        submap, self._submap = self._submap or GlobalMap(1.0), None
-        means = submap.means()
+        means, self._submap = self._means(index), None
         self._store.append(means)
         found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
@@ -226,25 +244,3 @@ class SlamGraph(Stateful):
         """(6, 6) of a keyframe's neighbours relative to it; each axis has a third of the squared error."""
         path_m = self._keyframes[key].path_m
         return drift_covariance(max(abs(self._keyframes[k].path_m - path_m) for k in self._around(key))) / 3.0
-
-    def _in_frames(self, poses: FloatArray, frames: NDArray[np.intp]) -> FloatArray:
-        """Keyframe poses (K, 4, 4) moved rigidly for each frame (K,), its first keyframe where it was registered.
-
-        An outlier closure may have moved a component that no edge takes back.
-        """
-        moved = poses.copy()
-        for frame in np.unique(frames):
-            keys = np.flatnonzero(frames == frame)
-            T_world_first = self.scan_poses[self._keyframes[keys[0]].scan]
-            moved[keys] = T_world_first @ inverse(poses[keys[0]]) @ poses[keys]
-        return moved
-
-    def _correct_scans(self, poses: FloatArray, recordings: NDArray[np.intp]) -> FloatArray:
-        """All scans (M, 4, 4), each recording's by the poses (K, 4, 4) of its own keyframes; as registered without."""
-        scans = np.array(self.scan_poses)
-        keyframes = np.array([keyframe.scan for keyframe in self._keyframes])
-        for recording, (begin, end) in enumerate(pairwise([*self._first_scans, len(scans)])):
-            own = recordings == recording
-            if own.any():
-                scans[begin:end] = corrected(scans[begin:end], keyframes[own] - begin, poses[own])
-        return scans

@@ -9,7 +9,8 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.state import Saved, State, Stateful
-from lidarslam.mapping.global_map.global_map import COLUMNS, VoxelMeans
+from lidarslam.mapping.global_map.global_map import VoxelMeans
+from lidarslam.mapping.global_map.voxel_rows import Layout
 
 
 class SubmapStore(Stateful):
@@ -22,12 +23,13 @@ class SubmapStore(Stateful):
 
     _ends: list[int]  # bytes
     _checksums: list[int]
+    _layouts: list[Layout]
 
     def __init__(self, directory: Path | None = None, file: Path | None = None) -> None:
         # Closed by whoever made the store.
         self._file = tempfile.TemporaryFile(dir=directory) if file is None else file.open("a+b")  # noqa: SIM115
         self._path = file
-        self._ends, self._checksums = [0], []
+        self._ends, self._checksums, self._layouts = [0], [], []
 
     def state(self) -> State:
         """Where submaps end; they are on the disk by now.
@@ -54,6 +56,7 @@ class SubmapStore(Stateful):
         if (
             self._ends[:1] != [0]
             or len(self._ends) != len(self._checksums) + 1
+            or len(self._layouts) != len(self._checksums)
             or min(np.diff(self._ends), default=0) < 0
         ):
             raise ValueError(f"{len(self._checksums)} submaps end at {self._ends[:2]}, ...")
@@ -67,15 +70,17 @@ class SubmapStore(Stateful):
         Raises:
             OSError: the disk is full.
         """
-        rows = np.ascontiguousarray(means, dtype="<f4").tobytes()
+        rows = np.ascontiguousarray(means.rows, dtype="<f4").tobytes()
         self._file.truncate(self._ends[-1])
         self._file.seek(self._ends[-1])
         self._file.write(rows)
         self._ends.append(self._ends[-1] + len(rows))
         self._checksums.append(zlib.crc32(rows))
+        self._layouts.append(means.layout)
 
     def __getitem__(self, index: int) -> VoxelMeans:
-        return np.frombuffer(self._read(index), dtype="<f4").reshape(-1, COLUMNS)
+        layout = self._layouts[index]
+        return VoxelMeans(np.frombuffer(self._read(index), dtype="<f4").reshape(-1, layout.width), layout)
 
     def _read(self, index: int) -> bytes:
         self._file.seek(self._ends[index])

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lidarslam.core.errors import ConfigError, OutputError
+from lidarslam.core.errors import OutputError
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.network.checkpoint import Checkpoint, network_of
@@ -55,16 +55,8 @@ def export_onnx(checkpoint: Checkpoint, out: Path) -> list[Path]:
     The number of scans and pairs stays free, the size of the images does not.
 
     Raises:
-        ConfigError: the packages for it are not installed.
         OutputError: the folder cannot be written.
     """
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(
-            f"{error.name} is not installed, which writing ONNX needs; pip install 'lidarslam[export]'"
-        ) from error
     network = network_of(checkpoint)
     graphs = _graphs(network, checkpoint.images.rows, checkpoint.images.columns)
     try:

@@ -5,9 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import PointAttributes, Scan
 
 INVALID = [[np.nan, 1, 1], [1, np.inf, 1], [1, 1, -np.inf], [0, 0, 0], [1e30, 1, 1], [1, -1e30, 1]]
+SOME = PointAttributes(
+    intensity=np.array([1.0, np.nan, 3.0], dtype=np.float32), rgb=np.arange(9, dtype=np.uint8).reshape(3, 3)
+)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -107,3 +110,52 @@ def test_select_keeps_everything_in_step(chosen):
     assert part.rings.tolist() == [0, 3]
     assert (part.stamp, part.dropped) == (3.0, 1)
     assert Scan(np.ones((4, 3)), 0.0).select(chosen).rings is None
+
+
+def test_intensities_and_colours_go_with_their_points():
+    points = np.array([[1, 2, 3], [0, 0, 0], [4, 5, 6], [7, 8, 9]])
+    colours = np.arange(12).reshape(4, 3)
+    scan = Scan.from_raw(points, 1.0, intensities=np.array([0, 65535, 7, 300], dtype=np.uint16), colours=colours)
+    assert scan.intensities.dtype == np.float32
+    assert scan.intensities.tolist() == [0.0, 7.0, 300.0]
+    assert scan.colours.tolist() == [[0, 1, 2], [6, 7, 8], [9, 10, 11]]
+    part = scan.select(np.array([2, 0]))
+    assert part.intensities.tolist() == [300.0, 0.0]
+    assert part.colours.tolist() == [[9, 10, 11], [0, 1, 2]]
+    for name, value in (("intensities", np.zeros(3)), ("colours", np.zeros((3, 3))), ("colours", np.zeros((3, 4)))):
+        with pytest.raises(ValueError, match=name):
+            Scan.from_raw(points, 1.0, **{name: value})
+        with pytest.raises(ValueError, match=rf"Scan\.{name} must be"):
+            dataclasses.replace(scan, **{name: value[:-1]})
+
+
+def test_attributes_are_those_that_are_wanted_and_there():
+    scan = Scan.from_raw(np.ones((3, 3)), 5.0, [0.0, 0.1, 0.2], [4, 5, 6], intensities=[1, 2, 3])
+    known = scan.attributes(["intensity", "rgb", "ring", "time"])
+    assert known.intensity.tolist() == [1.0, 2.0, 3.0]
+    assert known.rgb is None
+    assert known.ring.tolist() == [4, 5, 6]
+    assert known.time.tolist() == [5.0, 5.1, 5.2]
+    assert not list(scan.attributes([]).present())
+    untimed = Scan.from_raw(np.ones((2, 3)), 5.0).attributes(["time"])
+    assert untimed.time.tolist() == [5.0, 5.0]
+
+
+@pytest.mark.parametrize("chosen", [np.array([True, False, True]), np.array([0, 2])], ids=["mask", "indices"])
+def test_attributes_are_selected_together(chosen):
+    part = SOME.select(chosen)
+    assert part.intensity.tolist() == [1.0, 3.0]
+    assert part.rgb.tolist() == [[0, 1, 2], [6, 7, 8]]
+    assert part.ring is part.time is None
+
+
+def test_attributes_are_chosen_by_name():
+    assert [name for name, _ in SOME.present()] == ["intensity", "rgb"]
+    assert [name for name, _ in SOME.only(["rgb", "time"]).present()] == ["rgb"]
+
+
+def test_the_construction_of_attributes_is_checked():
+    with pytest.raises(ValueError, match=r"differ in length: \{'intensity': 2, 'time': 3\}"):
+        PointAttributes(intensity=np.zeros(2, dtype=np.float32), time=np.zeros(3))
+    with pytest.raises(ValueError, match=r"rgb must be \(N, 3\), got \(3, 4\)"):
+        PointAttributes(rgb=np.zeros((3, 4), dtype=np.uint8))

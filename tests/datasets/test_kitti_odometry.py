@@ -56,6 +56,7 @@ def test_reads_scans_stamps_and_truth_in_the_lidar_frame(tmp_path, rng, uncorrec
     assert len(recording) == len(scans) == 6
     for row, (scan, cloud) in enumerate(zip(scans, clouds, strict=True)):
         np.testing.assert_array_equal(scan.points, cloud[:, :3])
+        np.testing.assert_array_equal(scan.intensities, cloud[:, 3])
         assert scan.stamp == pytest.approx(0.1037 * row, abs=1e-6)
         assert scan.time_offsets is None
     np.testing.assert_allclose(recording.T_cam_lidar, T_CAM_LIDAR, atol=1e-11)

@@ -53,6 +53,11 @@ class Later(Motion):
         return super().pose_at(times + self.since_s)
 
 
+def brightness(in_office: FloatArray) -> FloatArray:
+    """Intensities (N,) that say where in the office points (N, 3) lie."""
+    return np.asarray(in_office @ [1.0, 2.0, 3.0])
+
+
 def record(folder: Path, office: int, since_s: float, scans: int, noise: int) -> Path:
     """Part of a walk through an office with a VLP-16, as .npy scans with times, stamps and ground truth."""
     world = build_world("office", office)
@@ -62,13 +67,15 @@ def record(folder: Path, office: int, since_s: float, scans: int, noise: int) ->
         world, find_sensor("vlp-16"), motion, mount_pose("upright", motion.sensor_height_m), scans, noise
     )
     folder.mkdir()
-    types = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8")])
+    types = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8"), ("intensity", "f4")])
     stamps = []
     for index, scan in enumerate(simulation.scans()):
         assert scan.time_offsets is not None
         table = np.empty(len(scan), dtype=types)
         table["x"], table["y"], table["z"] = scan.points.T
         table["time"] = scan.time_offsets
+        poses = simulation.T_world_lidar_at(scan.stamp + scan.time_offsets)
+        table["intensity"] = brightness(np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points) + poses[:, :3, 3])
         np.save(folder / f"{index:06d}.npy", table)
         stamps.append(scan.stamp)
     np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
@@ -135,6 +142,16 @@ def test_the_common_map_holds_what_is_joined_and_nothing_else(
     # Walls that both saw are one wall.
     both = cKDTree(first).query(second)[0]
     assert np.median(both) < 0.06
+
+
+def test_the_common_map_has_the_intensities_of_both(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:
+    T_office_common = read_tum(places["first"] / "ground_truth.tum").T_world_lidar[0]
+    for name in (".", "01_first", "03_second"):
+        cloud = load_map(merged[0] / name)
+        assert cloud.attributes.intensity is not None
+        off = np.abs(cloud.attributes.intensity - brightness(transform_points(T_office_common, cloud.points)))
+        assert np.median(off) < 0.1
+        assert off.max() < 1.0
 
 
 def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcome], places: dict[str, Path]) -> None:

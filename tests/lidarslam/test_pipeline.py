@@ -127,7 +127,7 @@ class _Notes:
         self.told: list[Any] = []
         self.fails_at = fails_at
 
-    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float) -> None:
+    def draw(self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, _attributes: object) -> None:
         assert voxel_size_m == 0.1
         self.told.append((len(points), T_world_lidar))
 

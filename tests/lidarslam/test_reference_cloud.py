@@ -9,9 +9,9 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from lidarslam.compare.assessment.reference_cloud import read_cloud
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.evaluate.reference_cloud import read_cloud
 
 UTM = np.array([5e5, 5e6, 300.0])
 

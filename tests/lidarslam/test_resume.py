@@ -23,6 +23,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.storage.finished_run import load_run
 
 ROOT = Path(__file__).parents[2]
@@ -173,17 +174,21 @@ def there_and_back(time: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
-    """Sweeps of few points along the loop; in one the sensor is covered."""
+    """Sweeps of few points along the loop, most with intensity and colour; in one the sensor is covered."""
     folder = tmp_path_factory.mktemp("data") / "room"
     folder.mkdir()
-    fields = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
+    plain = [("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")]
+    bright = [*plain, ("intensity", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
     stamps = 0.1 * np.arange(1, SCANS + 1)
     few = replace(room, points=3000)
     for index, stamp in enumerate(stamps):
         scan = few.sweep(there_and_back, float(stamp))
-        table = np.empty(len(scan), dtype=fields)
+        table = np.empty(len(scan), dtype=bright if index % 3 else plain)
         table["x"], table["y"], table["z"] = scan.points.T
         table["time"] = scan.time_offsets
+        if index % 3:
+            table["intensity"], table["red"] = np.linspace(0.0, 1.0, len(scan)), index
+            table["green"], table["blue"] = 10 * index % 256, np.arange(len(scan)) % 256
         if index == COVERED:
             table["x"] = np.nan
         np.save(folder / f"{index:06d}.npy", table)
@@ -212,6 +217,7 @@ def whole(run: Run, source: Path, tmp_path_factory: pytest.TempPathFactory) -> C
             out = tmp_path_factory.mktemp("whole") / "run"
             made[method] = Whole(out, run(source, out, *arguments), arguments)
             assert made[method].ended.status in (0, 3), made[method].ended.said
+            assert {"intensity", "red"} <= set(read_ply(out / "map.ply").dtype.names or ())
         return made[method]
 
     return make

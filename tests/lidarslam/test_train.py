@@ -228,7 +228,7 @@ def test_the_command_trains_goes_on_and_replaces(room_folder: Path, tmp_path: Pa
     assert result.exit_code == 0, result.output
     for words in ("training on 1 recording: 7 scans to learn from, 3 more", "step 3/3  loss", "validation after 0"):
         assert words in result.output
-    assert f"--odometry learned --weights {out / 'weights.safetensors'}" in result.output
+    assert f"lidarslam run SOURCE --weights {out / 'weights.safetensors'}" in result.output
     result = train(room_folder, *options, *settings)
     assert result.exit_code == 1
     assert "holds a training already" in result.output

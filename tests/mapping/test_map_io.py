@@ -2,13 +2,37 @@
 
 from pathlib import Path
 
+import laspy
 import numpy as np
 import open3d as o3d
 import pytest
 
 from lidarslam.core.errors import OutputError
+from lidarslam.core.scan import PointAttributes
+from lidarslam.mapping.global_map import map_io
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.global_map.map_io import require_format, write_cloud
+from lidarslam.storage.finished_run import load_map
+
+FORMATS = ["map.ply", "map.pcd", "map.laz", "map.e57"]
+
+
+@pytest.fixture
+def cloud(rng: np.random.Generator) -> PointCloud:
+    """Points with all attributes; one has no intensity, one no ring."""
+    count = 500
+    normals = rng.normal(size=(count, 3))
+    known = PointAttributes(
+        intensity=rng.uniform(0.0, 300.0, count).astype(np.float32),
+        rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        ring=rng.integers(0, 128, count).astype(np.int32),
+        time=1_700_000_000.0 + 1e-4 * rng.permutation(count),
+    )
+    assert known.intensity is not None
+    assert known.ring is not None
+    known.intensity[3], known.ring[4] = np.nan, -1
+    points = rng.normal(0.0, 30.0, (count, 3)).astype(np.float32).astype(np.float64)
+    return PointCloud(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), known)
 
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
@@ -17,12 +41,91 @@ def test_a_map_is_read_back(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(np.asarray(o3d.io.read_point_cloud(str(tmp_path / name)).points), np.eye(3))
 
 
-def test_a_failure_names_the_folder_and_no_partial_file(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"none: the \.ply map cannot be written") as caught:
-        write_cloud(tmp_path / "none" / ".partial-1-map.ply", PointCloud(np.eye(3), np.eye(3)))
+@pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
+def test_open3d_reads_every_attribute(
+    tmp_path: Path, cloud: PointCloud, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_io, "_POINTS_AT_A_TIME", 200)
+    write_cloud(tmp_path / name, cloud)
+    read = o3d.t.io.read_point_cloud(str(tmp_path / name)).point
+    np.testing.assert_array_equal(read.positions.numpy(), cloud.points)
+    np.testing.assert_array_equal(read.normals.numpy(), cloud.normals.astype(np.float32))
+    np.testing.assert_array_equal(read.colors.numpy(), cloud.attributes.rgb)
+    for attribute in ("intensity", "ring", "time"):
+        np.testing.assert_array_equal(read[attribute].numpy()[:, 0], getattr(cloud.attributes, attribute))
+
+
+@pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
+def test_maps_come_back_with_their_attributes(tmp_path: Path, cloud: PointCloud, name: str) -> None:
+    write_cloud(tmp_path / name, cloud)
+    back = load_map(tmp_path / name)
+    np.testing.assert_array_equal(back.points, cloud.points)
+    expected = dict(cloud.attributes.present())
+    for attribute, values in back.attributes.present():
+        np.testing.assert_array_equal(values, expected.pop(attribute))
+    assert not expected
+
+
+def test_laspy_reads_laz(tmp_path: Path, cloud: PointCloud) -> None:
+    write_cloud(tmp_path / "map.laz", cloud)
+    read, known = laspy.read(tmp_path / "map.laz"), cloud.attributes
+    assert read.header.are_points_compressed
+    np.testing.assert_allclose(read.xyz, cloud.points, atol=0.51e-4)
+    np.testing.assert_array_equal(read.NormalZ, cloud.normals[:, 2].astype(np.float32))
+    np.testing.assert_allclose(read.intensity, np.nan_to_num(known.intensity), atol=0.5)  # type: ignore[call-overload]
+    np.testing.assert_array_equal(read.ring, known.ring)
+    np.testing.assert_array_equal(read.gps_time, known.time)
+    assert known.rgb is not None
+    np.testing.assert_array_equal(np.column_stack([read.red, read.green, read.blue]) // 257, known.rgb)
+    assert set(read.return_number) == set(read.number_of_returns) == {1}
+
+
+def test_intensities_up_to_one_fill_the_bits_of_laz(tmp_path: Path) -> None:
+    shares = PointAttributes(intensity=np.array([0.0, 0.5, 1.0], dtype=np.float32))
+    write_cloud(tmp_path / "map.laz", PointCloud(np.eye(3), np.eye(3), shares))
+    assert laspy.read(tmp_path / "map.laz").intensity.tolist() == [0, 32768, 65535]
+
+
+def test_pye57_reads_e57(tmp_path: Path, cloud: PointCloud) -> None:
+    pye57 = pytest.importorskip("pye57")
+    write_cloud(tmp_path / "map.e57", cloud)
+    file = pye57.E57(str(tmp_path / "map.e57"))
+    read, known = file.read_scan(0, intensity=True, colors=True), cloud.attributes
+    file.close()
+    for column, axis in enumerate("XYZ"):
+        np.testing.assert_allclose(read[f"cartesian{axis}"], cloud.points[:, column], atol=1e-5)
+    np.testing.assert_array_equal(read["intensity"], np.nan_to_num(known.intensity))  # type: ignore[call-overload]
+    assert known.rgb is not None
+    for column, colour in enumerate(("Red", "Green", "Blue")):
+        np.testing.assert_array_equal(read[f"color{colour}"], known.rgb[:, column])
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_map_without_attributes_is_written_in_every_format(tmp_path: Path, name: str) -> None:
+    if name.endswith("e57"):
+        pytest.importorskip("pye57")
+    write_cloud(tmp_path / name, PointCloud(np.eye(3), np.eye(3)))
+    assert (tmp_path / name).stat().st_size > 100
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_failure_names_the_folder_and_no_partial_file(tmp_path: Path, name: str) -> None:
+    if name.endswith("e57"):
+        pytest.importorskip("pye57")
+    suffix = name.removeprefix("map")
+    with pytest.raises(OutputError, match=rf"none: the \{suffix} map cannot be written there \(.+\)$") as caught:
+        write_cloud(tmp_path / "none" / f".partial-1-{name}", PointCloud(np.eye(3), np.eye(3)))
     assert ".partial" not in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_an_empty_map_is_no_full_disk(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="a map without points"):
         write_cloud(tmp_path / "map.ply", PointCloud(np.empty((0, 3)), np.empty((0, 3))))
+
+
+def test_a_missing_library_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    require_format("laz")
+    monkeypatch.setattr(map_io, "find_spec", lambda _name: None)
+    with pytest.raises(OutputError, match=r"E57 maps need pye57; type: pip install 'lidarslam\[e57\]'$"):
+        require_format("e57")

@@ -140,7 +140,7 @@ def _caption(sequence: SequenceComparison, paths: Sequence[FloatArray], low: Flo
     measured = [method.metrics for method in sequence.methods if method.metrics is not None]
     unmeasured = [m.name for m in sequence.methods if m.trajectory is not None and m.metrics is None]
     if sequence.reference is None:
-        frame = "each in the frame of its first pose, as there is no reference"
+        frame = f"{'each ' if len(paths) > 1 else ''}in the frame of its first pose, as there is no reference"
     elif measured:
         frame = " or ".join(dict.fromkeys(ALIGNED[metrics.alignment] for metrics in measured))
         frame += f"; aligned by the first pose only: {', '.join(unmeasured)}" if unmeasured else ""
@@ -148,7 +148,8 @@ def _caption(sequence: SequenceComparison, paths: Sequence[FloatArray], low: Flo
         frame = "aligned with the reference by the first pose"
     outside = any((path < low).any() or (path > high).any() for path in paths)
     cut = " A path leaves the view; a double click shows it whole." if outside else ""
+    what = "Paths of all methods" if len(paths) > 1 else "Path"
     return (
-        f"Paths of all methods, {frame}. The ring marks the start, crosses mark scans on which tracking was lost."
+        f"{what}, {frame}. The ring marks the start, crosses mark scans on which tracking was lost."
         f" The axes of the top view have one scale, those of the side views have not.{cut}"
     )

@@ -61,7 +61,7 @@ def _fifth_is_ring(path: Path) -> bool:
 def read_npy(path: Path) -> NDArray[np.void]:
     """The points (N,) of a .npy file: a structured array with fields, or (N, >=3) numbers that begin with x, y, z.
 
-    Organised arrays are flattened.
+    Four columns are x, y, z and intensity. Organised arrays are flattened.
 
     Raises:
         InputError: the file is damaged or holds another array.
@@ -81,7 +81,8 @@ def read_npy(path: Path) -> NDArray[np.void]:
             f"{path}: expected an array (N, 3) or wider of numbers that begin with x, y, z, or a structured array,"
             f" got {array.shape} of {array.dtype}"
         )
-    names = tuple("xyz") + tuple(f"column_{column}" for column in range(3, array.shape[-1]))
+    further = tuple(f"column_{column}" for column in range(3, array.shape[-1]))
+    names = KITTI_FIELDS if len(further) == 1 else (*"xyz", *further)
     return _as_table(array.reshape(-1, array.shape[-1]), names)
 
 

@@ -17,6 +17,7 @@ from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.formats import table_reader
 from lidarslam.datasets.folders.layout import find_layout
+from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
 from lidarslam.datasets.point_time import (
     CLOCK_LIMIT_S,
@@ -74,8 +75,10 @@ class ScanFolderRecording(FileRecording):
     def _read(self, index: int, faults: Faults) -> Scan:
         table, points = self._table(index)
         stamp, offsets = self._stamp_and_offsets(index, table, points)
-        ring_field = find_ring_field(scalar_fields(table))
-        scan = Scan.from_raw(points, stamp, offsets, None if ring_field is None else table[ring_field])
+        names = scalar_fields(table)
+        ring_field = find_ring_field(names)
+        rings = None if ring_field is None else table[ring_field]
+        scan = Scan.from_raw(points, stamp, offsets, rings, read_intensities(table, names), read_colours(table, names))
         if self._point_time is not None and scan.time_offsets is None and len(scan):
             faults.note(NO_POINT_TIME, str(self._files[index]))
         return scan

@@ -120,8 +120,9 @@ class KittiOdometryRecording(FileRecording):
         return next((path for path in candidates if path.is_file()), None)
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        points = read_bin(self._files[index])[:, :3]
-        return Scan.from_raw(correction.correct_elevation(points, correction.ELEVATION_DEG), self.stamps[index])
+        rows = read_bin(self._files[index])
+        points = correction.correct_elevation(rows[:, :3], correction.ELEVATION_DEG)
+        return Scan.from_raw(points, self.stamps[index], intensities=rows[:, 3])
 
     def _truth_path(self) -> Path | None:
         return self._pose_file if (self._folder / "calib.txt").is_file() else None

@@ -101,14 +101,15 @@ class KittiRawRecording(FileRecording):
         return np.append(table, np.nan)[np.minimum(rows, len(table))]
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
-        points = read_bin(self._files[index])[:, :3]
+        rows = read_bin(self._files[index])
+        points = rows[:, :3]
         offsets = None
         if self._config.time_reference != "none":
             # The elevation correction turns points in their vertical plane, so azimuths are the same before it.
             before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
             offsets = offsets_from_azimuth(points, float(before_s), float(after_s))
         corrected = correction.correct_elevation(points, correction.ELEVATION_DEG)
-        return Scan.from_raw(corrected, self.stamps[index], offsets)
+        return Scan.from_raw(corrected, self.stamps[index], offsets, intensities=rows[:, 3])
 
     def _truth_path(self) -> Path | None:
         return None if self.ground_truth is None else self._folder / "oxts"

@@ -71,4 +71,5 @@ def _points(raw: bytes, start: int, count: int, timebase: int, order: ByteOrder,
         raise InputError(f"a Livox CustomMsg of {count} points needs {start + needed} bytes, it has {len(raw)}")
     cloud = np.ndarray((count,), record, raw, offset=start, strides=(step,))
     times = cloud[TIME_FIELD].astype(np.uint64) + np.uint64(timebase)
-    return DecodedCloud(coordinates(cloud), TIME_FIELD, times, cloud["line"].copy(), _FIELDS)
+    reflectivity = cloud["reflectivity"].astype(np.float32)
+    return DecodedCloud(coordinates(cloud), TIME_FIELD, times, cloud["line"].copy(), _FIELDS, reflectivity)

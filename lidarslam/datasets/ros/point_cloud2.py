@@ -10,6 +10,12 @@ from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointField as Po
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.folders.point_attributes import (
+    find_colour_fields,
+    find_intensity_field,
+    read_colours,
+    read_intensities,
+)
 from lidarslam.datasets.point_time import find_ring_field, find_time_field
 from lidarslam.datasets.recording import PointField
 
@@ -26,10 +32,12 @@ class DecodedCloud:
     times: NDArray[np.generic] | None  # (N,) as stored, None without per-point time
     rings: NDArray[np.generic] | None  # (N,) as stored, None when the points do not carry the number of their laser
     fields: tuple[PointField, ...]  # all fields of the message
+    intensities: NDArray[np.float32] | None = None  # (N,) as stored, None when the points have none
+    colours: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue, None when the points have none
 
 
 def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> DecodedCloud:
-    """Copy coordinates, times and rings out of a message, organised or not, of either byte order, with any padding.
+    """Copy what is used of the points out of a message, organised or not, of either byte order, with any padding.
 
     Args:
         message: of ROS 1 or ROS 2.
@@ -43,7 +51,8 @@ def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> 
     if missing := [axis for axis in "xyz" if axis not in fields]:
         raise InputError(f"points need the fields x, y and z, {missing[0]} is missing; they have: {', '.join(names)}")
     time_field, ring_field = find_time_field(names, time_field), find_ring_field(names)
-    wanted = [fields[name] for name in names if name in ("x", "y", "z", time_field, ring_field)]
+    extras = [name for name in _attribute_fields(names) if _flaw(fields[name], message.point_step) is None]
+    wanted = [fields[name] for name in names if name in ("x", "y", "z", time_field, ring_field, *extras)]
     cloud = _view(message, wanted)
     return DecodedCloud(
         coordinates(cloud),
@@ -51,7 +60,14 @@ def decode_point_cloud2(message: PointCloud2, time_field: str | None = None) -> 
         None if time_field is None else _column(cloud[time_field]),
         None if ring_field is None else _column(cloud[ring_field]),
         tuple(PointField(field.name, _type_name(field)) for field in message.fields),
+        read_intensities(cloud, extras),
+        read_colours(cloud, extras),
     )
+
+
+def _attribute_fields(names: Sequence[str]) -> list[str]:
+    intensity = find_intensity_field(names)
+    return [*([] if intensity is None else [intensity]), *find_colour_fields(names)]
 
 
 def coordinates(cloud: NDArray[np.void]) -> FloatArray:
@@ -74,10 +90,8 @@ def _view(message: PointCloud2, wanted: Sequence[PointFieldMessage]) -> NDArray[
             f" the message holds {len(message.data)}"
         )
     for field in wanted:
-        if field.datatype not in _TYPES:
-            raise InputError(f"point field {field.name!r} has the unknown datatype {field.datatype}; known are 1 to 8")
-        if field.offset + np.dtype(_TYPES[field.datatype]).itemsize > point_step:
-            raise InputError(f"point field {field.name!r} reaches beyond the {point_step} bytes of a point")
+        if flaw := _flaw(field, point_step):
+            raise InputError(f"point field {field.name!r} {flaw}")
     record = np.dtype(
         {
             "names": [field.name for field in wanted],
@@ -87,6 +101,15 @@ def _view(message: PointCloud2, wanted: Sequence[PointFieldMessage]) -> NDArray[
         }
     ).newbyteorder(">" if message.is_bigendian else "<")
     return np.ndarray((height, width), record, np.ascontiguousarray(message.data), strides=(row_step, point_step))
+
+
+def _flaw(field: PointFieldMessage, point_step: int) -> str | None:
+    """Why a field cannot be read."""
+    if field.datatype not in _TYPES:
+        return f"has the unknown datatype {field.datatype}; known are 1 to 8"
+    if field.offset + np.dtype(_TYPES[field.datatype]).itemsize > point_step:
+        return f"reaches beyond the {point_step} bytes of a point"
+    return None
 
 
 def _column(values: NDArray[np.generic]) -> NDArray[np.generic]:

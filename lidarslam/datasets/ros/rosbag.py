@@ -159,7 +159,7 @@ class BagRecording:
         offsets = None
         if model is not None and cloud.times is not None and cloud.time_field == model.field:
             offsets = model.offsets(cloud.times, stamp)
-        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings)
+        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings, cloud.intensities, cloud.colours)
         if model is not None and scan.time_offsets is None and len(scan):
             faults.note(NO_POINT_TIME, f"{stamp:.9f}")
         return scan

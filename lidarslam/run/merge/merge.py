@@ -14,7 +14,7 @@ from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
 from lidarslam.run.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
 from lidarslam.run.merge.summary import MergedRecording, MergeSummary
-from lidarslam.run.request import RunRequest
+from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
@@ -170,7 +170,7 @@ def _write(
                 views.append(part.tracked.views.placed(common.T_world_lidar[begin : begin + part.scans]))
             begin += part.scans
         drawn = drawn_map(common.global_map, PlacedViews.join(views), request.config.global_map)
-        written = write_map(directory, drawn, request.pcd)
+        written = write_map(directory, drawn, request.map_formats)
     recordings = tuple(_entry(part, runs[index], index in joined) for index, part in enumerate(parts))
     summary = MergeSummary(
         recordings=recordings,
@@ -199,7 +199,10 @@ def _write_run(part: _Part, finished: FinishedGraph | None, index: int, is_joine
     if not is_joined:
         part.tracked.log.warn(_OF_ITS_OWN)
     drawn = final_map(part.tracked, closed, part.request.config.global_map)
-    return write_results(part.directory, part.request, part.tracked, closed, drawn)
+    request = part.request
+    return write_results(
+        part.directory, request.config, describe_run(request), part.tracked, closed, drawn, request.map_formats
+    )
 
 
 def _entry(part: _Part, run: RunOutcome | None, is_joined: bool) -> MergedRecording:

@@ -13,6 +13,7 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.config import MapFormat
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import require_apart
 from lidarslam.storage import directory as files
@@ -31,7 +32,7 @@ class MergeRequest:
     sources: tuple[Path, ...]
     out: Path  # the directory of the merged map
     config: Config  # loops are closed whatever it says
-    pcd: bool = False  # whether the maps are written as .pcd too
+    map_formats: tuple[MapFormat, ...] = ()  # what the maps are written as beside .ply
     overwrite: bool = False  # whether an earlier merge, or a run, in `out` is replaced
 
     def describe(self) -> dict[str, Any]:
@@ -72,7 +73,7 @@ def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:
         name = re.sub(r"[^\w.-]+", "_", recording.name).strip("._")
         out = request.out / f"{number:02d}_{name or 'recording'}"
         require_apart(out, source)
-        run = RunRequest(source, out, request.config, pcd=request.pcd, overwrite=request.overwrite)
+        run = RunRequest(source, out, request.config, map_formats=request.map_formats, overwrite=request.overwrite)
         parts.append((run, recording))
     about = None if request.overwrite else About.read(request.out)
     if about is not None:

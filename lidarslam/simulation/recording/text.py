@@ -60,7 +60,7 @@ def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
         reference_map=REFERENCE_MAP,
         spacing_cm=100.0 * summary.map_spacing_m,
         info=shlex.join(["lidarslam", "info", str(summary.source)]),
-        run=_run_command(request, summary),
+        run=_run_command(summary),
     )
 
 
@@ -72,7 +72,7 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
         f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points a scan,"
         f" reference map of {summary.map_points:,} points\n"
         f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what\n"
-        f"next: {_run_command(request, summary)}"
+        f"next: {_run_command(summary)}"
     )
 
 
@@ -86,5 +86,5 @@ def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
     return shlex.join([*words, "--format", request.format])
 
 
-def _run_command(request: RecordRequest, summary: RecordingSummary) -> str:
-    return shlex.join(["lidarslam", "run", str(summary.source), "--out", f"runs/{request.out.resolve().name}"])
+def _run_command(summary: RecordingSummary) -> str:
+    return shlex.join(["lidarslam", "run", str(summary.source)])

@@ -1,9 +1,10 @@
 """Text that `lidarslam evaluate` prints."""
 
+import shlex
 from collections.abc import Iterator, Mapping
 
-from lidarslam.evaluate.evaluate import Evaluation
-from lidarslam.evaluate.map_evaluation import MapEvaluation
+from lidarslam.compare.assessment.evaluate import Evaluation
+from lidarslam.compare.assessment.map_evaluation import MapEvaluation
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
@@ -36,6 +37,8 @@ def _lines(evaluation: Evaluation) -> Iterator[str]:
     yield from (f"note: {note}" for note in evaluation.notes)
     if evaluation.written:
         yield from ("", f"written to {', '.join(map(str, evaluation.written))}")
+    if evaluation.estimate.run is not None:
+        yield f"next: {shlex.join(['lidarslam', 'view', str(evaluation.estimate.run)])}"
 
 
 def _row(label: str, text: str) -> str:

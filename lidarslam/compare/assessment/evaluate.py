@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lidarslam.compare.assessment.error_cloud import check_error_files, write_errors
+from lidarslam.compare.assessment.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
+from lidarslam.compare.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
+from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
 from lidarslam.core.errors import InputError
-from lidarslam.evaluate.error_cloud import check_error_files, write_errors
-from lidarslam.evaluate.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
-from lidarslam.evaluate.map_evaluation import MapEvaluation, MapOptions, evaluate_map
-from lidarslam.evaluate.reference_map import find_reference_map, load_reference_map
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
 from lidarslam.evaluation.report.error_colours import DEFAULT_CLIP_M
 from lidarslam.evaluation.trajectory.alignment import AlignmentMethod
@@ -22,9 +23,9 @@ from lidarslam.storage.directory import RunDirectory
 class EvaluateRequest:
     """Estimate, references and outputs."""
 
-    run: Path  # a run directory, or a trajectory in TUM or KITTI text
-    # a trajectory file, a run directory or a recording; None: the truth that came with the run's source
-    reference: Path | None = None
+    run: Path | Trajectory  # a run directory, or a trajectory, in memory or in TUM or KITTI text
+    # a trajectory likewise, a run directory or a recording; None: the truth that came with the run's source
+    reference: Path | Trajectory | None = None
     reference_map: Path | None = None  # a cloud; None: the exact map of a simulated source, else none
     map_file: Path | None = None  # the map of a bare trajectory, or another one than the run's
     alignment: AlignmentMethod = "se3"  # of the trajectory, for the ATE
@@ -36,6 +37,8 @@ class EvaluateRequest:
     errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
     out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
     needs_reference: bool = True  # whether it is an error that there is no reference
+    write: bool = True  # whether the figures are written
+    report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +73,10 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     check_error_files(request.errors)
     estimate = read_estimate(request.run, request.map_file)
     notes: list[str] = []
-    reference, metrics = _reference(request, estimate, notes), None
+    reference, metrics, trajectory = _reference(request, estimate, notes), None, None
     if reference is not None:
         trajectories = pair(estimate, reference)
+        trajectory = trajectories[0]
         metrics = evaluate_trajectory(*trajectories, request.tolerance_s, request.max_gap_s, request.alignment)
         notes += [warning] if (warning := disagreement(metrics)) is not None else []
     # Poses of KITTI's camera do not give the LiDAR's world.
@@ -86,7 +90,7 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         notes += compared.warnings()
     elif estimate.map_file is not None:
         entropy = map_entropy(estimate.map_points())
-    out = request.out or (None if estimate.run is None else estimate.run / files.METRICS)
+    out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
     written = [*([] if out is None else [out]), *request.errors]
     label = None if reference is None else reference.label
     evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
@@ -95,7 +99,24 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     if compared is not None:
         for path in request.errors:
             write_errors(path, compared.comparison, compared.positions, request.errors_clip_m)
+    if request.report and estimate.run is not None and request.out is None:
+        _draw_report(request, estimate.run, evaluation, trajectory if in_camera else None)
     return evaluation
+
+
+def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:
+    """The page of the run with its errors; `compared` are the poses in the camera's frame, if they were compared."""
+    from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+    accuracy = Accuracy(
+        evaluation.metrics,
+        request.reference.name if isinstance(request.reference, Path) else "ground truth",
+        compared,
+        None if evaluation.map is None else evaluation.map.json,
+        None if evaluation.map is None else evaluation.map.errors,
+        tuple(evaluation.notes),
+    )
+    leave_report(run, accuracy)
 
 
 def _reference(request: EvaluateRequest, estimate: Estimate, notes: list[str]) -> Poses | None:
@@ -130,7 +151,7 @@ def _evaluate_map(
     if request.reference_map is not None:
         reference = load_reference_map(request.reference_map)
     elif request.needs_reference:
-        sources = [path for path in (estimate.source, request.reference) if path is not None and path.exists()]
+        sources = [path for path in (estimate.source, request.reference) if isinstance(path, Path) and path.exists()]
         reference = next((found for found in map(find_reference_map, sources) if found is not None), None)
         if reference is not None and estimate.map_file is None:
             if estimate.run is not None:

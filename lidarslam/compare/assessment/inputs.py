@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from lidarslam.compare.assessment.reference_cloud import read_cloud
 from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
@@ -14,7 +15,6 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
-from lidarslam.evaluate.reference_cloud import read_cloud
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.storage import directory as files
 from lidarslam.storage.finished_run import read_trajectory
@@ -63,12 +63,14 @@ class Estimate:
         return read_cloud(self.map_file)
 
 
-def read_estimate(path: Path, map_file: Path | None = None) -> Estimate:
-    """A run directory, or a trajectory in TUM or KITTI text with the map given beside it.
+def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Estimate:
+    """A run directory, or a trajectory, in memory or in TUM or KITTI text, with the map given beside it.
 
     Raises:
-        InputError: it is neither, or damaged.
+        InputError: it is none of these, or damaged.
     """
+    if isinstance(path, Trajectory):
+        return Estimate(_in_memory(path, "the trajectory"), None, map_file, None, Config())
     if not path.exists():
         raise InputError(f"{path}: no such run directory or trajectory file")
     if not path.is_dir():
@@ -104,12 +106,14 @@ def _config_of_run(file: Path) -> Config:
         return Config()
 
 
-def read_reference(path: Path, config: ReaderConfig) -> Poses:
-    """A trajectory to compare with: a TUM or KITTI text file, a run directory, or the truth of a recording.
+def read_reference(path: Path | Trajectory, config: ReaderConfig) -> Poses:
+    """A trajectory to compare with: in memory, a TUM or KITTI text file, a run directory, or the truth of a recording.
 
     Raises:
         InputError: it is none of these, is damaged, or the recording came without ground truth.
     """
+    if isinstance(path, Trajectory):
+        return _in_memory(path, "the reference")
     if not path.exists():
         raise InputError(f"{path}: no such trajectory, run directory or recording")
     require_whole(path)
@@ -168,6 +172,10 @@ def read_poses(path: Path) -> Poses:
         return Poses(str(path), None, read_kitti_poses(path))
     trajectory = read_tum(path)
     return Poses(str(path), trajectory.stamps, trajectory.T_world_lidar)
+
+
+def _in_memory(trajectory: Trajectory, label: str) -> Poses:
+    return Poses(label, trajectory.stamps, trajectory.T_world_lidar)
 
 
 def pair(estimate: Estimate, reference: Poses) -> tuple[Trajectory, Trajectory]:

@@ -1,4 +1,4 @@
-"""Point clouds on disk, as scanners, surveyors and mapping programs write them; the only file with laspy and pye57."""
+"""Point clouds on disk, as scanners, surveyors and mapping programs write them."""
 
 from collections.abc import Callable
 from pathlib import Path

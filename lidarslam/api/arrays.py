@@ -1,0 +1,106 @@
+"""Scans from arrays: what a caller hands over is checked before it is used."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+
+# No sweep lasts longer, and no clock reading is smaller.
+_LONGEST_OFFSET_S = 10.0
+# Thousands of years are no time in seconds.
+_LATEST_STAMP_S = 1e11
+# Stamps jitter; a sweep that is longer than so many intervals between stamps has other units.
+_MOST_INTERVALS = 4.0
+
+
+def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float) -> Scan:
+    """A scan, of copies, without the invalid points: NaN, at the origin, beyond 10 km.
+
+    Args:
+        points: (N, 3) or more columns, of which the first three are x, y, z in metres.
+        point_times: (N,) seconds from the stamp.
+        stamp: seconds.
+
+    Raises:
+        InputError: an array has another shape, or a time is not in seconds.
+    """
+    table = _numbers("points", points)
+    if not table.size:
+        table = np.empty((0, 3))
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise InputError(f"points must be (N, 3) or (N, 3 and more), x, y, z first; got the shape {table.shape}")
+    times = None if point_times is None else _times(point_times, len(table))
+    return Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times)
+
+
+def check_stamp(stamp: float, last: float | None) -> float:
+    """The stamp in seconds.
+
+    Raises:
+        InputError: it is no number of seconds, or not after the last one.
+    """
+    try:
+        seconds = float(stamp)
+    except (TypeError, ValueError):
+        raise InputError(f"stamp must be a number of seconds, got {stamp!r}") from None
+    if not np.isfinite(seconds):
+        raise InputError(f"stamp must be a finite number of seconds, got {seconds}")
+    if abs(seconds) > _LATEST_STAMP_S:
+        raise InputError(f"stamp must be in seconds, got {seconds:.6g}; multiply nanoseconds by 1e-9")
+    if last is not None and seconds <= last:
+        raise InputError(
+            f"stamps must increase: {seconds:.9f} s is not after the scan before, {last:.9f} s; leave this scan out"
+        )
+    return seconds
+
+
+def check_sweep(scan: Scan, interval_s: float) -> None:
+    """The duration of a sweep, against the longest time between two stamps so far.
+
+    Raises:
+        InputError: it is much longer.
+    """
+    if scan.time_offsets is None or not len(scan):
+        return
+    sweep_s = float(np.ptp(scan.time_offsets))
+    if sweep_s > _MOST_INTERVALS * interval_s:
+        raise InputError(
+            f"point_times span {sweep_s:.3g} s, but scans are {interval_s:.3g} s apart; expected are seconds from the"
+            " stamp: multiply times from 0 to 1 by the duration of a sweep"
+        )
+
+
+def _times(point_times: ArrayLike, count: int) -> FloatArray:
+    times = _numbers("point_times", point_times).reshape(-1)
+    if len(times) != count:
+        raise InputError(f"point_times must have one entry a point, got {len(times)} for {count} points")
+    seconds = np.array(times, dtype=np.float64)
+    largest = float(np.abs(seconds[np.isfinite(seconds)]).max(initial=0.0))
+    if largest > _LONGEST_OFFSET_S:
+        raise InputError(
+            f"point_times must be seconds from the stamp, fractions of one; got up to {largest:.6g}: subtract the stamp"
+            " from absolute times, and multiply nanoseconds by 1e-9, microseconds by 1e-6"
+        )
+    return seconds
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[Any]:
+    """An array of real numbers.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(f"{name} must be an array of numbers: {error}") from None
+    if array.dtype.names is not None:
+        fields = ", ".join(array.dtype.names)
+        raise InputError(f"{name} must be an array of numbers, got the fields {fields}; stack their columns")
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} must be an array of numbers, got {array.dtype}")
+    return array

@@ -1,0 +1,82 @@
+"""Recordings on disk as sequences of scans."""
+
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+
+from lidarslam.config.settings import make_config
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.registry import open_recording
+
+
+class OpenRecording:
+    """A recording on disk; iterating reads one scan after the other, in the order of time, as a run does."""
+
+    def __init__(self, recording: Recording, chosen: range) -> None:
+        self._recording = recording
+        self._chosen = chosen
+        self._faults = Faults()
+
+    def __len__(self) -> int:
+        """How many scans there are; iterating leaves out those that cannot be read."""
+        return len(self._chosen)
+
+    def __iter__(self) -> Iterator[Scan]:
+        """The scans.
+
+        Raises:
+            InputError: the recording is damaged where no scan can be left out.
+        """
+        self._faults = Faults()
+        return take_in(self._recording, self._chosen, self._faults)
+
+    @property
+    def name(self) -> str:
+        """A short name."""
+        return self._recording.name
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The true poses of the LiDAR, at stamps and in a world of their own; None where the recording has none.
+
+        Raises:
+            InputError: they are damaged.
+        """
+        return self._recording.ground_truth
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Faults of the recording as a whole, and of the scans that were read by the latest iteration."""
+        return (*self._recording.warnings, *self._faults.warnings())
+
+
+def open(
+    source: str | PathLike[str],
+    *,
+    topic: str | None = None,
+    sequence: str | None = None,
+    reader: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    step: int = 1,
+) -> OpenRecording:
+    """Open a recording: anything that `lidarslam run` takes.
+
+    Args:
+        source: a bag, a KITTI folder, or a folder of scans.
+        topic: point cloud topic of a bag that has several.
+        sequence: sequence of a KITTI odometry root, such as "04".
+        reader: name of the reader; None: the one that recognises the source.
+        start, stop, step: which scans, as in `range`.
+
+    Raises:
+        InputError: the source cannot be read.
+    """
+    given = {"topic": topic, "sequence": sequence, "name": reader}
+    config = make_config({"reader": {key: value for key, value in given.items() if value is not None}})
+    recording = open_recording(Path(source), config.reader)
+    return OpenRecording(recording, range(len(recording))[start:stop:step])

@@ -1,0 +1,241 @@
+"""SLAM in a program's own loop, one scan after the other."""
+
+import copy
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from threading import RLock
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from threadpoolctl import ThreadpoolController
+from typing_extensions import Self
+
+from lidarslam.api.arrays import check_stamp, check_sweep, make_scan
+from lidarslam.api.registered_scan import RegisteredScan
+from lidarslam.api.saving import Built, python_names, save_run
+from lidarslam.config.settings import Config, make_config
+from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import look_at
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.pipeline.background_worker import BackgroundWorker
+from lidarslam.pipeline.estimates import Estimated, Localised
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.stages import Stages
+from lidarslam.run.loop_closing import begin_graph
+from lidarslam.run.run import open_odometry
+from lidarslam.run.scan_log import ScanLog
+
+# Scans whose points may wait for the map, to bound the memory they hold.
+_SCANS_BEHIND = 8
+
+
+class Slam:
+    """Estimates the pose of each scan as it comes, and builds the map in the background.
+
+    A context manager: `close` ends its threads. Methods may be called from several threads; one waits for the other.
+
+    Args:
+        config: the path of a YAML file, or the name of one that comes with the program; settings such as
+            `{"odometry.method": "kiss-icp"}` or `{"pose_graph": {"enabled": True}}`; or a `Config`. None: the defaults,
+            as in `lidarslam run`.
+
+    Raises:
+        ConfigError: a setting does not exist or does not fit.
+        InputError: the weights of the odometry are damaged.
+    """
+
+    def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
+        self._config = make_config(config)
+        if self._config.odometry.method == "external":
+            raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
+        with python_names():
+            self._odometry = open_odometry(self._config, None)
+        self._graph = begin_graph(self._config)
+        self._stages = Stages(self._odometry, make_localiser(self._config), self._config.global_map, self._graph)
+        self._builder = BackgroundWorker("map", _SCANS_BEHIND)
+        self._blas = ThreadpoolController()
+        self._log, self._faults = ScanLog(), Faults()
+        self._count, self._longest_interval_s = 0, 0.0
+        self._last_stamp: float | None = None
+        self._counts_stamps = False  # whether stamps are made from the rate
+        self._failure: BaseException | None = None
+        self._closed = False
+        self._lock = RLock()
+
+    def register_frame(
+        self, points: ArrayLike | Scan, point_times: ArrayLike | None = None, stamp: float | None = None
+    ) -> RegisteredScan:
+        """Register the next scan, and return its pose at once; the map follows in the background.
+
+        Points that are NaN, at the origin or beyond 10 km are left out. The arrays may be used again afterwards.
+
+        Args:
+            points: (N, 3) or more columns, of which the first three are x, y, z: metres, in the LiDAR frame (x forward,
+                z up) of the instant each was measured at. Or a `Scan`, which has times and stamp of its own, and
+                whatever else goes into maps.
+            point_times: (N,) seconds from the stamp at which each point was measured; None when the points are
+                motion compensated, or the times unknown.
+            stamp: seconds, after that of the scan before; the pose belongs to this instant. None, then for all scans:
+                they come at `reader.rate_hz`, 10 Hz unless it is configured.
+
+        Raises:
+            InputError: an array or the stamp is not as described. Nothing has changed; go on with the next scan.
+            LidarSlamError: registration is not possible any more, or this object is closed.
+        """
+        with self._entered():
+            self._require_working()
+            started = time.perf_counter()
+            scan = self._take(points, point_times, stamp)
+            with self._failing(), self._blas.limit(limits=1, user_api="blas"):
+                estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
+                localised = self._stages.localise(estimated)
+                total_ms = 1e3 * (time.perf_counter() - started)
+                self._submit(estimated, localised, total_ms)
+            return RegisteredScan.of(scan.stamp, localised)
+
+    def trajectory(self) -> Trajectory:
+        """The poses of all scans so far, corrected by the loops that the pose graph has closed.
+
+        Raises:
+            LidarSlamError: building the map failed, or this object is closed.
+        """
+        with self._entered():
+            self._settle()
+            trajectory, graph = self._log.trajectory, self._built().graph
+            result = None if graph is None else graph.present()
+            return trajectory if result is None else Trajectory(trajectory.stamps, result.T_world_lidar)
+
+    def map(self) -> PointCloud:
+        """The map of all scans so far, one point in a voxel, with normals; without what moved.
+
+        Raises:
+            LidarSlamError: building the map failed, or this object is closed.
+        """
+        with self._entered():
+            self._settle()
+            cloud = self._built().correct()[1].cloud
+            return PointCloud(np.empty((0, 3)), np.empty((0, 3))) if cloud is None else cloud
+
+    def save(self, directory: str | PathLike[str], overwrite: bool = False) -> None:
+        """Write the run directory of all scans so far, as `lidarslam run` does; more scans may follow.
+
+        Args:
+            directory: made if it is not there.
+            overwrite: whether a run that lies there is replaced.
+
+        Raises:
+            OutputError: the directory holds something else, or cannot be written.
+            LidarSlamError: there is nothing to save, building the map failed, or this object is closed.
+        """
+        with self._entered():
+            self._settle()
+            if not self._log.points_read:
+                raise InputError("there is nothing to save: no scan with points was registered")
+            self._stages.map.slides.finish()
+            save_run(Path(directory), overwrite, self._config, self._built())
+
+    def close(self) -> None:
+        """End the threads, and let go of everything; no other method may be called afterwards."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            try:
+                self._builder.close()
+                self._stages.close()
+            except Exception as error:
+                if self._failure is None:
+                    raise _map_error(error) from error
+            finally:
+                self._odometry.close()
+                if self._graph is not None:
+                    self._graph.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _take(self, points: ArrayLike | Scan, point_times: ArrayLike | None, stamp: float | None) -> Scan:
+        """The next scan, once it is checked."""
+        if isinstance(points, Scan):
+            if point_times is not None or stamp is not None:
+                raise InputError("a Scan has times and a stamp of its own; give it alone")
+            point_times, stamp = points.time_offsets, points.stamp
+        counts_stamps = stamp is None
+        if self._count and counts_stamps != self._counts_stamps:
+            raise InputError("give a stamp with every scan or with none")
+        last = self._last_stamp
+        seconds = check_stamp(self._count / self._config.reader.rate_hz if stamp is None else stamp, last)
+        scan = points if isinstance(points, Scan) else make_scan(points, point_times, seconds)
+        longest_s = 0.0 if last is None else max(self._longest_interval_s, seconds - last)
+        if last is not None:
+            check_sweep(scan, longest_s)
+        self._count, self._counts_stamps = self._count + 1, counts_stamps
+        self._last_stamp, self._longest_interval_s = seconds, longest_s
+        return look_at(scan, self._faults)
+
+    def _submit(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
+        """Leave the rest to the background; an error of an earlier scan may be raised."""
+        try:
+            self._builder.submit(self._build, estimated, localised, total_ms)
+        except Exception as error:
+            raise _map_error(error) from error
+
+    def _build(self, estimated: Estimated, localised: Localised, total_ms: float) -> None:
+        """What of a scan is done in the background."""
+        self._log.add(self._stages.build(estimated, localised), total_ms)
+
+    def _built(self) -> Built:
+        """What there is so far, once the background is done; a graph that missed a scan is left out."""
+        graph = self._graph if self._graph is not None and len(self._graph.scan_poses) == len(self._log) else None
+        return Built(self._config, copy.deepcopy(self._log), copy.copy(self._faults), self._stages.map, graph)
+
+    def _settle(self) -> None:
+        """Wait for the background, and add the last scan to the map."""
+        try:
+            self._builder.wait()
+            self._stages.add_pending()
+            self._stages.wait_for_graph()
+        except Exception as error:
+            known, self._failure = self._failure, self._failure or error
+            if known is None:
+                raise _map_error(error) from error
+
+    @contextmanager
+    def _entered(self) -> Iterator[None]:
+        with self._lock:
+            if self._closed:
+                raise LidarSlamError("this Slam is closed; call trajectory(), map() and save() before close()")
+            yield
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """An error or Ctrl-C in the middle of a scan leaves the stages in different states."""
+        try:
+            yield
+        except BaseException as error:
+            self._failure = error
+            raise
+
+    def _require_working(self) -> None:
+        if self._failure is not None:
+            reason = str(self._failure) or type(self._failure).__name__
+            raise LidarSlamError(
+                f"an earlier scan was broken off ({reason}), and no more can be registered; trajectory(), map() and"
+                " save() give what came before it"
+            )
+
+
+def _map_error(error: Exception) -> LidarSlamError:
+    if isinstance(error, LidarSlamError):
+        return error
+    return LidarSlamError(f"building the map failed: {type(error).__name__}: {error}")

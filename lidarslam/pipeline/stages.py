@@ -1,0 +1,104 @@
+"""The stages of a scan: odometry, pose, map, pose graph.
+
+Scans pass through `estimate`, `localise` and `build` in this order, one after the other. Each of the three may be
+called on a thread of its own; the pose graph is built on another.
+"""
+
+import time
+from typing import TYPE_CHECKING
+
+from lidarslam.core.scan import Scan
+from lidarslam.core.state import Stateful
+from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.odometry.interface import Odometry
+from lidarslam.pipeline.background_worker import BackgroundWorker
+from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, graph_scan
+from lidarslam.pipeline.localisation import Localiser
+from lidarslam.pipeline.map_building import MapBuilder
+
+if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+# Calls that may wait for the graph, which takes as long for a loop closure as for all scans up to the next keyframe.
+_GRAPH_CALLS_BEHIND = 64
+
+
+class Stages(Stateful):
+    """Carries what each stage keeps from scan to scan; the state is without that of odometry and graph.
+
+    Args:
+        odometry, localiser: estimate the poses.
+        config: of the global map.
+        graph: built along the way; complete after `finish`.
+    """
+
+    map: MapBuilder
+    _localiser: Localiser
+    _measured_stamp: float | None  # of the last scan, unless its motion was only predicted
+
+    def __init__(
+        self, odometry: Odometry, localiser: Localiser, config: GlobalMapConfig, graph: "SlamGraph | None" = None
+    ) -> None:
+        self._odometry = odometry
+        self._localiser = localiser
+        self._graph = graph
+        self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
+        self._measured_stamp = None
+        self.map = MapBuilder(config)
+
+    def estimate(self, scan: Scan, read_ms: float = 0.0) -> Estimated:
+        """The odometry of the next scan, which took so long to read."""
+        started = time.perf_counter()
+        motion = self._odometry.estimate(scan)
+        stage_ms = {"read": read_ms, "odometry": _ms(started, time.perf_counter())}
+        measured, previous = motion.failure is None, self._measured_stamp
+        interval_s = scan.stamp - previous if measured and previous is not None else None
+        self._measured_stamp = scan.stamp if measured else None
+        return Estimated(scan, motion, interval_s, stage_ms)
+
+    def localise(self, estimated: Estimated, following: Estimated | None = None) -> Localised:
+        """The pose of a scan; the odometry of the following one gives the motion after the stamp, where it is known."""
+        return self._localiser.localise(estimated, following)
+
+    def build(self, estimated: Estimated, localised: Localised) -> ScanResult:
+        """Deskew a scan, add the scan before to the map, and both to the graph."""
+        scan, started = estimated.scan, time.perf_counter()
+        thinned = self.map.thin(scan)
+        points = localised.motion.compensate(thinned)
+        deskewed = time.perf_counter()
+        self.add_pending(next_is_lost=localised.status is Status.LOST)
+        self.map.add(thinned, points, localised)
+        if self._graph is not None:
+            self._graph_worker.submit(self._graph.add, graph_scan(estimated, localised, points))
+        stage_ms = {"deskew": _ms(started, deskewed), "map": _ms(deskewed, time.perf_counter())}
+        return ScanResult(
+            **vars(localised) | {"stage_ms": estimated.stage_ms | localised.stage_ms | stage_ms},
+            stamp=scan.stamp,
+            points=points,
+            points_read=len(scan),
+            points_dropped=scan.dropped,
+        )
+
+    def add_pending(self, next_is_lost: bool = False) -> None:
+        """Add the last scan to the map, unless it is in there."""
+        added = self.map.add_pending(next_is_lost)
+        if added is not None and self._graph is not None:
+            self._graph_worker.submit(self._graph.draw, *added)
+
+    def finish(self) -> None:
+        """Add the last scan to the map, and look at the last pair of scans; more may follow."""
+        self.add_pending()
+        self.map.slides.finish()
+
+    def wait_for_graph(self) -> None:
+        """Wait until the graph has taken all scans, and raise its error."""
+        self._graph_worker.wait()
+
+    def close(self) -> None:
+        """Wait for the graph, and end its thread."""
+        self._graph_worker.close()
+
+
+def _ms(start: float, end: float) -> float:
+    return 1e3 * (end - start)

@@ -1,0 +1,1 @@
+"""Parts of pictures: the view, the shaded clouds, paths and legend."""

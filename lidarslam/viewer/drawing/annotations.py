@@ -1,0 +1,156 @@
+"""Paths on a picture, and the strip below it: legend, size and scale bar."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.viewer.drawing.view import View
+
+Colour = tuple[int, int, int]
+
+INK, PAPER, HALO = (20, 20, 20), (255, 255, 255), (255, 255, 255)
+START = (0, 158, 115)
+# Of the picture's width.
+_TEXT, _LINE, _MARKER = 1 / 58, 1 / 320, 1 / 130
+_LONGEST_BAR = 0.2
+_LONGEST_NAME = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A part of the strip: a symbol and its text."""
+
+    text: str
+    symbol_width: int = 0  # pixels
+    # draws the symbol from a column on, about a row
+    symbol: Callable[[ImageDraw.ImageDraw, float, float], None] | None = None
+
+
+def draw_path(
+    picture: Image.Image, view: View, positions: FloatArray, colours: Sequence[Colour], around: Colour | None = HALO
+) -> None:
+    """Draw a path through positions (N, 3) above everything; colours are those of its poses, and of a wider line."""
+    if len(positions) < 2:
+        return
+    pen, width = ImageDraw.Draw(picture), max(2, round(view.width * _LINE))
+    pixels = [tuple(pixel) for pixel in view.project(positions).tolist()]
+    if around is not None:
+        pen.line(pixels, fill=around, width=2 * width, joint="curve")
+    for first, last in _stretches(colours):
+        pen.line(pixels[first : last + 1], fill=colours[last], width=width, joint="curve")
+
+
+def draw_ends(picture: Image.Image, view: View, positions: FloatArray, colour: Colour) -> None:
+    """Mark the first position with a disc, the last with a square of the colour."""
+    if not len(positions):
+        return
+    pen, radius = ImageDraw.Draw(picture), view.width * _MARKER
+    for pixel, fill in zip(view.project(positions[[-1, 0]]), (colour, START), strict=True):
+        _mark(pen, pixel[0], pixel[1], radius, fill)
+
+
+def line_entry(text: str, colour: Colour, width: int) -> Entry:
+    """A line of the legend."""
+    length, thick = round(width / 45), max(3, round(1.2 * width * _LINE))
+
+    def symbol(pen: ImageDraw.ImageDraw, column: float, row: float) -> None:
+        pen.line([(column, row), (column + length, row)], fill=colour, width=thick)
+
+    return Entry(_short(text), length, symbol)
+
+
+def end_entry(text: str, colour: Colour, width: int) -> Entry:
+    """The mark of the first or the last pose in the legend."""
+    radius = width * _MARKER
+
+    def symbol(pen: ImageDraw.ImageDraw, column: float, row: float) -> None:
+        _mark(pen, column + radius, row, radius, colour)
+
+    return Entry(text, round(2 * radius), symbol)
+
+
+def ramp_entry(low: str, high: str, colours: NDArray[np.uint8], width: int) -> Entry:
+    """A scale of colours (K, 3) from `low` to `high`."""
+    height, font = round(width * _TEXT * 0.7), _font(width)
+    before = round(font.getlength(low)) + round(width / 160)
+
+    def symbol(pen: ImageDraw.ImageDraw, column: float, row: float) -> None:
+        pen.text((column, row), low, fill=INK, font=font, anchor="lm")
+        for step, colour in enumerate(colours.tolist()):
+            left = column + before + step
+            pen.line([(left, row - height / 2), (left, row + height / 2)], tuple(colour))
+
+    return Entry(high, before + len(colours), symbol)
+
+
+def scale_entry(view: View) -> Entry:
+    """The scale bar; its length is that of the text."""
+    metres = round_length(_LONGEST_BAR * view.width * view.pixel_m)
+    length, tick, thick = round(metres / view.pixel_m), view.width / 200, max(2, round(view.width / 500))
+
+    def symbol(pen: ImageDraw.ImageDraw, column: float, row: float) -> None:
+        left, right = round(column), round(column) + length
+        pen.rectangle([left, row - thick / 2, right - 1, row + thick / 2], fill=INK)
+        for end in (left, right - thick):
+            pen.rectangle([end, row - tick, end + thick - 1, row + tick], fill=INK)
+
+    return Entry(f"{metres:g} m", length, symbol)
+
+
+def round_length(longest_m: float) -> float:
+    """The longest of 1, 2, 5, 10, 20, 50, ... m, or decimal parts of them, up to a length."""
+    power = 10.0 ** np.floor(np.log10(longest_m))
+    return float(power * max(digit for digit in (1, 2, 5) if digit * power <= longest_m * (1.0 + 1e-9)))
+
+
+def with_strip(picture: Image.Image, entries: Sequence[Entry]) -> Image.Image:
+    """The picture above a strip with the entries from left to right, in as many rows as they need."""
+    width, font, gap = picture.width, _font(picture.width), round(picture.width / 45)
+    text_gap, margin, row_height = round(width / 160), round(width / 40), round(width * _TEXT * 2.0)
+    rows: list[list[tuple[int, Entry]]] = [[]]
+    column = margin
+    for entry in entries:
+        taken = entry.symbol_width + text_gap + round(font.getlength(entry.text))
+        if rows[-1] and column + taken > width - margin:
+            rows.append([])
+            column = margin
+        rows[-1].append((column, entry))
+        column += taken + gap
+    whole = Image.new("RGB", (width, picture.height + row_height * len(rows) + row_height // 2), PAPER)
+    whole.paste(picture, (0, 0))
+    pen = ImageDraw.Draw(whole)
+    for number, row in enumerate(rows):
+        middle = picture.height + row_height * (number + 0.5) + row_height // 4
+        for column, entry in row:
+            if entry.symbol is not None:
+                entry.symbol(pen, column, middle)
+            text_column = column + entry.symbol_width + text_gap
+            pen.text((text_column, middle), entry.text, fill=INK, font=font, anchor="lm")
+    return whole
+
+
+def _font(width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(width * _TEXT)
+
+
+def _short(text: str) -> str:
+    """Shortened, and without the characters that Pillow's font lacks."""
+    text = text.encode("ascii", "replace").decode()
+    return text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..."
+
+
+def _mark(pen: ImageDraw.ImageDraw, column: float, row: float, radius: float, colour: Colour) -> None:
+    """A disc at the start, else a square."""
+    box = [column - radius, row - radius, column + radius, row + radius]
+    draw = pen.ellipse if colour == START else pen.rectangle
+    draw(box, fill=colour, outline=HALO, width=max(1, round(radius / 4)))
+
+
+def _stretches(colours: Sequence[Colour]) -> list[tuple[int, int]]:
+    """First and last pose of each stretch of one colour; a stretch begins at the pose before it."""
+    ends = [row for row in range(1, len(colours)) if row + 1 == len(colours) or colours[row + 1] != colours[row]]
+    return list(zip([0, *ends[:-1]], ends, strict=True)) if ends else []

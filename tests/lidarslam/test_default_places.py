@@ -1,0 +1,199 @@
+"""Where results go, and which run is taken, when the command line names no directory."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.core.errors import InputError
+from lidarslam.storage import default_places
+from lidarslam.storage.default_places import latest_run, new_place, source_name, unfinished_run
+from lidarslam.storage.unfinished import About, Unfinished
+
+TIME = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d"
+FAST = ("--odometry", "constant-velocity", "--stop", "3")
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def only(folder: str) -> Path:
+    """The one entry of a folder, by its relative path."""
+    (entry,) = Path(folder).iterdir()
+    return entry
+
+
+def finished(name: str, written: int) -> Path:
+    """A run directory whose trajectory was written at some time."""
+    run = Path("runs") / name
+    run.mkdir(parents=True)
+    (run / "trajectory.tum").touch()
+    os.utime(run / "trajectory.tum", (written, written))
+    return run
+
+
+def unfinished(name: str, source: Path, sequence: str | None = None, **others: str) -> Path:
+    """A run directory with the mark of a run that was killed."""
+    run = Path("runs") / name
+    (run / "unfinished").mkdir(parents=True)
+    About({"source": str(source.resolve()), "reader": {"sequence": sequence}, **others}).write(run)
+    return run
+
+
+def test_a_run_is_written_to_a_place_of_its_own_which_is_named_first_and_last(small_recording: Path) -> None:
+    ran = lidarslam("run", small_recording, *FAST)
+    assert ran.exit_code == 0
+    out = only("runs")
+    assert re.fullmatch(f"room_{TIME}", out.name)
+    assert ran.stderr == f"lidarslam: results go to {out}\n"
+    assert f"written to {out}\nnext: lidarslam view {out}\n      lidarslam evaluate {out}\n" in ran.stdout
+    assert json.loads((out / "summary.json").read_text())["scans"] == 3
+
+
+def test_an_impossible_request_leaves_no_folder(small_recording: Path) -> None:
+    assert lidarslam("run", small_recording, "--start", 9).exit_code == 1
+    assert not list(Path("runs").glob("*"))
+
+
+def test_runs_in_the_same_second_do_not_meet() -> None:
+    places = []
+    for _ in range(3):
+        places.append(new_place(Path("runs"), "room"))
+        places[-1].mkdir(parents=True)
+    assert len(set(places)) == 3
+
+
+@pytest.mark.parametrize(
+    ("source", "sequence", "name"),
+    [
+        ("site.mcap", None, "site"),
+        ("site.v2.mcap", None, "site.v2"),
+        ("drive_0005.sync/", None, "drive_0005.sync"),
+        ("KITTI/", "04", "KITTI_04"),
+        ("KITTI/sequences/04/", "04", "04"),
+        ("site.mcap", "04", "site"),
+        ("recordings/office_2026-01-31_12-00-00/", None, "office"),
+        ("recordings/office_2026-01-31_12-00-00-2/", None, "office"),
+        ("2011_09_26_drive_0005_sync/", None, "2011_09_26_drive_0005_sync"),
+        ("/", None, "recording"),
+    ],
+)
+def test_results_bear_the_name_of_the_recording(source: str, sequence: str | None, name: str) -> None:
+    if source.endswith("/"):
+        Path(source).mkdir(parents=True, exist_ok=True)
+        Path("KITTI/sequences").mkdir(parents=True, exist_ok=True)
+    assert source_name(Path(source), sequence) == name
+
+
+def test_the_other_commands_have_a_place_too(small_recording: Path) -> None:
+    made = lidarslam("simulate", "--world", "hall", "--scans", 2, "--format", "ply")
+    assert made.exit_code == 0
+    recording = only("recordings")
+    assert re.fullmatch(f"hall_{TIME}", recording.name)
+    assert f"next: lidarslam run {recording}" in made.stdout
+    compared = lidarslam("compare", small_recording, "--methods", "constant-velocity+map")
+    assert compared.exit_code == 0
+    assert re.fullmatch(f"room_{TIME}", only("compared").name)
+    assert (only("compared") / "report.html").is_file()
+    lidarslam("merge", small_recording, recording, "--odometry", "constant-velocity")
+    assert re.fullmatch(f"room_{TIME}", only("merged").name)
+
+
+@pytest.mark.parametrize(
+    ("environment", "arguments", "message"),
+    [
+        ({}, ["--resume"], "--resume continues the training in --out; name it"),
+        ({"WORLD_SIZE": "2"}, [], "the processes of torchrun share a directory; name it with --out"),
+    ],
+)
+def test_a_training_is_named_where_its_place_must_be_known(
+    environment: dict[str, str], arguments: list[str], message: str
+) -> None:
+    ran = CliRunner(env=environment).invoke(main, ["train", *arguments])
+    assert (ran.exit_code, list(Path().iterdir())) == (2, [])
+    assert message in ran.stderr
+
+
+def test_a_killed_run_is_resumed_without_its_name(small_recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(Unfinished, "end", lambda *_, **__: None)  # as if it was killed before
+        lidarslam("run", small_recording, *FAST)
+    out = only("runs")
+    assert About.read(out) is not None
+    resumed = lidarslam("run", small_recording, *FAST, "--resume")
+    assert (resumed.exit_code, only("runs")) == (0, out)
+    assert resumed.stderr.startswith(f"lidarslam: resuming {out}\n")
+    assert About.read(out) is None
+    assert "resumed once" in (out / "summary.json").read_text()
+    again = lidarslam("run", small_recording, *FAST, "--resume")
+    assert again.exit_code == 1
+    assert f"runs: holds no unfinished run of {small_recording}; name one with --out" in again.stderr
+
+
+def test_the_run_to_resume_is_one_of_the_same_recording(place: Path) -> None:
+    (place / "runs").mkdir()
+    (place / "runs" / "notes.txt").touch()
+    unfinished("other", place / "other.mcap")
+    unfinished("part", place / "site.mcap", merge="00_site")
+    unfinished("five", place / "site.mcap", "05")
+    damaged = unfinished("damaged", place / "site.mcap")
+    (damaged / "unfinished" / "run.json").write_text("{")
+    with pytest.raises(InputError, match=r"runs: holds no unfinished run of site\.mcap"):
+        unfinished_run(Path("site.mcap"))
+    mine = unfinished("mine", place / "site.mcap")
+    assert unfinished_run(Path("site.mcap")) == mine
+    assert unfinished_run(Path("site.mcap"), "05") == Path("runs/five")
+    unfinished("twin", place / "site.mcap")
+    with pytest.raises(InputError, match=r"has several unfinished runs \(runs/mine, runs/twin\); name the one"):
+        unfinished_run(Path("site.mcap"))
+
+
+def test_the_latest_run_is_the_one_written_last() -> None:
+    assert latest_run() is None
+    late, _ = finished("a", 2_000), finished("b", 1_000)
+    killed = finished("c", 3_000)
+    (killed / "unfinished").mkdir()
+    About({"source": "x"}).write(killed)
+    assert latest_run() == late
+    About({"source": "x"}, "stopped").write(killed)
+    assert latest_run() == killed
+
+
+def test_evaluate_and_view_take_the_latest_run(whole_run: Path) -> None:
+    for command in (["evaluate"], ["view", "--save", "run.rrd"]):
+        refused = lidarslam(*command)
+        assert refused.exit_code == 2
+        assert "name a RUN; runs holds no finished one" in refused.stderr
+    default_places.RUNS.mkdir()
+    (default_places.RUNS / "whole").symlink_to(whole_run)
+    evaluated = lidarslam("evaluate", "-o", "metrics.json")
+    assert (evaluated.exit_code, evaluated.stderr) == (0, "lidarslam: taking the latest run, runs/whole\n")
+    assert evaluated.stdout.endswith("written to metrics.json\nnext: lidarslam view runs/whole\n")
+    viewed = lidarslam("view", "--save", "run.rrd")
+    assert (viewed.exit_code, viewed.stderr) == (0, "lidarslam: taking the latest run, runs/whole\n")
+
+
+@pytest.mark.parametrize("name", ["run", "merge", "compare", "simulate", "train", "export", "demo", "evaluate"])
+def test_out_is_optional_and_short(name: str) -> None:
+    (out,) = [option for option in main.commands[name].params if "--out" in option.opts]
+    assert "-o" in out.opts
+    assert not out.required
+
+
+def test_config_is_short_everywhere() -> None:
+    options = [option for command in main.commands.values() for option in command.params]
+    configs = [option for option in options if "--config" in option.opts]
+    assert len(configs) >= 7
+    assert all("-c" in option.opts for option in configs)

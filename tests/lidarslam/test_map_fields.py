@@ -1,0 +1,164 @@
+"""Intensity, colour, ring and time of a recording are in the map of a run, where the recording has them."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.mapping.global_map import map_io
+from lidarslam.storage.directory import MAPS
+from lidarslam.storage.finished_run import load_map, load_run
+
+SCANS = 10
+WITHOUT = (0, 3, 4)  # scans that lack the fields
+EPOCH = 1_700_000_000.0
+XYZ_TIME = [("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")]
+FIELDS = [("intensity", "u2"), ("ring", "u1"), ("rgb", "u4")]
+WAYS = {
+    "true poses": ["--prior", "{}/ground_truth.tum", "--no-mapping"],
+    "registered": ["--odometry", "constant-velocity"],
+    "pose graph": [
+        "--odometry", "constant-velocity", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",
+    ],
+}  # fmt: skip
+SETTINGS = ["--set", "global_map.voxel_size_m=0.1"]
+
+
+def brightness(in_room: FloatArray) -> FloatArray:
+    """Intensity (N,), 16 bits of it, of points (N, 3) on the surfaces of the room: linear, so that means keep it."""
+    return np.asarray(30_000.0 + in_room @ [2_000.0, 1_000.0, 500.0])
+
+
+def colours(in_room: FloatArray) -> FloatArray:
+    """Red, green and blue (N, 3), likewise."""
+    return np.asarray(127.0 + in_room @ np.diag([15.0, 20.0, 50.0]))
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Callable[[FloatArray], FloatArray]) -> Path:
+    """A drive whose intensities and colours follow from where a point lies; the ring is the number of the scan."""
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    folder.mkdir()
+    stamps = 0.1 * np.arange(1, SCANS + 1)
+    for index, stamp in enumerate(stamps):
+        scan = replace(room, points=4000).sweep(drive, float(stamp))
+        table = np.empty(len(scan), dtype=XYZ_TIME if index in WITHOUT else XYZ_TIME + FIELDS)
+        table["x"], table["y"], table["z"], table["time"] = *scan.points.T, scan.time_offsets
+        if index not in WITHOUT:
+            poses = drive(stamp + scan.time_offsets)
+            in_room = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points) + poses[:, :3, 3]
+            rgb = np.round(colours(in_room)).astype(np.uint32)
+            table["intensity"], table["ring"] = np.round(brightness(in_room)), index
+            table["rgb"] = rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
+        np.save(folder / f"{index:06d}.npy", table)
+    np.savetxt(folder / "timestamps.txt", EPOCH + stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", Trajectory(EPOCH + stamps, drive(stamps)))
+    return folder
+
+
+def run(source: Path, out: Path, *arguments: str) -> str:
+    """Run a recording; what it printed."""
+    given = [one.format(source) for one in arguments]
+    result = CliRunner().invoke(main, ["run", str(source), "--out", str(out), *SETTINGS, *given])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_map_has_the_intensities_and_colours_of_its_surfaces(
+    source: Path, tmp_path: Path, drive: Callable[[FloatArray], FloatArray], way: str
+) -> None:
+    printed = run(source, tmp_path / "run", *WAYS[way])
+    assert "voxels of 10 cm, with intensity and rgb;" in printed
+    cloud = load_map(tmp_path / "run")
+    in_room, known = transform_points(drive(np.array([0.1]))[0], cloud.points), cloud.attributes
+    assert known.intensity is not None
+    assert known.rgb is not None
+    assert known.ring is known.time is None
+    has = np.isfinite(known.intensity)
+    assert 0.8 < has.mean() < 1.0  # some places were only seen by scans without
+    # A voxel's mean point is that of all scans, its intensity that of some.
+    off = np.abs(known.intensity - brightness(in_room))[has]
+    assert np.median(off) < 2_000.0 * 0.01
+    assert off.max() < 2_000.0 * 0.2
+    off = np.abs(known.rgb - colours(in_room))[has]
+    assert np.median(off) < 1.0
+    assert off.max() < 50.0 * 0.2
+    assert not known.rgb[~has].any()
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["map_fields"] == ["intensity", "rgb"]
+    assert len(dict(load_run(tmp_path / "run").map_attributes.present())) == 2
+
+
+def test_rings_and_times_are_those_of_the_first_point(
+    source: Path, tmp_path: Path, drive: Callable[[FloatArray], FloatArray]
+) -> None:
+    run(source, tmp_path / "run", *WAYS["true poses"], "--set", "global_map.fields=[ring, time]")
+    known = load_map(tmp_path / "run").attributes
+    assert known.intensity is known.rgb is None
+    assert known.ring is not None
+    assert known.time is not None
+    # The number of the scan stands for its ring; its sweep is from 50 ms before to 50 ms after the stamp.
+    number = np.round((known.time - EPOCH) / 0.1 - 1.0).astype(int)
+    sure = np.abs((known.time - EPOCH) / 0.1 - 1.0 - number) < 0.49
+    expected = np.where(np.isin(number, WITHOUT), -1, number)
+    np.testing.assert_array_equal(known.ring[sure], expected[sure])
+    assert np.bincount(number).argmax() == 0
+    only = tmp_path / "rings"
+    run(source, only, *WAYS["true poses"], "--set", "global_map.fields=[ring]")
+    assert [name for name, _ in load_map(only).attributes.present()] == ["ring"]
+
+
+def test_geometry_does_not_depend_on_the_fields(source: Path, tmp_path: Path) -> None:
+    for name, fields in (("none", "[]"), ("all", "[intensity, rgb, ring, time]")):
+        run(source, tmp_path / name, *WAYS["pose graph"], "--set", f"global_map.fields={fields}")
+    none, every = load_map(tmp_path / "none"), load_map(tmp_path / "all")
+    np.testing.assert_array_equal(none.points, every.points)
+    np.testing.assert_array_equal(none.normals, every.normals)
+    assert not list(none.attributes.present())
+    for name in ("trajectory.tum", "pose_graph.g2o"):
+        assert (tmp_path / "none" / name).read_bytes() == (tmp_path / "all" / name).read_bytes()
+
+
+def test_further_formats(source: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    out = tmp_path / "run"
+    run(source, out, *WAYS["true poses"], "--pcd", "--map-format", "laz", "--map-format", "e57", "--map-format", "pcd")
+    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", *MAPS.values()}
+    run(source, out, *WAYS["true poses"], "--overwrite")
+    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply"}
+
+
+@pytest.mark.parametrize("command", ["run", "merge"])
+def test_a_missing_library_is_said_before_the_run(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setattr(map_io, "find_spec", lambda _name: None)
+    out = tmp_path / "run"
+    result = CliRunner().invoke(main, [command, str(source), "--out", str(out), "--map-format", "e57"])
+    assert result.exit_code != 0
+    assert "pip install 'lidarslam[e57]'" in f"{result.output}{result.exception}"
+    assert not out.exists()
+
+
+def test_info_says_what_the_map_will_have(source: Path, small_recording: Path) -> None:
+    lines = CliRunner().invoke(main, ["info", str(source)]).output.splitlines()
+    assert [line.split()[1:] for line in lines if line.startswith(("intensity", "colour"))] == [["no"], ["no"]]
+    (source.parent / "rest").mkdir()
+    for file in sorted(source.glob("*.npy"))[1:3]:
+        (source.parent / "rest" / file.name).symlink_to(file)
+    lines = CliRunner().invoke(main, ["info", str(source.parent / "rest")]).output.splitlines()
+    (intensity,) = (line.split(maxsplit=1)[1] for line in lines if line.startswith("intensity"))
+    assert intensity.endswith("in the first scan")
+    low, high = (float(word) for word in intensity.split()[:3:2])
+    assert 1_000.0 < low < 20_000.0
+    assert 40_000.0 < high < 65_535.0
+    assert any(line.split() == ["colour", "yes"] for line in lines)

@@ -1,0 +1,368 @@
+"""The interface for Python programs, on scans of known truth."""
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lidarslam
+from lidarslam import LidarSlamError, RegisteredScan, Scan, Slam, Status, Trajectory
+from lidarslam.config.settings import Config
+from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.geometry import inverse, transform_points
+from lidarslam.core.trajectory_io import read_tum, write_tum
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.run.run import open_odometry
+from lidarslam.storage.finished_run import load_run
+
+# Nothing but NumPy and compiled loops, so that tests are fast.
+SETTINGS = {"odometry.method": "constant-velocity", "global_map": {"voxel_size_m": 0.1}}
+GRAPH = SETTINGS | {"pose_graph": {"enabled": True, "keyframes.distance_m": 0.4}}
+
+
+@pytest.fixture
+def slam() -> Iterator[Slam]:
+    with Slam(SETTINGS) as slam:
+        yield slam
+
+
+def register(slam: Slam, scans: list[Scan]) -> list[RegisteredScan]:
+    return [slam.register_frame(scan.points, scan.time_offsets, scan.stamp) for scan in scans]
+
+
+def from_start(truth: Trajectory) -> Trajectory:
+    return truth.transformed(inverse(truth.T_world_lidar[0]))
+
+
+def map_errors(slam: Slam, room: Any, truth: Trajectory) -> Any:
+    return room.distance_to_surface(transform_points(truth.T_world_lidar[0], slam.map().points))
+
+
+def test_each_pose_is_returned_at_once(slam: Slam, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    results, truth = register(slam, room_scans), from_start(room_truth)
+    assert [result.stamp for result in results] == [scan.stamp for scan in room_scans]
+    assert {result.status for result in results} == {Status.OK}
+    positions = np.array([result.T_world_lidar[:3, 3] for result in results])
+    assert np.linalg.norm(positions - truth.positions, axis=1).max() < 0.01
+    assert results[-1].covariance is not None
+    assert results[-1].covariance.shape == (6, 6)
+    assert results[-1].velocity is not None
+    np.testing.assert_allclose(results[-1].velocity, [0.0, 0.01, 0.3, 0.8, 0.05, 0.0], atol=0.03)
+    np.testing.assert_array_equal(slam.trajectory().T_world_lidar, [result.T_world_lidar for result in results])
+
+
+def test_a_loop_and_a_run_have_the_same_poses(slam: Slam, room_scans: list[Scan]) -> None:
+    """Without an odometry's motion of the following scan there is nothing that a run waits for."""
+    config = lidarslam.Config.model_validate({"odometry": {"method": "constant-velocity"}})
+    pipeline = Pipeline(open_odometry(config, None), make_localiser(config), config.global_map)
+    of_run = [result.T_world_lidar for result in pipeline.run(room_scans)]
+    np.testing.assert_array_equal([result.T_world_lidar for result in register(slam, room_scans)], of_run)
+
+
+@pytest.mark.parametrize("method", ["learned", "kiss-icp"])
+def test_every_odometry_works_at_once(method: str, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    with Slam({"odometry.method": method, "odometry.kiss_icp.voxel_size_m": 0.2}) as slam:
+        register(slam, room_scans)
+        metrics = lidarslam.evaluate(slam.trajectory(), room_truth)
+    assert metrics["trajectory"]["ate_rmse_m"] < 0.01
+
+
+def test_odometry_alone(room_scans: list[Scan], room_truth: Trajectory) -> None:
+    with Slam({"mapping.method": "off", "global_map.voxel_size_m": 0.1}) as slam:
+        results = register(slam, room_scans)
+        assert lidarslam.evaluate(slam.trajectory(), room_truth)["trajectory"]["ate_rmse_m"] < 0.05
+        assert len(slam.map()) > 1000
+    assert results[-1].covariance is None
+
+
+def test_the_map_lies_on_the_walls(slam: Slam, room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    assert len(slam.map()) == len(slam.trajectory()) == 0
+    register(slam, room_scans[:1])
+    assert len(slam.map()) > 1000, "the first scan is in the map at once"
+    register(slam, room_scans[1:])
+    cloud = slam.map()
+    assert cloud.normals.shape == cloud.points.shape == (len(cloud), 3)
+    distance = map_errors(slam, room, room_truth)
+    assert np.median(distance) < 0.01
+    assert np.percentile(distance, 95) < 0.03
+
+
+def test_asking_for_the_map_on_the_way_changes_no_pose(room_scans: list[Scan]) -> None:
+    poses = []
+    for asks in (False, True):
+        with Slam(GRAPH) as slam:
+            for scan in room_scans:
+                slam.register_frame(scan)
+                if asks:
+                    slam.map()
+                    slam.trajectory()
+            poses.append((slam.trajectory().T_world_lidar, len(slam.map())))
+    np.testing.assert_array_equal(poses[0][0], poses[1][0])
+    assert poses[0][1] == poses[1][1]
+
+
+def test_saved_runs_are_like_others(slam: Slam, tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    register(slam, room_scans[:10])
+    out = tmp_path / "run"
+    slam.save(out)
+    register(slam, room_scans[10:])
+    with pytest.raises(OutputError, match="replace it with overwrite"):
+        slam.save(out)
+    slam.save(str(out), overwrite=True)
+    names = {
+        "config.yaml",
+        "trajectory.tum",
+        "trajectory.kitti",
+        "odometry.tum",
+        "map.ply",
+        "scans.csv",
+        "summary.json",
+    }
+    assert {path.name for path in out.iterdir()} >= names
+    run = load_run(out)
+    np.testing.assert_allclose(run.trajectory.T_world_lidar, slam.trajectory().T_world_lidar, atol=1e-8)
+    assert len(run.map_points) == len(slam.map())
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["scans"] == 20
+    assert summary["warnings"] == []
+    write_tum(tmp_path / "truth.tum", room_truth)
+    metrics = lidarslam.evaluate(out, tmp_path / "truth.tum")
+    assert metrics["trajectory"]["ate_rmse_m"] < 0.01
+    assert metrics["map"] is None
+    assert not (out / "metrics.json").exists(), "nothing is written"
+
+
+def test_a_pose_graph_is_saved(tmp_path: Path, room: Any, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    with Slam(GRAPH) as slam:
+        register(slam, room_scans)
+        slam.save(tmp_path)
+        assert np.percentile(map_errors(slam, room, room_truth), 95) < 0.03
+        trajectory = slam.trajectory()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["pose_graph"]["keyframes"] >= 3
+    assert (tmp_path / "pose_graph.g2o").is_file()
+    np.testing.assert_allclose(read_tum(tmp_path / "trajectory.tum").positions, trajectory.positions, atol=1e-8)
+
+
+def test_points_as_drivers_give_them(slam: Slam, room_scans: list[Scan]) -> None:
+    """Other columns, single precision, no-returns; and the buffer is used again."""
+    buffer = np.zeros((len(room_scans[0]) + 3, 5), dtype=np.float32)
+    times = np.zeros(len(buffer))
+    with Slam(SETTINGS) as plain:
+        expected = register(plain, room_scans[:6])
+    for scan, same in zip(room_scans, expected, strict=False):
+        buffer[:-3, :3], times[:-3] = scan.points, scan.time_offsets
+        buffer[-3, :3], buffer[-2, :3], buffer[-1, :3] = np.nan, 0.0, 2e4
+        result = slam.register_frame(buffer, times, scan.stamp)
+        buffer[:], times[:] = 7.0, 0.3
+        np.testing.assert_allclose(result.T_world_lidar, same.T_world_lidar, atol=2e-3)
+    assert np.linalg.norm(slam.map().points - [7.0, 7.0, 7.0], axis=1).min() > 0.5
+
+
+def test_results_are_read_only(slam: Slam, room_scans: list[Scan]) -> None:
+    result = slam.register_frame(room_scans[0])
+    with pytest.raises(ValueError, match="read-only"):
+        result.T_world_lidar[0, 3] = 1.0
+
+
+def test_without_stamps_scans_come_at_the_rate(room_scans: list[Scan]) -> None:
+    with Slam(SETTINGS | {"reader.rate_hz": 20}) as slam:
+        stamps = [slam.register_frame(scan.points).stamp for scan in room_scans[:3]]
+        assert stamps == [0.0, 0.05, 0.1]
+        with pytest.raises(InputError, match="with every scan or with none"):
+            slam.register_frame(room_scans[3].points, stamp=0.4)
+
+
+POINTS = np.random.default_rng(1).uniform(1.0, 9.0, (60, 3))
+
+
+@pytest.mark.parametrize(
+    ("points", "times", "stamp", "told"),
+    [
+        (np.zeros((5, 2)), None, 0.2, r"must be \(N, 3\).* \(5, 2\)"),
+        (np.zeros((2, 5, 3)), None, 0.2, r"must be \(N, 3\)"),
+        (np.zeros(5, dtype=[("x", "f4"), ("y", "f4")]), None, 0.2, "got the fields x, y"),
+        (np.array([["a", "b", "c"]]), None, 0.2, "array of numbers"),
+        ([[1.0, 2.0], [1.0]], None, 0.2, "array of numbers"),
+        (POINTS, np.zeros(7), 0.2, "7 for 60 points"),
+        (POINTS, np.full(60, 1.7e9), 2.0, "subtract the stamp"),
+        (POINTS, np.linspace(0, 1e8, 60), 2.0, "nanoseconds by 1e-9"),
+        (POINTS, np.linspace(0, 1, 60), 0.2, "multiply times from 0 to 1"),
+        (POINTS, None, 0.1, "is not after the scan before, 0.100000000 s"),
+        (POINTS, None, -1.0, "stamps must increase"),
+        (POINTS, None, None, "with every scan or with none"),
+        (POINTS, None, float("nan"), "finite"),
+        (POINTS, None, 1_700_000_000_000_000_000, "nanoseconds by 1e-9"),
+        (POINTS, None, "now", "a number of seconds"),
+        (Scan(POINTS, 0.2), None, 0.2, "give it alone"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_and_changes_nothing(
+    slam: Slam, room_scans: list[Scan], points: Any, times: Any, stamp: Any, told: str
+) -> None:
+    register(slam, room_scans[:1])
+    with pytest.raises(InputError, match=told):
+        slam.register_frame(points, times, stamp)
+    assert len(slam.trajectory()) == 1
+    (result,) = register(slam, room_scans[1:2])
+    assert result.status is Status.OK
+
+
+def test_a_scan_without_points_is_lost_and_the_next_is_not(slam: Slam, room_scans: list[Scan]) -> None:
+    register(slam, room_scans[:5])
+    assert slam.register_frame(np.empty((0, 3)), stamp=0.6).status is Status.LOST
+    assert slam.register_frame([], stamp=0.65).message
+    assert register(slam, room_scans[6:7])[0].status is Status.OK
+
+
+class _Breaks:
+    """An odometry that fails at one scan."""
+
+    def __init__(self, odometry: Any, error: BaseException) -> None:
+        self._odometry, self._error, self._scans = odometry, error, 0
+
+    def estimate(self, scan: Scan) -> Any:
+        self._scans += 1
+        if self._scans == 4:
+            raise self._error
+        return self._odometry.estimate(scan)
+
+    def close(self) -> None:
+        self._odometry.close()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no more memory"), KeyboardInterrupt()])
+def test_after_a_break_the_results_so_far_can_be_saved(
+    slam: Slam, tmp_path: Path, room_scans: list[Scan], error: BaseException
+) -> None:
+    slam._stages._odometry = _Breaks(slam._odometry, error)
+    with pytest.raises(type(error)):
+        register(slam, room_scans)
+    with pytest.raises(LidarSlamError, match=r"broken off \((no more memory|KeyboardInterrupt)\)"):
+        slam.register_frame(room_scans[10])
+    assert len(slam.trajectory()) == 3
+    slam.save(tmp_path)
+    assert len(load_run(tmp_path).trajectory) == 3
+
+
+def test_an_error_in_the_background_is_raised_once(slam: Slam, room_scans: list[Scan]) -> None:
+    register(slam, room_scans[:3])
+    slam.trajectory()
+    slam._stages.map.thin = None  # type: ignore[assignment]
+    slam.register_frame(room_scans[3])
+    with pytest.raises(LidarSlamError, match="building the map failed: TypeError"):
+        slam.map()
+    with pytest.raises(LidarSlamError, match="broken off"):
+        slam.register_frame(room_scans[4])
+    assert len(slam.trajectory()) == 3
+
+
+def test_closed_is_closed(room_scans: list[Scan], tmp_path: Path) -> None:
+    before = threading.active_count()
+    with Slam(GRAPH) as slam:
+        register(slam, room_scans[:2])
+    slam.close()
+    assert threading.active_count() == before
+    for call in (lambda: slam.register_frame(room_scans[2]), slam.map, slam.trajectory, lambda: slam.save(tmp_path)):
+        with pytest.raises(LidarSlamError, match="is closed"):
+            call()
+
+
+def test_nothing_is_saved_of_nothing(slam: Slam, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nothing to save"):
+        slam.save(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_configurations_of_every_form(tmp_path: Path) -> None:
+    file = tmp_path / "my.yaml"
+    file.write_text("odometry: {method: constant-velocity}\nglobal_map: {voxel_size_m: 0.1}\n")
+    for given in (file, str(file), SETTINGS, Config.model_validate({"odometry": {"method": "constant-velocity"}})):
+        with Slam(given) as slam:
+            assert slam._config.odometry.method == "constant-velocity"
+    with Slam("indoor") as slam:
+        assert slam._config != Config()
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"odometry.methd": "kiss-icp"}, "there is no odometry.methd; did you mean method"),
+        ({"odometry": {"method": "icp"}}, "odometry.method='icp'"),
+        ({"odometry.method": "external"}, "odometry.method=external"),
+        ({"odometry.method": "constant-velocity", "mapping": {"method": "off"}}, "needs scan-to-map registration"),
+        ({"odometry": 3, "odometry.method": "kiss-icp"}, "odometry is a value, not a section"),
+        ("no such file.yaml", "no such file.yaml"),
+    ],
+)
+def test_a_wrong_configuration_is_refused(settings: Any, told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        Slam(settings)
+
+
+@pytest.fixture
+def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    folder = tmp_path / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder
+
+
+def test_a_recording_is_a_sequence_of_scans(recording: Path, room_scans: list[Scan], room_truth: Trajectory) -> None:
+    opened = lidarslam.open(recording, stop=5)
+    assert len(opened) == 5
+    for scan, written in zip(opened, room_scans, strict=False):
+        np.testing.assert_allclose(scan.points, written.points)
+        assert scan.stamp == pytest.approx(written.stamp)
+    assert len(list(opened)) == 5
+    assert opened.name == "room"
+    assert opened.ground_truth is not None
+    np.testing.assert_allclose(opened.ground_truth.T_world_lidar, room_truth.T_world_lidar, atol=1e-8)
+    (recording / "000002.npy").write_bytes(b"")
+    assert len(list(opened)) == 4
+    assert "left out" in opened.warnings[0]
+    with pytest.raises(InputError, match="no such file"):
+        lidarslam.open(recording / "elsewhere")
+
+
+def test_evaluate_takes_trajectories_files_and_recordings(
+    recording: Path, tmp_path: Path, room_truth: Trajectory
+) -> None:
+    moved = Trajectory(room_truth.stamps, room_truth.T_world_lidar.copy())
+    moved.T_world_lidar[:, 0, 3] += np.where(np.arange(20) % 2, 0.01, -0.01)
+    write_tum(tmp_path / "moved.tum", moved)
+    for estimate in (moved, tmp_path / "moved.tum", str(tmp_path / "moved.tum")):
+        for reference in (room_truth, recording):
+            metrics = lidarslam.evaluate(estimate, reference)
+            assert metrics["trajectory"]["ate_rmse_m"] == pytest.approx(0.01, rel=0.05)
+            assert metrics["association"]["matched"] == 20
+    with pytest.raises(InputError, match="no reference"):
+        lidarslam.evaluate(moved)
+
+
+def test_the_root_loads_nothing_before_it_is_used() -> None:
+    code = (
+        "import sys; before = set(sys.modules); import lidarslam; dir(lidarslam)\n"
+        "print(sorted(name for name in set(sys.modules) - before if name.startswith(('lidarslam', 'numpy'))))\n"
+        "lidarslam.Trajectory; print(sorted({'torch', 'open3d', 'gtsam', 'numba'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["['lidarslam']", "[]"]
+
+
+def test_the_names_are_those_that_are_said() -> None:
+    assert set(lidarslam._MODULES) == set(lidarslam.__all__) <= set(dir(lidarslam))
+    for name in lidarslam.__all__:
+        assert getattr(lidarslam, name).__doc__, f"{name} is documented"
+    with pytest.raises(AttributeError, match="has no attribute 'slam'"):
+        _ = lidarslam.slam  # type: ignore[attr-defined]

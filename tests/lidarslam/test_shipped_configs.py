@@ -1,0 +1,98 @@
+"""Configurations and benchmarks by name, anywhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.config.settings import Config, dump_yaml, load_config
+from lidarslam.config.shipped import BENCHMARKS, CONFIGS, headline, shipped_files
+
+ROOT = Path(__file__).parents[2]
+FILES = [*shipped_files(CONFIGS).values(), *shipped_files(BENCHMARKS).values()]
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_file_of_the_repository_has_a_name() -> None:
+    assert CONFIGS.parent.name == "lidarslam"  # the part of the repository that is installed
+    assert {path.resolve() for path in FILES} == set((ROOT / "configs").rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_file_begins_with_a_line_about_it_and_an_example_by_its_name(path: Path) -> None:
+    assert re.fullmatch(r"# .{20,118}\.", path.read_text().splitlines()[0])
+    assert f"--config {path.stem}\n" in path.read_text() or f"--benchmark {path.stem}" in path.read_text()
+
+
+def test_a_configuration_is_found_by_its_name() -> None:
+    expected = dump_yaml(load_config(CONFIGS / "indoor.yaml"))
+    assert expected != dump_yaml(Config())
+    assert lidarslam("config", "--config", "indoor").stdout == expected
+    assert lidarslam("config", "-c", "indoor").stdout == expected
+
+
+def test_a_path_is_a_file_of_the_user(place: Path) -> None:
+    for name in ("indoor", "indoor.yaml", "mine"):
+        (place / name).write_text("global_map: {voxel_size_m: 0.77}\n")
+    for path in ("./indoor", "indoor.yaml", "mine", place / "indoor"):
+        assert "voxel_size_m: 0.77" in lidarslam("config", "-c", path).stdout
+    assert "voxel_size_m: 0.77" not in lidarslam("config", "-c", "indoor").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["config", "-c", "indor"], "'indor' is neither a file nor the name of a configuration; there are: indoor, "),
+        (["config", "-c", "configs/indoor.yaml"], "'configs/indoor.yaml' is neither a file nor"),
+        (["config", "-c", ""], "'' is neither a file nor"),
+        (["config", "-c", "."], "'.' is neither a file nor"),
+        (["compare", "--benchmark", "indoor"], "the name of a benchmark; there are: ablation, anymal, kitti, "),
+    ],
+)
+def test_an_unknown_name_gets_the_list(arguments: list[str], message: str) -> None:
+    refused = lidarslam(*arguments)
+    assert refused.exit_code == 2
+    assert message in refused.stderr
+
+
+def test_config_lists_them_with_what_they_are_and_what_they_need() -> None:
+    listed = lidarslam("config", "--list").stdout
+    for path in FILES:
+        assert re.search(rf"^  {path.stem} +{re.escape(headline(path))}$", listed, re.MULTILINE)
+    assert "--data: the root of the KITTI odometry benchmark, with sequences/NN and poses/NN.txt" in listed
+    assert f"The files are in {CONFIGS}\n" in listed
+
+
+def test_a_benchmark_without_its_data_says_what_it_needs() -> None:
+    refused = lidarslam("compare", "--benchmark", "kitti")
+    assert refused.exit_code == 1
+    assert (
+        "KITTI odometry benchmark: none of its recordings is in the current folder;"
+        " --data is the root of the KITTI odometry benchmark, with sequences/NN" in refused.stderr
+    )
+    elsewhere = lidarslam("compare", "--benchmark", "kitti", "--data", "/nowhere")
+    assert "none of its recordings is in /nowhere; --data is the root" in elsewhere.stderr
+
+
+def test_a_benchmark_of_ones_own_finds_its_recordings(place: Path, small_recording: Path) -> None:
+    (place / "mine.yaml").write_text(
+        "title: Mine\nrecordings: [{name: a, source: room}]\nmethods: [constant-velocity+map]\n"
+    )
+    compared = lidarslam("compare", "--benchmark", "mine.yaml", "--data", small_recording.parent)
+    assert compared.exit_code == 0
+    (out,) = (place / "compared").iterdir()
+    assert out.name.startswith("mine_")
+    refused = lidarslam("compare", "--benchmark", "mine.yaml")
+    assert "Mine: none of its recordings is in the current folder; name their folder with --data" in refused.stderr

@@ -1,0 +1,132 @@
+"""What a voxel of the map says of intensity, colour, ring and time is what its points say."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import PointAttributes
+from lidarslam.core.state import Saved, State
+from lidarslam.mapping.global_map import global_map as module
+from lidarslam.mapping.global_map.global_map import GlobalMap
+
+VOXEL_M = 0.5
+EPOCH = 1_700_000_000.0
+
+
+def some(rng: np.random.Generator, count: int, number: int, names: str = "intensity rgb ring time") -> PointAttributes:
+    """Attributes of a scan's points; every fifth has no intensity."""
+    intensity = rng.uniform(0.0, 65535.0, count).astype(np.float32)
+    intensity[::5] = np.nan
+    known = PointAttributes(
+        intensity=intensity,
+        rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        ring=rng.integers(0, 128, count).astype(np.int32),
+        time=EPOCH + 0.1 * number + rng.permutation(count) * 1e-4,
+    )
+    return known.only(names.split())  # type: ignore[arg-type]
+
+
+def cells(points: FloatArray) -> list[tuple[int, ...]]:
+    return [tuple(cell) for cell in np.floor(points / VOXEL_M).astype(int).tolist()]
+
+
+def test_equals_a_dictionary_of_voxels(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans with all, some and none of the attributes, merged many times; later ones bring new attributes."""
+    monkeypatch.setattr(module, "_MIN_PENDING", 500)
+    grid, plain = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
+    intensities: dict[tuple[int, ...], list[float]] = {}
+    colours: dict[tuple[int, ...], list[FloatArray]] = {}
+    firsts: dict[tuple[int, ...], tuple[float, int]] = {}
+    for number in rng.permutation(30):  # so that the earliest point may come last
+        points, T = rng.normal(0.0, 1.5, (200, 3)), exp(rng.normal(0.0, 0.3, 6))
+        wanted = "" if number < 5 else "intensity" if number < 10 else "intensity rgb ring time"
+        known = some(rng, len(points), int(number), wanted)
+        grid.add(points, T, known)
+        plain.add(points, T)
+        for n, cell in enumerate(cells(points @ T[:3, :3].T + T[:3, 3])):
+            if known.intensity is not None and np.isfinite(known.intensity[n]):
+                intensities.setdefault(cell, []).append(float(known.intensity[n]))
+            if known.rgb is not None:
+                colours.setdefault(cell, []).append(known.rgb[n].astype(float))
+            if known.time is not None and known.ring is not None:
+                first = float(known.time[n]), int(known.ring[n])
+                firsts[cell] = min(firsts.get(cell, (np.inf, -1)), first)
+    cloud = grid.cloud()
+    np.testing.assert_array_equal(cloud.points, plain.cloud().points)
+    np.testing.assert_array_equal(cloud.normals, plain.cloud().normals)
+    found = cloud.attributes
+    assert found.intensity is not None
+    assert found.rgb is not None
+    assert found.ring is not None
+    assert found.time is not None
+    kinds = set()
+    for n, cell in enumerate(cells(cloud.points)):
+        kinds.add((cell in intensities, cell in colours))
+        np.testing.assert_allclose(found.intensity[n], np.mean(intensities.get(cell, [np.nan])), rtol=1e-5)
+        np.testing.assert_allclose(found.rgb[n], np.mean(colours.get(cell, [np.zeros(3)]), axis=0), atol=0.501)
+        time, ring = firsts.get(cell, (np.inf, -1))
+        assert found.ring[n] == ring
+        assert found.time[n] == time or abs(found.time[n] - time) < 1e-5
+    assert kinds >= {(True, True), (True, False), (False, False)}
+
+
+def test_what_is_chosen_of_a_map_keeps_its_attributes(rng: np.random.Generator) -> None:
+    grid = GlobalMap(VOXEL_M)
+    points = VOXEL_M * (np.arange(40)[:, None] + 0.5) * [1.0, 0.0, 0.0]
+    numbers = np.arange(40, dtype=np.float32)
+    grid.add(points, np.eye(4), PointAttributes(intensity=numbers))
+    grid.add(points[::2], np.eye(4), PointAttributes(intensity=numbers[::2]))
+    left_out = rng.random(20) < 0.5
+    cloud = grid.cloud(min_hits=2, left_out=left_out)
+    assert cloud.attributes.intensity is not None
+    np.testing.assert_allclose(cloud.points[:, 0], points[::2][~left_out, 0], atol=1e-6)
+    np.testing.assert_array_equal(cloud.attributes.intensity, numbers[::2][~left_out])
+
+
+def test_a_map_of_submaps_has_the_attributes_of_their_scans(rng: np.random.Generator) -> None:
+    poses = [exp([0.0, 0.0, 0.0, x, 0.0, 0.0]) for x in (0.0, 2.0, 4.0)]  # whole voxels, so that they are cut alike
+    direct, drawn = GlobalMap(VOXEL_M), GlobalMap(VOXEL_M)
+    for number, (pose, names) in enumerate(zip(poses, ("", "intensity", "intensity rgb ring time"), strict=True)):
+        submap = GlobalMap(VOXEL_M)
+        for half in range(2):
+            points = rng.uniform(-3.0, 3.0, (1000, 3))
+            known = some(rng, len(points), 2 * number + half, names)
+            submap.add(points, np.eye(4), known)
+            direct.add(points, pose, known)
+        drawn.add_means(submap.means(), pose)
+    expected = dict(direct.cloud().attributes.present())
+    assert len(expected) == 4
+    for name, values in drawn.cloud().attributes.present():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-5, atol=1.0 if name == "rgb" else 1e-5)
+
+
+def test_attributes_go_on(
+    rng: np.random.Generator, through_disk: Callable[[State], Saved], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map that is saved and restored in between is the whole one, to the last bit."""
+    monkeypatch.setattr(module, "_MIN_PENDING", 1500)
+    scans = [
+        (rng.uniform(-3.0, 3.0, (1000, 3)), some(rng, 1000, number, names))
+        for number, names in enumerate(("", "intensity", "intensity", "intensity rgb ring time", "rgb"))
+    ]
+    whole = GlobalMap(VOXEL_M)
+    for points, known in scans:
+        whole.add(points, np.eye(4), known)
+    for after in range(len(scans)):
+        part, restored = GlobalMap(VOXEL_M), GlobalMap(1.0)
+        for points, known in scans[:after]:
+            part.add(points, np.eye(4), known)
+        restored.restore(through_disk(part.state()))
+        for points, known in scans[after:]:
+            restored.add(points, np.eye(4), known)
+        np.testing.assert_array_equal(restored.means().rows, whole.means().rows)
+        assert restored.means().layout == whole.means().layout
+
+
+def test_a_map_without_attributes_has_none() -> None:
+    grid = GlobalMap(VOXEL_M)
+    grid.add(np.ones((3, 3)), np.eye(4))
+    assert not list(grid.cloud().attributes.present())
+    assert grid.means().rows.shape == (1, 7)  # and takes no room for them
