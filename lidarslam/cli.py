@@ -19,11 +19,10 @@ from lidarslam.commands.info import info
 from lidarslam.commands.merge import merge
 from lidarslam.commands.run import run
 from lidarslam.commands.simulate import simulate
-from lidarslam.commands.terminal import EXIT_MENDABLE, note
+from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
 from lidarslam.commands.train import train
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
-from lidarslam.core.plain_text import printable
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.viewer.rerun_environment import keep_rerun_to_itself, leave_if_abandoned
 
@@ -43,6 +42,8 @@ class _Group(click.Group):
                 return super().invoke(ctx)
         except LidarSlamError as error:
             note(str(error))
+        except KeyboardInterrupt:
+            note("interrupted")
         except UnicodeEncodeError as error:
             note(f"{error.object}: the name is not valid Unicode; rename it")
         except MemoryError:
@@ -88,23 +89,16 @@ def _has_current_folder() -> bool:
     return True
 
 
-class _PlainFormatter(logging.Formatter):
-    """Log lines may hold names from recordings too."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
-
-
 @click.group(
     "lidarslam", cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.version_option(package_name="lidarslam", message="%(prog)s %(version)s")
-@click.option("-v", "--verbose", is_flag=True, help="Log more.")
-def main(verbose: bool) -> None:
+def main() -> None:
     """LiDAR SLAM: trajectories and maps of recordings, and their accuracy."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_PlainFormatter("lidarslam: %(message)s"))
-    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
+    prepare_log()
+
+
+main.params.append(verbose_option())
 
 
 for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, config):

@@ -4,6 +4,7 @@ Each scan is predicted from the last motion and the odometry, registered to the 
 inserted into the map. `mapping.tracking` has the cases in which the registration fails.
 """
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
+
+logger = logging.getLogger(__name__)
 
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2
@@ -132,6 +135,7 @@ class SurfelMapper(Stateful):
     def _new_map(self, scan: SampledScan, state: MotionState) -> SurfelMap:
         """A map of one scan."""
         surfel_map = SurfelMap(scan.cell_m, self._config.radius_m)
+        logger.info("new surfel map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
         _insert(scan, state, surfel_map)
         return surfel_map
 

@@ -224,7 +224,7 @@ def test_a_damaged_scan_is_left_out_and_counted(recording: Path, tmp_path: Path)
     assert summary["scans"] == 19
     assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == summary["scans"]
     (warning,) = (warning for warning in summary["warnings"] if "left out" in warning)
-    assert warning.startswith("1 scans were left out: they could not be read")
+    assert warning.startswith("1 scan was left out: it could not be read")
     assert "000012.npy" in warning
 
 

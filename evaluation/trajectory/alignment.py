@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, transform_points
 from lidarslam.core.trajectory import Trajectory
 
 AlignmentMethod = Literal["se3", "first_pose", "none"]
@@ -16,6 +16,8 @@ _LEAST_SPREAD_M = 0.01
 _LEAST_RELATIVE_SPREAD = 0.04
 # Weight of the orientations beside the positions' main direction: it affects only the unobservable rotation.
 _TIE_BREAK = 1e-8
+# Smaller errors are those of rounding, and say nothing of the weights.
+_LEAST_DISTANCE_M, _LEAST_ANGLE_RAD = 1e-3, 2e-4
 
 
 def align(estimate: Trajectory, reference: Trajectory, method: AlignmentMethod = "se3") -> FloatArray:
@@ -48,9 +50,7 @@ def align_se3(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     line therefore agree a little less closely than in the least-squares solution.
     """
     centre_estimate, centre_reference = estimate[:, :3, 3].mean(axis=0), reference[:, :3, 3].mean(axis=0)
-    p_estimate, p_reference = estimate[:, :3, 3] - centre_estimate, reference[:, :3, 3] - centre_reference
-    covariance = p_reference.T @ p_estimate / len(estimate)
-    orientations = np.einsum("nij,nkj->ik", reference[:, :3, :3], estimate[:, :3, :3]) / len(estimate)
+    covariance, orientations = _covariance(estimate, reference), _mean_difference(estimate, reference)
     U, spread_squared, Vt = np.linalg.svd(covariance)
     spread_m = np.sqrt(spread_squared)
     if spread_m[0] < _LEAST_SPREAD_M:
@@ -60,6 +60,47 @@ def align_se3(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     else:
         R = _nearest_rotation(covariance)
     return make_transform(R, centre_reference - R @ centre_estimate)
+
+
+def align_poses(
+    estimate: Trajectory, reference: Trajectory, T_reference_estimate: FloatArray, method: AlignmentMethod = "se3"
+) -> FloatArray:
+    """Maximum-likelihood `T_reference_estimate` (4, 4) by positions and orientations; of both the most certain counts.
+
+    Positions determine the rotation about an axis as well as their errors are small beside their distances from the
+    axis: on a straight stretch, or with a weak reference, not at all. Orientations determine all of it directly. With
+    isotropic errors, d the positions' RMS distance after their own alignment and a the RMS angle after that of the
+    orientations, the rotation minimises sum |p_ref - R p_est|^2 / d^2 + sum angle(R_ref, R R_est)^2 / a^2, the angle
+    by its chord. `first_pose` and `none` are what they are in `align`.
+
+    Args:
+        estimate, reference: of the same instants.
+        T_reference_estimate: that of `align`.
+        method: of `align`.
+    """
+    if method != "se3":
+        return T_reference_estimate
+    T_estimate, T_reference = estimate.T_world_lidar, reference.T_world_lidar
+    orientations = _mean_difference(T_estimate, T_reference)
+    aligned = transform_points(T_reference_estimate, estimate.positions)
+    distance_squared = np.mean(np.sum((aligned - reference.positions) ** 2, axis=1))
+    # Of a mean rotation M the nearest rotation R has the mean squared chord 2 (3 - trace(R^T M)), twice the angle's.
+    angle_squared = 3.0 - np.sum(_nearest_rotation(orientations) * orientations)
+    weight_m2 = max(distance_squared, _LEAST_DISTANCE_M**2) / (2.0 * max(angle_squared, _LEAST_ANGLE_RAD**2))
+    R = _nearest_rotation(_covariance(T_estimate, T_reference) + weight_m2 * orientations)
+    return make_transform(R, reference.positions.mean(axis=0) - R @ estimate.positions.mean(axis=0))
+
+
+def _covariance(estimate: FloatArray, reference: FloatArray) -> FloatArray:
+    """Of the positions of poses (N, 4, 4) about their means, reference to estimate (3, 3)."""
+    p_estimate, p_reference = (poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (estimate, reference))
+    return np.asarray(p_reference.T @ p_estimate / len(estimate), dtype=np.float64)
+
+
+def _mean_difference(estimate: FloatArray, reference: FloatArray) -> FloatArray:
+    """Mean (3, 3) of the rotations from the estimate's world to the reference's that make orientations coincide."""
+    products = np.einsum("nij,nkj->ik", reference[:, :3, :3], estimate[:, :3, :3])
+    return np.asarray(products / len(estimate), dtype=np.float64)
 
 
 def _nearest_rotation(M: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plain_text import count
 from lidarslam.core.trajectory import Trajectory
 
 # Interpolation over half a second at constant velocity errs by a * 0.5^2 / 8 at most, 6 cm when braking at 2 m/s^2.
@@ -93,7 +94,7 @@ def _explain(estimate: Trajectory, reference: Trajectory, matched: int, toleranc
 def _range(trajectory: Trajectory) -> str:
     if not len(trajectory):
         return "no pose"
-    return f"{len(trajectory)} pose(s) from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
+    return f"{count(len(trajectory), 'pose')} from {trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
 
 
 def _likely_cause(estimate: Trajectory, reference: Trajectory, tolerance_s: float, max_gap_s: float) -> str:

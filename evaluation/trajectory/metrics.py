@@ -1,13 +1,13 @@
 """Errors of a trajectory relative to a reference."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align
+from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, align_poses
 from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
 from lidarslam.evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
 
@@ -25,7 +25,9 @@ class TrajectoryErrors:
 
     length_m: float  # path length of the reference over the matched poses
     ate_rmse_m: float  # absolute trajectory error, the positions' root mean square distance after SE(3) alignment
-    ate_rotation_rmse_deg: float  # root mean square angle between the orientations after the same alignment
+    # root mean square angle between the orientations after alignment by positions and orientations: positions alone
+    # leave the rotation about a straight path open
+    ate_rotation_rmse_deg: float
     # relative pose error from one scan to the next; None when no two successive scans have a reference pose
     rpe_translation_rmse_m: float | None
     rpe_rotation_rmse_deg: float | None  # likewise for the rotation
@@ -42,11 +44,20 @@ class TrajectoryMetrics:
     """All errors of a trajectory."""
 
     association: Association  # the pairs of poses that were compared
-    T_reference_estimate: FloatArray  # (4, 4) the alignment of the ATE
+    T_reference_estimate: FloatArray  # (4, 4) the alignment of the ATE, by the positions
+    T_reference_estimate_joint: FloatArray  # (4, 4) that of the rotations, by positions and orientations
     errors: TrajectoryErrors  # absolute and relative errors
     kitti: KittiDrift | None  # KITTI's drift; None under 100 m
     segments: Mapping[int, Drift | None]  # metres -> drift over short segments; None where the reference is too short
     alignment: AlignmentMethod = "se3"  # how the alignment was found
+
+    def absolute_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Distance (M,) in metres and angle (M,) in radians of every pose, as in the ATE."""
+        return _by_both(absolute_errors, self.association, self.T_reference_estimate, self.T_reference_estimate_joint)
+
+    def deviations(self) -> tuple[FloatArray, FloatArray]:
+        """Translation (M, 3) and roll, pitch, yaw (M, 3) of every pose, see `deviations`."""
+        return _by_both(deviations, self.association, self.T_reference_estimate, self.T_reference_estimate_joint)
 
     def to_json(self) -> dict[str, object]:
         """The content of metrics.json, with no map compared."""
@@ -75,11 +86,14 @@ def evaluate_trajectory(
         InputError: fewer than three poses are of the same instant.
     """
     association = associate(estimate, reference, tolerance_s, max_gap_s)
-    T_reference_estimate = align(association.estimate, association.reference, alignment)
+    pair = association.estimate, association.reference
+    T_reference_estimate = align(*pair, alignment)
+    T_reference_estimate_joint = align_poses(*pair, T_reference_estimate, alignment)
     return TrajectoryMetrics(
         association=association,
         T_reference_estimate=T_reference_estimate,
-        errors=trajectory_errors(association, T_reference_estimate),
+        T_reference_estimate_joint=T_reference_estimate_joint,
+        errors=trajectory_errors(association, T_reference_estimate, T_reference_estimate_joint),
         kitti=kitti_drift(association),
         segments=short_drift(association),
         alignment=alignment,
@@ -97,9 +111,11 @@ def metrics_json(
     }
 
 
-def trajectory_errors(association: Association, T_reference_estimate: FloatArray) -> TrajectoryErrors:
-    """The absolute errors after the given alignment (4, 4), and the relative ones, which need none."""
-    distances_m, angles_rad = absolute_errors(association, T_reference_estimate)
+def trajectory_errors(
+    association: Association, T_reference_estimate: FloatArray, T_reference_estimate_joint: FloatArray
+) -> TrajectoryErrors:
+    """The absolute errors after the given alignments (4, 4), and the relative ones, which need none."""
+    distances_m, angles_rad = _by_both(absolute_errors, association, T_reference_estimate, T_reference_estimate_joint)
     step_distances_m, step_angles_rad = relative_errors(association)
     at_start = align(association.estimate, association.reference, "first_pose")
     end = at_start @ association.estimate.T_world_lidar[-1]
@@ -164,6 +180,16 @@ def disagreement(metrics: TrajectoryMetrics) -> str | None:
     if min(spread_m, own_spread_m) > 0.0 and max(spread_m / own_spread_m, own_spread_m / spread_m) > _OTHER_UNIT:
         return f"{message}, that of the trajectory {own_spread_m:.3g} m; are both in metres?"
     return f"{message}; tracking was lost, or the reference belongs to another recording or sensor"
+
+
+def _by_both(
+    errors: Callable[[Association, FloatArray], tuple[FloatArray, FloatArray]],
+    association: Association,
+    T_reference_estimate: FloatArray,
+    T_reference_estimate_joint: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of the positions after the one alignment, and of the orientations after the other."""
+    return errors(association, T_reference_estimate)[0], errors(association, T_reference_estimate_joint)[1]
 
 
 def _spread_m(trajectory: Trajectory) -> float:

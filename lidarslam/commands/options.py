@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarslam.commands.names import Registered, ShippedFile
-from lidarslam.commands.terminal import note
+from lidarslam.commands.terminal import note, verbose_option
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config
@@ -15,7 +15,12 @@ if TYPE_CHECKING:
 
 
 class CommandWithExample(click.Command):
-    """Keeps the line breaks of the examples in its help."""
+    """Keeps the line breaks of the examples in its help, and takes `-v`."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """The options, with `-v` before `--help`."""
+        *own, help_option = super().get_params(ctx)
+        return [*own, verbose_option(), help_option]
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         if self.epilog:

@@ -58,9 +58,9 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
     """Build trajectory and map of a recording."""
     from lidarslam.run.progress import show_progress
     from lidarslam.run.request import RunRequest
-    from lidarslam.run.resuming import lost_when_finished
+    from lidarslam.run.resuming import abandoned, lost_when_finished
     from lidarslam.run.run import execute
-    from lidarslam.run.summary_text import format_outcome
+    from lidarslam.run.summary_text import format_outcome, format_stop
     from lidarslam.storage.directory import RERUN
 
     if options["resume"] and options["overwrite"]:
@@ -72,14 +72,18 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
         say(f"{out}: is finished already")
         ctx.exit(EXIT_LOST if lost else 0)
     with serving() if request.rerun == "web" else contextlib.nullcontext() as page:
-        with show_progress(source.name) as progress:
-            outcome = execute(request, progress, page)
+        try:
+            with show_progress(source.name) as progress:
+                outcome = execute(request, progress, page)
+        except KeyboardInterrupt:
+            note(abandoned(out))
+            ctx.exit(EXIT_MENDABLE)
         say(format_outcome(out, outcome))
         if page is not None and outcome.stopped is None:
             say(f"serving {page.address} until Ctrl-C; later: lidarslam view {out / RERUN} --web")
             wait_for_interrupt()
     if outcome.stopped is not None:
-        note(f"stopped after {outcome.summary.scans} scans: {outcome.stopped}; continue with --resume")
+        note(format_stop(out, outcome))
         ctx.exit(EXIT_MENDABLE)
     if outcome.summary.went_astray:
         ctx.exit(EXIT_LOST)

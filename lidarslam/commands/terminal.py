@@ -1,6 +1,7 @@
-"""Output of the commands on the terminal, and their exit status."""
+"""Output of the commands on the terminal, `-v`, and their exit status."""
 
 import contextlib
+import logging
 import signal
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -45,3 +46,29 @@ def _announce(address: str) -> None:
     port = address.rpartition(":")[2]
     say(address)
     say(f"for browsers on this machine, until Ctrl-C; on another, first ssh -L {port}:127.0.0.1:{port} to this one")
+
+
+class _StandardError(logging.Handler):
+    """Log lines as the other lines of the program; above a progress bar, where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(printable(self.format(record)), err=True)
+
+
+def prepare_log() -> None:
+    """Send warnings to standard error; may be called again."""
+    handler = _StandardError()
+    handler.setFormatter(logging.Formatter("lidarslam: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+
+
+def _log_more(_ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
+    if is_asked:
+        logging.getLogger("lidarslam").setLevel(logging.INFO)
+
+
+def verbose_option() -> click.Option:
+    """The option `-v`, of the program and of each command."""
+    return click.Option(
+        ["-v", "--verbose"], is_flag=True, expose_value=False, callback=_log_more, help="Log what is chosen and done."
+    )

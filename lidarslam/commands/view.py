@@ -1,7 +1,7 @@
 """`lidarslam view`: finished runs, raw scans and Rerun recordings."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,6 @@ from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
 from lidarslam.core.errors import InputError
 
 if TYPE_CHECKING:
-    from lidarslam.core.scan import Scan
-    from lidarslam.datasets.recording import Recording
-    from lidarslam.viewer.rerun_output import Show
     from lidarslam.viewer.web_page import WebPage
 
 _RRD = ".rrd"
@@ -68,10 +65,12 @@ def view(
     places = places or (latest_run(),)
     if picture is not None:
         _draw(places, picture, oblique)
-    elif any(place.suffix == _RRD for place in places):
+    elif any(place.suffix.lower() == _RRD for place in places):
         if len(places) > 1 or save is not None:
             raise click.UsageError(f"a {_RRD} file is shown alone, in a window or with --web")
         _replay(places[0], web)
+    elif save is not None and save.suffix.lower() != _RRD:
+        raise InputError(f"{save}: a Rerun recording must end in {_RRD}; for a picture use --picture {save}")
     else:
         _show(_to_show(ctx, places, options), web, save)
 
@@ -85,7 +84,7 @@ def _replay(file: Path, web: bool) -> None:
         show_file_in_window(file)
 
 
-def _show(show: "Show", web: bool, file: Path | None) -> None:
+def _show(show: Any, web: bool, file: Path | None) -> None:
     from lidarslam.viewer.rerun_output import save, show_in_window, show_on_page
 
     if file is not None:
@@ -103,7 +102,8 @@ def _serve(show: "Callable[[WebPage], None]") -> None:
         wait_for_interrupt()
 
 
-def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, Any]) -> "Show":
+def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, Any]) -> Any:
+    """What is shown; its type is not named because that would import Rerun."""
     from lidarslam.compare.assessment.inputs import truth_of_run
     from lidarslam.config.settings import load_config
     from lidarslam.datasets.registry import is_recording
@@ -121,32 +121,16 @@ def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, An
     return show_runs(finished, truth_of_run(places[0]), config)
 
 
-def _scans(source: Path, options: dict[str, Any]) -> "Show":
+def _scans(source: Path, options: dict[str, Any]) -> Any:
     from lidarslam.datasets.intake import choose_scans
     from lidarslam.datasets.registry import open_recording
+    from lidarslam.run.progress import show_count
     from lidarslam.viewer.rerun_scans import show_scans
 
     config = take_config(options, source)
     recording = open_recording(source, config.reader)
     chosen = choose_scans(recording, source, options["start"], options["stop"], options["step"])
-    return show_scans(source.name, _read(recording, source, chosen), recording.ground_truth, config.viewer)
-
-
-def _read(recording: "Recording", source: Path, chosen: range) -> "Iterator[Scan]":
-    """The scans, with a progress bar and notes on what is wrong with them."""
-    from lidarslam.datasets.faults import Faults
-    from lidarslam.datasets.intake import take_in
-    from lidarslam.run.progress import show_count
-
-    faults, number = Faults(), 0
-    with show_count(source.name) as count:
-        for number, scan in enumerate(take_in(recording, chosen, faults), start=1):
-            yield scan
-            count(number, len(chosen))
-    for warning in (*recording.warnings, *faults.warnings()):
-        note(warning)
-    if not number:
-        raise InputError(f"{source}: no scan can be read")
+    return show_scans(recording, source, chosen, config.viewer, show_count, note)
 
 
 def _draw(runs: tuple[Path, ...], picture: Path, oblique: bool) -> None:

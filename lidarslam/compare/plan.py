@@ -88,6 +88,8 @@ def _check_folder(request: CompareRequest, planned: list[PlannedRecording]) -> N
         raise OutputError(f"{out}: a file is in the way; name another directory")
     if any(out.resolve() == recording.source.resolve() for recording in planned):
         raise OutputError(f"{out}: is the recording itself; name another directory for the comparison")
+    if (out / files.TRAJECTORY_TUM).is_file() and (out / files.CONFIG).is_file():
+        raise OutputError(f"{out}: holds a run; name another directory for the comparison")
     if request.overwrite or request.reuse:
         return
     folders = [run.out for recording in planned for run in recording.runs]

@@ -33,5 +33,13 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
+def small_length(metres: float) -> str:
+    """A length in the unit that suits it: 24 cm, 0.5 mm."""
+    for factor, unit in ((1.0, "m"), (100.0, "cm")):
+        if round(factor * metres, 6) >= 1.0:
+            return f"{factor * metres:.3g} {unit}"
+    return f"{1000.0 * metres:.2g} mm"
+
+
 def _spelt(match: re.Match[str]) -> str:
     return match.group().encode("unicode_escape").decode("ascii")

@@ -19,6 +19,19 @@ _LONGEST_BYTES = 1 << 30
 # Survey coordinates are far below; squares of much larger numbers overflow.
 _FARTHEST_M = 1e9
 
+_FORMATS = {
+    8: "; a TUM trajectory has lines `stamp tx ty tz qx qy qz qw`",
+    12: "; a KITTI trajectory has the first three rows of a pose matrix a line",
+}
+# By the columns that were expected and those that came.
+_OTHER_FORMAT = {
+    (8, 12): (
+        "; it is in KITTI's format, which has no stamps, and often holds the poses of a camera: give the LiDAR's as TUM"
+        " text, a line `stamp tx ty tz qx qy qz qw` for each scan"
+    ),
+    (12, 8): "; it looks like a TUM trajectory, `stamp tx ty tz qx qy qz qw`",
+}
+
 
 def parse_numbers(path: Path, columns: int) -> FloatArray:
     """The (N, columns) numbers of a text file; commas count as blanks.
@@ -42,9 +55,12 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
         try:
             row = [float(word) for word in words]
         except ValueError:
-            raise InputError(f"{path}:{number}: expected {columns} numbers, got {line.strip()[:60]!r}") from None
+            raise InputError(
+                f"{path}:{number}: expected {columns} numbers, got {line.strip()[:60]!r}{_FORMATS.get(columns, '')}"
+            ) from None
         if len(row) != columns:
-            raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}")
+            hint = _OTHER_FORMAT.get((columns, len(row)), _FORMATS.get(columns, ""))
+            raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}{hint}")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
 

@@ -13,6 +13,22 @@ T = TypeVar("T")
 
 NO_POINT_TIME = "scans have no usable times of their points and are taken as measured at one instant"
 _UNREADABLE = "scans were left out: they could not be read"
+# Of the kinds, for a single scan.
+_SINGULAR = (
+    ("scans of more than 1,048,576 points were", "scan of more than 1,048,576 points was"),
+    ("scans were", "scan was"),
+    ("scans are", "scan is"),
+    ("scans have", "scan has"),
+    ("scans look", "scan looks"),
+    ("places in the bag were", "place in the bag was"),
+    ("they co", "it co"),
+    ("it come", "it comes"),
+    ("their stamps were", "its stamp was"),
+    ("their stamps are", "its stamp is"),
+    ("and are taken", "and is taken"),
+    ("and carry", "and carries"),
+    ("their points", "its points"),
+)
 
 
 @dataclass
@@ -39,7 +55,15 @@ class Faults:
 
     def warnings(self) -> tuple[str, ...]:
         """A line for each kind, with its count, in the order they were met."""
-        return tuple(f"{count} {kind}; the first: {self._first[kind]}" for kind, count in self._counts.items())
+        return tuple(f"{_counted(n, kind)}; the first: {self._first[kind]}" for kind, n in self._counts.items())
+
+
+def _counted(number: int, kind: str) -> str:
+    """The number and the kind, which is written for several scans."""
+    if number == 1:
+        for several, one in _SINGULAR:
+            kind = kind.replace(several, one)
+    return f"{number:,} {kind}"
 
 
 def readable_scans(items: Iterable[T], read: Callable[[T], Scan], faults: Faults | None) -> Iterator[Scan]:

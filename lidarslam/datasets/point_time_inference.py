@@ -59,6 +59,10 @@ def learn_point_time(
         is_clear = cloud.stamp is None or abs(cloud.stamp) > 2 * CLOCK_LIMIT_S
         if (found is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
             break
+    if model is None:
+        logger.info("time of a point: none is known; scans are taken as measured at one instant, or compensated")
+    else:
+        logger.info("time of a point: field %r in %s, %s", model.field, model.unit, model.reference)
     return model
 
 

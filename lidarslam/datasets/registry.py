@@ -1,5 +1,6 @@
 """The readers and the choice among them; a reader's module is imported on use."""
 
+import logging
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -8,6 +9,9 @@ from typing import NamedTuple, cast
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.unrecognised import absent, result_of_program, unrecognised
+
+logger = logging.getLogger(__name__)
 
 # Of rosbag2; a recorder that was killed leaves such a file without the metadata.yaml beside it.
 _BAG_SUFFIXES = (".db3", ".mcap")
@@ -67,25 +71,37 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror}); check its permissions") from error
     if not exists:
-        raise InputError(f"{source}: no such file or folder")
+        raise InputError(absent(source))
     if name is not None:
         if name not in READERS:
             raise InputError(f"no reader is called {name!r}; there are: {', '.join(READERS)}")
+        logger.info("reader: %s, as it was named", name)
         return name
-    for candidate, reader in READERS.items():
-        if reader.recognises(source):
-            return candidate
-    if source.is_dir() and not any(source.iterdir()):
+    if (result := result_of_program(source)) is not None:
+        raise InputError(result)
+    if (found := _recognise(source)) is not None:
+        logger.info("reader: %s, because the names fit: %s", found, READERS[found].reads)
+        return found
+    if source.is_dir() and all(entry.name.startswith(".") for entry in source.iterdir()):
         raise InputError(f"{source}: the folder is empty; name the one with the recording")
     if source.suffix.lower() in SCAN_SUFFIXES:
-        raise InputError(f"{source}: is a single scan; give the folder it lies in")
+        raise InputError(
+            f"{source}: is a single point cloud; give the folder with the scans, {source.absolute().parent}?"
+        )
+    if (other := unrecognised(source, _recognise)) is not None:
+        raise InputError(other)
     layouts = "; ".join(reader.reads for reader in READERS.values())
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
 
 
 def is_recording(source: Path, name: str | None = None) -> bool:
     """Whether a reader was named for an existing source, or one recognises it."""
-    return source.exists() and (name is not None or any(reader.recognises(source) for reader in READERS.values()))
+    return source.exists() and (name is not None or _recognise(source) is not None)
+
+
+def _recognise(source: Path) -> str | None:
+    """The first reader in the table that recognises a path by its names."""
+    return next((name for name, reader in READERS.items() if reader.recognises(source)), None)
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:

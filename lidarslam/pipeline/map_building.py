@@ -1,5 +1,6 @@
 """Building the global map: each scan is added one scan late, once the motion it was deskewed with is confirmed."""
 
+import logging
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -14,6 +15,8 @@ from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.slides.slides import SlideCheck
 from lidarslam.pipeline.estimates import Localised, SweepMotion
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,9 @@ class MapBuilder(Stateful):
             return scan
         if self.voxel_size_m is None:
             self.voxel_size_m = voxel_size_for(scan.points)
+            logger.info(
+                "voxels of the map: %.3g m, 1/50 of the first scan's median range, from 5 to 25 cm", self.voxel_size_m
+            )
         thinned = scan.select(one_per_cell(scan.points, self.voxel_size_m))
         squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
         return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import OutputError
+from lidarslam.core.plain_text import count
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
@@ -71,6 +72,7 @@ class Checkpoints:
                 "log": self._log.state(),
             }
             write_state(self._unfinished.state, state)
+            logger.info("checkpoint after %s", count(len(self._log), "scan"))
         except (OutputError, OSError) as error:
             logger.info("%s", error)
             self._log.warn(f"a checkpoint could not be saved, so that --resume would go back further: {error}")

@@ -1,5 +1,6 @@
 """The pose graph of a run: begun with it, and in the end trajectory and map corrected by it."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from lidarslam.viewer.viewer import Viewer
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.correction import Corrected
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def close_loops(
     """Correct the log, and show it, once all scans are there; None where there is nothing to correct."""
     if graph is None or global_map is None:
         return None
+    logger.info("optimising the pose graph")
     closed = _corrected(graph, graph.finish(), global_map.voxel_size_m, log)
     if closed is not None:
         pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]

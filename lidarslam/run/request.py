@@ -1,13 +1,18 @@
 """The request for a run."""
 
+import logging
+import os
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from lidarslam.config.settings import Config
+from lidarslam.core.plain_text import count
 from lidarslam.mapping.config import MapFormat
 from lidarslam.viewer.viewer import RerunMode
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,24 @@ class RunRequest:
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued
     resumable: bool = True  # whether checkpoints are saved
     report: bool = False  # whether a page and pictures are drawn, once all else is written
+
+
+def log_choices(request: RunRequest, scans: range, recorded: int) -> None:
+    """Log what a run is about to do."""
+    config = request.config
+    logger.info("%s of %s, to %s", count(len(scans), "scan"), f"{recorded:,}", request.out)
+    logger.info(
+        "odometry: %s; mapping: %s; pose graph: %s",
+        config.odometry.method,
+        config.mapping.method,
+        "on" if config.pose_graph.enabled else "off",
+    )
+    logger.info(
+        "%s of %s; OMP_NUM_THREADS %s, NUMBA_NUM_THREADS %s",
+        count(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, "core"),
+        os.cpu_count(),
+        *(os.environ.get(name, "not set") for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")),
+    )
 
 
 def describe_run(request: RunRequest) -> dict[str, Any]:

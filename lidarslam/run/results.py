@@ -1,11 +1,13 @@
 """The results of a run: trajectories, map, pose graph, metrics and summary are written to its directory."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import inverse
+from lidarslam.core.plain_text import count
 from lidarslam.core.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
@@ -21,6 +23,8 @@ from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class RunOutcome:
@@ -29,6 +33,7 @@ class RunOutcome:
     summary: RunSummary  # the run in numbers
     metrics: TrajectoryMetrics | None  # its errors; None without ground truth
     stopped: str | None = None  # why it ended before its last scan, None when it did not
+    is_resumable: bool = False  # whether it can be continued from a checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,7 @@ def write_results(
         map_formats: further formats of the map.
     """
     log = tracked.log
+    logger.info("writing the results of %s", count(len(log), "scan"))
     directory.write_text(files.CONFIG, dump_yaml(config, described))
     if closed is not None:
         directory.write_text(files.POSE_GRAPH, format_g2o(closed.keyframe_poses, closed.edges))

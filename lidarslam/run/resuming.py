@@ -64,6 +64,15 @@ def lost_when_finished(request: RunRequest) -> bool | None:
     return lost
 
 
+def abandoned(out: Path) -> str:
+    """What is left of a run that an interruption ended without results, and what to do."""
+    if (out / files.STATE).is_file():
+        return f"{out}: interrupted, no results were written; continue from the last checkpoint with --resume"
+    if (out / files.ABOUT).is_file():
+        return f"{out}: interrupted, no results were written and there is no checkpoint yet; repeat with --overwrite"
+    return "interrupted; nothing was kept"
+
+
 def scans_left(scans: Iterator[Scan], held: Scan, odometry: Odometry, saved: Saved) -> Iterator[Scan]:
     """The scans after the one that was read last; the odometry is restored.
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +13,9 @@ from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
+from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
-from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.request import RunRequest, describe_run, log_choices
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.resuming import describe_computed
 from lidarslam.run.scan_log import ScanLog
@@ -49,26 +51,32 @@ def execute(request: RunRequest, progress: Progress, page: WebPage | None = None
     config = request.config
     recording = open_recording(request.source, config.reader)
     chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
-    with ExitStack() as stack:
-        odometry = open_odometry(config, request.prior)
-        stack.callback(odometry.close)
-        directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
-        unfinished = None
-        if request.resumable:
-            description = describe_computed(request, recording)
-            unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
-        log, graph = ScanLog(), _open_graph(config, directory, unfinished)
-        if graph is not None:
-            stack.callback(graph.close)
-        with _viewing(request, recording.name, directory, log, page) as viewer:
-            tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
-            closed = close_loops(graph, tracked.global_map, log, viewer)
-            drawn = final_map(tracked, closed, config.global_map)
-            if drawn.cloud is not None:
-                viewer.show_final_map(drawn.cloud.points)
-        outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, request.map_formats)
-    if unfinished is not None:
-        unfinished.end(outcome.stopped is not None)
+    log_choices(request, chosen, len(recording))
+    with Interruptions() as interruptions:
+        with ExitStack() as stack:
+            odometry = open_odometry(config, request.prior)
+            stack.callback(odometry.close)
+            directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
+            unfinished = None
+            if request.resumable:
+                description = describe_computed(request, recording)
+                unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
+            log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+            if graph is not None:
+                stack.callback(graph.close)
+            with _viewing(request, recording.name, directory, log, page) as viewer:
+                tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
+                interruptions.protect_results()
+                closed = close_loops(graph, tracked.global_map, log, viewer)
+                drawn = final_map(tracked, closed, config.global_map)
+                if drawn.cloud is not None:
+                    viewer.show_final_map(drawn.cloud.points)
+            described = describe_run(request)
+            outcome = write_results(directory, config, described, tracked, closed, drawn, request.map_formats)
+        if unfinished is not None:
+            unfinished.end(outcome.stopped is not None)
+            is_resumable = outcome.stopped is not None and unfinished.state.is_file()
+            outcome = replace(outcome, is_resumable=is_resumable)
     if request.report:
         from lidarslam.viewer.page.run_report import Accuracy, leave_report
 

@@ -4,12 +4,14 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.plain_text import count
+from lidarslam.core.plain_text import count, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
 from lidarslam.storage.directory import SCANS_CSV, SUMMARY
 
+# A speed that differs less is that of the recording.
+_ALIKE = 1.05
 # Stretches of lost scans that are listed; summary.json has them all.
 _LISTED = 3
 
@@ -19,12 +21,21 @@ def format_outcome(out: Path, outcome: RunOutcome) -> str:
     return "\n".join(_lines(out, outcome))
 
 
+def format_stop(out: Path, outcome: RunOutcome) -> str:
+    """A line about a run that ended before its last scan."""
+    done = f"stopped after {count(outcome.summary.scans, 'scan')}: {outcome.stopped}"
+    if outcome.is_resumable:
+        return f"{done}; continue with --resume"
+    return f"{done}; {out} holds the results so far, but no checkpoint to continue from; --overwrite begins again"
+
+
 def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
-    speed = "" if summary.realtime_factor is None else f", {summary.realtime_factor:.1f} times real time"
     total = summary.ms_per_scan["total"]
-    yield f"{total.median:.0f} ms a scan (95 %: {total.p95:.0f} ms){speed}, {summary.peak_rss_mb:.0f} MB"
+    speed = _speed(summary.realtime_factor)
+    memory = f"{summary.peak_rss_mb:,.0f} MB of memory"
+    yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms){speed}, {memory}"
     yield format_map(summary.map)
     if summary.graph is not None:
         yield _loops(summary.graph)
@@ -39,15 +50,25 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield f"      {shlex.join(['lidarslam', 'evaluate', str(out)])}"
 
 
+def _speed(realtime_factor: float | None) -> str:
+    """By the time of all scans, the slow first one included."""
+    if realtime_factor is None or realtime_factor <= 0.0:
+        return ""
+    times = max(realtime_factor, 1.0 / realtime_factor)
+    if times < _ALIKE:
+        return ", as fast as recorded"
+    return f", {times:.1f} times {'faster' if realtime_factor > 1.0 else 'slower'} than recorded"
+
+
 def format_map(written: WrittenMap) -> str:
     """A line about a map."""
     if written.voxel_size_m is None:
         return "no map: no scan was registered"
-    voxel_cm = 100.0 * written.voxel_size_m
     fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
-    return f"map of {count(written.points, 'point')}, voxels of {voxel_cm:.0f} cm{fields}{moved}{entropy}"
+    voxels = f"voxels of {small_length(written.voxel_size_m)}"
+    return f"map of {count(written.points, 'point')}, {voxels}{fields}{moved}{entropy}"
 
 
 def _loops(graph: GraphSummary) -> str:
@@ -59,7 +80,10 @@ def _loops(graph: GraphSummary) -> str:
 
 def _accuracy(metrics: TrajectoryMetrics) -> Iterator[str]:
     errors = metrics.errors
-    yield f"against ground truth: ATE {errors.ate_rmse_m:.3f} m, {errors.ate_rotation_rmse_deg:.2f} deg"
+    steps = ""
+    if errors.rpe_translation_rmse_m is not None and errors.rpe_rotation_rmse_deg is not None:
+        steps = f"; from scan to scan {errors.rpe_translation_rmse_m:.3f} m, {errors.rpe_rotation_rmse_deg:.2f} deg"
+    yield f"against ground truth: ATE {errors.ate_rmse_m:.3f} m, {errors.ate_rotation_rmse_deg:.2f} deg{steps}"
     if metrics.kitti is not None:
         drift = metrics.kitti.overall
         yield f"KITTI drift {drift.translation_percent:.2f} %, {100.0 * drift.rotation_deg_per_m:.2f} deg per 100 m"

@@ -10,6 +10,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse
+from lidarslam.core.plain_text import count
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
@@ -102,8 +103,10 @@ def track(
             log.warn(warning)
     error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     if not log.points_read:
+        if isinstance(error, KeyboardInterrupt):
+            raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)
         why = "; ".join(_why_none(log, faults, error))
-        raise NoScanError(f"{request.source}: no scan could be used: {why}", isinstance(error, KeyboardInterrupt))
+        raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
     built = pipeline.map
     return Tracked(recording, truth, log, len(chosen), faults, built.global_map, built.views, built.slides.tests, error)
 
@@ -131,7 +134,7 @@ def _process(
                     viewer.show_map(pipeline.map.global_map.points())
                 progress(len(log), result)
     except (InputError, KeyboardInterrupt) as error:
-        log.warn(f"stopped after {len(log)} scans: {_reason(error)}")
+        log.warn(f"stopped after {count(len(log), 'scan')}: {_reason(error)}")
         return error.with_traceback(None)  # whose frames hold maps and scans
     return None
 
@@ -156,9 +159,10 @@ def _reason(error: InputError | KeyboardInterrupt) -> str:
     return str(error) or "interrupted"
 
 
-def _why_none(log: ScanLog, faults: Faults, error: InputError | KeyboardInterrupt | None) -> Iterator[str]:
+def _why_none(log: ScanLog, faults: Faults, error: InputError | None) -> Iterator[str]:
     if error is not None:
         yield _reason(error)
     yield from faults.warnings()
     if len(log):
-        yield f"{len(log)} scans without a valid point, {log.points_dropped} invalid ones (NaN, at the origin, too far)"
+        invalid = count(log.points_dropped, "invalid point")
+        yield f"{count(len(log), 'scan')} without a valid point, {invalid} (NaN, at the origin, too far)"

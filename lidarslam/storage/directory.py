@@ -52,6 +52,7 @@ FILES = (
 # The checkpoint of a run that is at work or was stopped, see `lidarslam.storage.unfinished`.
 UNFINISHED = "unfinished"
 ABOUT = f"{UNFINISHED}/run.json"
+STATE = f"{UNFINISHED}/state.npz"
 
 
 class RunDirectory:

@@ -20,8 +20,10 @@ from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
+from lidarslam.datasets.unrecognised import absent
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
+from lidarslam.storage.not_a_run import not_a_run
 from lidarslam.storage.unfinished import require_whole
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
@@ -68,7 +70,7 @@ def read_trajectory(path: Path) -> Trajectory:
     require_whole(path)
     file = path / files.TRAJECTORY_TUM
     if not file.is_file():
-        raise InputError(f"{path}: not a run directory (no {files.TRAJECTORY_TUM}); make one with lidarslam run")
+        raise InputError(not_a_run(path))
     trajectory, scans = read_tum(file), read_summary(path).get("scans")
     if scans not in (None, len(trajectory)):
         raise InputError(
@@ -86,8 +88,10 @@ def load_map(path: Path) -> PointCloud:
     """
     file = path / files.MAP_PLY if path.is_dir() else path
     if not path.exists():
-        raise InputError(f"{path}: no such file")
+        raise InputError(absent(path))
     require_whole(path)
+    if path.is_dir() and not file.is_file() and not (path / files.TRAJECTORY_TUM).is_file():
+        raise InputError(not_a_run(path))
     if not file.is_file() or not file.stat().st_size:
         return PointCloud(np.empty((0, 3)), np.empty((0, 3)))
     read = _CLOUD_READERS.get(file.suffix.lower())

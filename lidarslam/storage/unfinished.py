@@ -10,10 +10,10 @@ from typing import Any, Literal
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
 from lidarslam.core.state import Saved
-from lidarslam.storage.directory import ABOUT, FILES, UNFINISHED, RunDirectory
+from lidarslam.storage.directory import ABOUT, FILES, STATE, UNFINISHED, RunDirectory
 from lidarslam.storage.state_file import read_state
 
-_STATE, _SUBMAPS = "state.npz", "submaps.bin"
+_SUBMAPS = "submaps.bin"
 # Differences to another run that an error lists.
 _LISTED = 3
 
@@ -112,7 +112,7 @@ class Unfinished:
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
         self._folder = run / UNFINISHED
-        self.state, self.submaps = self._folder / _STATE, self._folder / _SUBMAPS
+        self.state, self.submaps = run / STATE, self._folder / _SUBMAPS
         self.saved: Saved | None = None
 
     @classmethod

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 
+from lidarslam.core.plain_text import count
 from lidarslam.odometry.training.training import Validation
 from lidarslam.run.machine import as_typed
 
@@ -22,13 +23,12 @@ def format_step(step: int, steps: int, losses: Mapping[str, float], pairs_per_s:
 
 def format_validation(step: int, result: Validation, is_best: bool) -> str:
     """Errors on held-out recordings."""
+    validation = f"validation after {count(step, 'step')}"
     if not result.pairs:
-        return (
-            f"validation after {step:,} steps: no held-out pair could be aligned, so there is nothing to compare with"
-        )
+        return f"{validation}: no held-out pair could be aligned, so there is nothing to compare with"
     covered = ", ".join(f"{percent:.0f}" for percent in result.covered_percent)
     return (
-        f"validation after {step:,} steps: {format_errors(result)} from scan to scan, over {result.pairs:,} pairs;"
+        f"{validation}: {format_errors(result)} from scan to scan, over {count(result.pairs, 'pair')};"
         f" {covered} % of the errors within 1, 2, 3 standard deviations{'; the best so far' if is_best else ''}"
     )
 
@@ -45,7 +45,7 @@ def format_outcome(out: Path, weights: Path, steps: int, best: Validation | None
     """The path of the weights, their errors, and the commands that use them."""
     errors = "" if best is None else f", on held-out scans {format_errors(best)}"
     lines = [
-        f"{steps:,} steps done; weights written to {weights}{errors}",
+        f"{count(steps, 'step')} done; weights written to {weights}{errors}",
         f"use them:   {as_typed('lidarslam')} run SOURCE --weights {weights}",
         f"curves:     {as_typed('tensorboard')} --logdir {out / 'tensorboard'}",
     ]

@@ -10,6 +10,7 @@ import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -167,9 +168,9 @@ def _is_date(stamp: float) -> bool:
     return bool(stamp >= _FIRST_DATE_S)
 
 
-def every_nth(points: FloatArray, count: int) -> FloatArray:
-    """So many points (N, 3) at most."""
-    return points[:: max(1, -(-len(points) // count))]
+def every_nth(rows: NDArray[Any], count: int) -> NDArray[Any]:
+    """So many rows at most."""
+    return rows[:: max(1, -(-len(rows) // count))]
 
 
 def _disconnect(recording: rr.RecordingStream, file: "_PipedFile | None") -> None:

@@ -4,6 +4,7 @@ Precision comes before recall: a false closure tears a map apart, a missed one l
 that drift cannot explain is rejected within a segment; where tracking was lost, a new segment begins.
 """
 
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -15,6 +16,8 @@ from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
 from lidarslam.mapping.loops.verification import MIN_INLIERS, Verification, verify
+
+logger = logging.getLogger(__name__)
 
 # Way after a closure before the next is looked for: another would repeat it.
 _SPACING_M = 2.0
@@ -92,6 +95,8 @@ class LoopDetector(Stateful):
             closure = _closure(candidate, index, found)
             reason = found.objection(self._config.min_overlap)
             reason = reason or objection_to_drift(closure, closure.by_appearance, self._database.track)
+            pair = f"loop closure between keyframes {closure.first} and {index}"
+            logger.info("%s: %s (overlap %.2f)", pair, reason or "verified", found.overlap)
             if reason:
                 decided.append(replace(closure, reason=reason))
                 continue

@@ -183,7 +183,7 @@ def test_a_database_whose_rows_are_no_messages(write_drive, data, indexed):
     with closing(sqlite3.connect(file)) as database, database:
         database.execute("UPDATE messages SET data = ? WHERE id = 4", (data,))
     if indexed:
-        told = f"1 scans were left out: they could not be read; the first: {file}: a message that is no bytes"
+        told = f"1 scan was left out: it could not be read; the first: {file}: a message that is no bytes"
         assert_all_but(open_recording(file), points, [3], told)
         return
     reports = []
@@ -285,7 +285,7 @@ def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive,
 def test_behind_the_damaged_header_of_a_chunk_the_next_one_is_read(write_drive):
     file, _, points = write_drive("mcap", **BIG)
     overwrite(file, chunks_of(file)[1][0] - 24, bytes([255]) * 24)
-    assert_all_but(open_recording(file), points, [2, 3], "1 damaged places", "2 scans are missing")
+    assert_all_but(open_recording(file), points, [2, 3], "1 damaged place", "2 scans are missing")
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
@@ -294,7 +294,7 @@ def test_messages_recorded_at_one_instant_are_each_read_once(write_drive, kind):
     file, _, points = write_drive(kind, **BIG, recorded_ns=lambda i: STAMP_NS + PERIOD_NS * (i > 1))
     begin, length = chunks_of(file)[2]
     overwrite(file, begin, bytes(length))
-    assert_all_but(open_recording(file), points, [4, 5], "1 damaged places", "2 scans are missing")
+    assert_all_but(open_recording(file), points, [4, 5], "1 damaged place", "2 scans are missing")
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
@@ -312,8 +312,8 @@ def test_a_damaged_chunk_is_counted_once_for_each_topic(make_bag_kit, make_sweep
         scans = list(open_recording(file, ReaderConfig(topic=topic)).scans(faults=faults))
         assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in times]
         assert [warning.split(";")[0] for warning in faults.warnings()] == [
-            "1 damaged places in the bag were passed over",
-            "1 scans are missing that the index lists",
+            "1 damaged place in the bag were passed over",
+            "1 scan is missing that the index lists",
         ]
 
 
@@ -367,7 +367,7 @@ def test_a_damaged_message_that_was_compressed_by_itself_costs_no_other(write_dr
         assert len(places) == 6
         overwrite(file, places[damaged] + 4, b"\xff" * 40)
     recording = open_recording(folder)
-    told = f"1 scans were left out: they could not be read; the first: {folder}: a compressed message is damaged ("
+    told = f"1 scan was left out: it could not be read; the first: {folder}: a compressed message is damaged ("
     assert_all_but(recording, points, [damaged], told)
     assert recording.describe().first_stamp == stamp_ns(damaged == 0) / 10**9
 
@@ -376,7 +376,7 @@ def test_a_damaged_chunk_of_compressed_messages_costs_no_other(write_drive):
     file, folder, points = write_drive("mcap", **BIG, compression=(CompressionMode.MESSAGE, CompressionFormat.ZSTD))
     begin, length = chunks_of(file)[1]
     overwrite(file, begin, bytes(length))
-    assert_all_but(open_recording(folder), points, [3, 4, 5], "1 damaged places", "3 scans are missing")
+    assert_all_but(open_recording(folder), points, [3, 4, 5], "1 damaged place", "3 scans are missing")
 
 
 def test_a_damaged_file_that_was_compressed_as_a_whole_is_told(write_drive):

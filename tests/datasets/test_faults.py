@@ -25,7 +25,7 @@ def test_each_kind_is_counted_and_its_first_remembered():
     assert faults.left_out == 6
     assert faults.warnings() == (
         "2 scans look odd; the first: scan 1",
-        "1 scans were left out: too old; the first: scan 3",
+        "1 scan was left out: too old; the first: scan 3",
         "5 scans are missing; the first: the index",
     )
 

@@ -32,7 +32,7 @@ def test_a_scan_of_ten_million_points_is_thinned_and_said(rng):
     assert 400_000 < len(scan) <= 1 << 20
     np.testing.assert_array_equal(scan.time_offsets, scan.points[:, 0] / 1000.0)
     assert faults.left_out == 0
-    assert faults.warnings()[0].startswith("1 scans of more than 1,048,576 points were thinned")
+    assert faults.warnings()[0].startswith("1 scan of more than 1,048,576 points was thinned")
     assert "10,000,000 points at 1.0" in faults.warnings()[0]
 
 
@@ -40,8 +40,8 @@ def test_millimetres_are_told(rng):
     room = rng.uniform(-6.0, 6.0, (1000, 3))
     scan, faults = seen(1000.0 * room)
     assert len(scan) == 1000
-    assert faults.warnings()[0].startswith("1 scans look like millimetres, where metres are expected")
+    assert faults.warnings()[0].startswith("1 scan looks like millimetres, where metres are expected")
 
 
 def test_all_points_at_one_place_are_told():
-    assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scans have all their points at one place")
+    assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scan has all its points at one place")

@@ -130,7 +130,7 @@ def test_the_sequence_must_be_chosen_among_several(tmp_path, rng):
     for name in ("03", "07"):
         _write_sequence(tmp_path, rng, name)
     (tmp_path / "sequences" / "11").mkdir()  # no scans: not available
-    with pytest.raises(InputError, match=r"--sequence: 03, 07$"):
+    with pytest.raises(InputError, match=r"holds the sequences 03, 07; choose one with --sequence 03, or name"):
         open_recording(tmp_path)
     with pytest.raises(InputError, match=r"there are: 03, 07$"):
         open_recording(tmp_path, ReaderConfig(sequence="11"))
@@ -197,7 +197,7 @@ def test_damaged_files_are_named(tmp_path, rng):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("0.0\n0.1\n0.2\n", "up to 000005.bin, 6 lines, got 3"),
+        ("0.0\n", "expected 6 stamps, one for every scan up to 000005.bin, got 1"),
         ("0.0\n0.1\nlater\n0.3\n0.4\n0.5\n", "'later' at line 3"),
         ("0.0\n0.1\n0.2\n0.2\n0.4\n0.5\n", "expected stamps that increase"),
     ],
@@ -207,6 +207,17 @@ def test_a_damaged_times_file_is_an_error(tmp_path, rng, content, message):
     (tmp_path / "sequences" / "04" / "times.txt").write_text(content)
     with pytest.raises(InputError, match=message):
         open_recording(tmp_path)
+
+
+def test_missing_stamps_continue_at_the_rate_and_are_told_once(tmp_path, rng):
+    _write_sequence(tmp_path, rng)
+    (tmp_path / "sequences" / "04" / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    recording = open_recording(tmp_path)
+    assert recording.stamps[-1] == pytest.approx(0.5)
+    (warning,) = [line for line in recording.warnings if "times.txt" in line]
+    assert (
+        warning == "times.txt has only 4 lines for the scans up to number 5; the missing stamps continue at its rate."
+    )
 
 
 @pytest.mark.parametrize("line", ["Tr: 1 2 3", "P0: 1", "Tr: 1 0 0 0 0 2 0 0 0 0 1 0", "Tr: 1 0 0 0 0 1 0 0 0 0 -1 0"])

@@ -195,7 +195,7 @@ def test_scan_stamps_that_repeat_are_interpolated(tmp_path, rng):
     recording = open_recording(drive)
     read = np.array([scan.stamp for scan in recording.scans()])
     np.testing.assert_allclose(read, FIRST_STAMP + MID_S * np.arange(8), rtol=0.0, atol=1e-6)
-    assert any("1 stamps of timestamps.txt" in note for note in recording.describe().notes)
+    assert any("1 stamp of timestamps.txt" in note for note in recording.describe().notes)
 
 
 def test_implausible_starts_are_replaced(tmp_path, rng):

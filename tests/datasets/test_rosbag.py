@@ -15,12 +15,12 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.point_time import PointTimeModel
 from lidarslam.datasets.recording import PointField, Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.truth_files import find_truth_file
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -541,4 +541,4 @@ def test_a_scan_whose_times_are_worth_nothing_keeps_its_points(bag_kit, make_swe
     scans = list(recording.scans(faults=faults))
     assert [scan.time_offsets is None for scan in scans] == [False, False, True, False]
     assert [len(scan) for scan in scans] == [200] * 4
-    assert faults.warnings()[0].startswith("1 scans have no usable times of their points")
+    assert faults.warnings()[0].startswith("1 scan has no usable times of its points")

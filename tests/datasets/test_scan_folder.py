@@ -331,9 +331,29 @@ def test_a_stamp_file_comes_first(tmp_path, rng, name, above):
     (tmp_path / name if above else folder / name).write_text("0.5\n0.75\n1.5\n")
     recording = open_recording(folder)
     assert [scan.stamp for scan in recording.scans()] == [0.5, 0.75, 1.5]
-    (tmp_path / name if above else folder / name).write_text("0.5\n0.75\n")
-    with pytest.raises(InputError, match=r"each of the 3 \.bin scans.*got 2"):
-        open_recording(folder)
+
+
+@pytest.mark.parametrize(
+    ("lines", "stamps", "warning"),
+    [
+        ("0.5\n0.75\n", [0.5, 0.75, 1.0], "2 stamps for 3 scans; those of the last 1 continue at its rate."),
+        ("0.5\n1.5\n2.5\n3.5\n", [0.5, 1.5, 2.5], "4 stamps for 3 scans; the first are taken."),
+    ],
+)
+def test_stamps_of_another_number_than_the_scans_are_a_warning(tmp_path, rng, lines, stamps, warning):
+    _write_numbered(tmp_path, rng, ["a1.bin", "a2.bin", "a3.bin"])
+    (tmp_path / "times.txt").write_text(lines)
+    recording = open_recording(tmp_path)
+    assert [scan.stamp for scan in recording.scans()] == stamps
+    assert recording.warnings == (f"times.txt has {warning}",)
+
+
+def test_a_scan_with_a_number_for_its_name_has_the_line_of_that_number(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["000001.bin", "000003.bin"])
+    (tmp_path / "times.txt").write_text("0.0\n0.1\n0.25\n0.35\n0.45\n")
+    recording = open_recording(tmp_path)
+    assert [scan.stamp for scan in recording.scans()] == [0.1, 0.35]
+    assert recording.warnings == ("times.txt has 5 stamps for 2 scans; each takes the line of its number, from 0 on.",)
 
 
 def test_stamp_file_formats(tmp_path):
@@ -359,7 +379,7 @@ def test_stamps_that_do_not_increase_are_interpolated(tmp_path, rng):
     (tmp_path / "times.txt").write_text("1.0\n1.5\n1.5\n2.5\n")
     recording = open_recording(tmp_path)
     np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [1.0, 1.5, 2.0, 2.5])
-    assert any("1 stamps of times.txt" in note for note in recording.describe().notes)
+    assert any("1 stamp of times.txt" in note for note in recording.describe().notes)
 
 
 @pytest.mark.parametrize("name", ["ground_truth.tum", "groundtruth.tum", "groundtruth.txt", "ground_truth.txt"])

@@ -6,6 +6,7 @@ import pytest
 from lidarslam.core.geometry import exp, inverse, is_rigid, rotation_angle
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import align, align_se3
+from lidarslam.evaluation.trajectory.metrics import absolute_errors, evaluate_trajectory
 
 MOTIONS = [(0.0,) * 6, (0.3, -0.2, 2.5, 10.0, -4.0, 1.0), (3.1, 0.1, 0.2, -500.0, 20.0, 3.0)]
 
@@ -95,3 +96,51 @@ def test_misuse_is_refused(random_drive):
         align(random_drive(1), random_drive(1, scans=30))
     with pytest.raises(ValueError, match="'sim3'"):
         align(random_drive(1), random_drive(1), "sim3")
+
+
+def rotation_error_deg(estimate: Trajectory, reference: Trajectory) -> float:
+    return evaluate_trajectory(estimate, reference).errors.ate_rotation_rmse_deg
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.0005, 0.01], ids=["straight", "3 %", "20 %"])
+def test_the_rotation_error_is_that_of_the_orientations_where_positions_leave_it_open(bend, straight_drive, rng):
+    """Orientations off by 0.2 degrees about each axis, on a path whose reference is off by half a metre as GNSS is."""
+    drive = straight_drive(400, (0.0, 0.0, bend, 0.2, 0.0, 0.0))
+    turns = np.zeros((400, 6))
+    turns[:, :3] = np.deg2rad(rng.normal(0.0, 0.2, (400, 3)))
+    turns[:, :3] -= turns[:, :3].mean(axis=0)
+    poses = drive.T_world_lidar.copy()
+    poses[:, 2, 3] += 0.5 * np.sin(np.linspace(0.0, 3.0, 400))
+    poses[:, 1, 3] += 0.5 * np.cos(np.linspace(0.0, 5.0, 400))
+    estimate = Trajectory(drive.stamps, exp(MOTIONS[1]) @ drive.T_world_lidar @ exp(turns))
+    known_deg = np.rad2deg(np.sqrt(np.mean(np.sum(turns[:, :3] ** 2, axis=1))))
+    assert rotation_error_deg(estimate, Trajectory(drive.stamps, poses)) == pytest.approx(known_deg, rel=0.06)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_sensor_that_is_mounted_askew_is_seen_where_positions_are_certain(axis, random_drive):
+    """The orientations alone would align a constant error of the heading away."""
+    reference = random_drive(11)
+    skew = np.zeros(6)
+    skew[axis] = np.deg2rad(3.0)
+    estimate = Trajectory(reference.stamps, exp(MOTIONS[1]) @ reference.T_world_lidar @ exp(skew))
+    assert rotation_error_deg(estimate, reference) == pytest.approx(3.0, abs=1e-3)
+
+
+def test_the_rotations_do_not_change_the_distances(random_drive, noisy):
+    reference = random_drive(12)
+    metrics = evaluate_trajectory(noisy(reference, 13, sigma=0.05), reference)
+    distances_m, _ = absolute_errors(metrics.association, metrics.T_reference_estimate)
+    assert metrics.errors.ate_rmse_m == np.sqrt(np.mean(distances_m**2))
+
+
+def test_trajectories_that_are_equal_have_no_error(random_drive, straight_drive):
+    for drive in (random_drive(14), straight_drive(50), straight_drive(50, (0.0,) * 6)):
+        assert rotation_error_deg(drive.transformed(exp(MOTIONS[2])), drive) < 1e-4
+
+
+@pytest.mark.parametrize("method", ["first_pose", "none"])
+def test_an_alignment_that_is_asked_for_holds_for_the_rotations_too(method, random_drive, noisy):
+    reference = random_drive(15)
+    metrics = evaluate_trajectory(noisy(reference, 16), reference, alignment=method)
+    assert np.array_equal(metrics.T_reference_estimate, metrics.T_reference_estimate_joint)

@@ -257,7 +257,7 @@ def test_damaged_scans_are_left_out_and_a_recording_without_any_is_told(rooms: l
     assert not (tmp_path / "out" / "02_in_room_1").exists()
     (stopped,) = outcome.stopped
     assert "no scan could be used: 5 scans were left out: they could not be read" in stopped
-    assert any("1 scans were left out: they could not be read" in warning for warning in outcome.summary.warnings)
+    assert any("1 scan was left out: it could not be read" in warning for warning in outcome.summary.warnings)
     assert len(read_tum(tmp_path / "out" / "03_in_room_2" / "trajectory.tum")) == 5
 
 

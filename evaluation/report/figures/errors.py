@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.report.figures.figure import Figure, Panel, Styles, line_trace, thin_curve
-from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, absolute_errors, deviations
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
 ALIGNED = {
     "se3": "after SE(3) alignment",
@@ -27,7 +27,7 @@ def error_figure(sequence: SequenceComparison, styles: Styles) -> Figure | None:
     measured = measured_methods(sequence)
     if not measured:
         return None
-    errors = [absolute_errors(metrics.association, metrics.T_reference_estimate) for _, metrics in measured]
+    errors = [metrics.absolute_errors() for _, metrics in measured]
     panels = [
         _panel("Position error [m]", measured, [metres for metres, _ in errors], styles, signed=False),
         _panel("Orientation error [°]", measured, [np.rad2deg(rad) for _, rad in errors], styles, signed=False),
@@ -45,7 +45,7 @@ def deviation_figure(sequence: SequenceComparison, styles: Styles) -> Figure | N
     measured = measured_methods(sequence)
     if not measured:
         return None
-    found = [np.hstack(deviations(metrics.association, metrics.T_reference_estimate)) for _, metrics in measured]
+    found = [np.hstack(metrics.deviations()) for _, metrics in measured]
     panels = [
         _panel(title, measured, [components[:, axis] for components in found], styles, signed=True)
         for axis, title in enumerate(_COMPONENTS)

@@ -15,6 +15,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
+from lidarslam.datasets.unrecognised import absent
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.storage import directory as files
 from lidarslam.storage.finished_run import read_trajectory
@@ -72,7 +73,7 @@ def read_estimate(path: Path | Trajectory, map_file: Path | None = None) -> Esti
     if isinstance(path, Trajectory):
         return Estimate(_in_memory(path, "the trajectory"), None, map_file, None, Config())
     if not path.exists():
-        raise InputError(f"{path}: no such run directory or trajectory file")
+        raise InputError(absent(path))
     if not path.is_dir():
         return Estimate(read_poses(path), None, map_file, None, Config())
     trajectory, config_file = read_trajectory(path), path / files.CONFIG
@@ -115,7 +116,7 @@ def read_reference(path: Path | Trajectory, config: ReaderConfig) -> Poses:
     if isinstance(path, Trajectory):
         return _in_memory(path, "the reference")
     if not path.exists():
-        raise InputError(f"{path}: no such trajectory, run directory or recording")
+        raise InputError(absent(path))
     require_whole(path)
     if (path / files.TRAJECTORY_TUM).is_file():
         trajectory = read_trajectory(path)
@@ -167,7 +168,9 @@ def read_poses(path: Path) -> Poses:
             rows = (line.split("#", 1)[0].replace(",", " ").split() for line in lines)
             columns = next((len(words) for words in rows if words), 0)
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: neither a TUM nor a KITTI trajectory; it is not text") from error
+        raise InputError(
+            f"{path}: neither a TUM nor a KITTI trajectory; it is not text. Name a run directory or a trajectory file"
+        ) from error
     if columns == _KITTI_COLUMNS:
         return Poses(str(path), None, read_kitti_poses(path))
     trajectory = read_tum(path)

@@ -16,7 +16,7 @@ from lidarslam.evaluation.comparison.comparison import MapErrors
 from lidarslam.evaluation.map.alignment import GLOBAL, MapAlignment, align_map
 from lidarslam.evaluation.map.entropy import MapEntropy, map_entropy
 from lidarslam.evaluation.map.metrics import DEFAULT_SPACING_M, F_SCORE_THRESHOLDS_M, MapComparison, compare_maps
-from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.alignment import align, align_poses
 from lidarslam.evaluation.trajectory.association import associate
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 
@@ -119,10 +119,11 @@ def _along_trajectory(
             association = associate(Trajectory(poses.stamps, poses.T_world_lidar), reference.truth)
         except InputError:
             return without_truth
-        T_reference_world = align(association.estimate, association.reference, method)
+        pair = association.estimate, association.reference
+        T_reference_world = align_poses(*pair, align(*pair, method), method)
         true_positions = association.reference.positions
     elif metrics is not None:
-        T_reference_world, true_positions = metrics.T_reference_estimate, metrics.association.reference.positions
+        T_reference_world, true_positions = metrics.T_reference_estimate_joint, metrics.association.reference.positions
     else:
         return without_truth
     return T_reference_world, transform_points(inverse(T_reference_world), true_positions)

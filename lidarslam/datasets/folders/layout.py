@@ -9,10 +9,11 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plain_text import count
 from lidarslam.datasets.folders.scan_files import natural_key
+from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.registry import SCAN_SUFFIXES
 from lidarslam.datasets.stamps import mend_stamps, read_stamps, stamps_from_names
-from lidarslam.datasets.truth_files import find_truth_file
 
 _STAMP_FILES = ("timestamps.txt", "times.txt")
 
@@ -41,10 +42,11 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
     stamps, from_clock = np.arange(len(files)) / rate_hz, True
     named = stamps_from_names([path.stem for path in files])
     if stamp_file is not None:
-        stamps, replaced = _read_stamp_file(stamp_file, files)
+        stamps, replaced, faults = _read_stamp_file(stamp_file, files)
+        warnings += faults
         if replaced:
             warnings.append(
-                f"{replaced} stamps of {stamp_file.name} repeat, run backwards or far ahead and were interpolated."
+                f"{count(replaced, 'stamp')} of {stamp_file.name} interpolated: repeated, backwards or far ahead."
             )
     elif named is not None and len(set(named)) == len(named):
         notes.append("The stamps are the file names.")
@@ -72,22 +74,37 @@ def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:
     skipped = sorted(path.name for path in set(candidates) - set(files))
     shown = ", ".join(skipped[:3]) + (", ..." if len(skipped) > 3 else "")
     gone = sorted(path.name for path in named if path.suffix.lower() == suffix and not path.is_file())
+    no_files = "is no file" if len(gone) == 1 else "are no files"
     return (
         files,
-        [f"{len(skipped)} other files were not taken for scans: {shown}."] if skipped else [],
-        [f"{len(gone)} scans are no files that can be opened, such as {gone[0]}."] if gone else [],
+        [f"{count(len(skipped), 'other file')} not taken for scans: {shown}."] if skipped else [],
+        [f"{count(len(gone), 'scan')} {no_files} that can be opened, such as {gone[0]}."] if gone else [],
     )
 
 
-def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int]:
-    stamps = read_stamps(path)
-    stamps = stamps[np.isfinite(stamps)]
-    if len(stamps) != len(files):
-        raise InputError(
-            f"{path}: expected a stamp for each of the {len(files)} {files[0].suffix} scans in {files[0].parent},"
-            f" got {len(stamps)}; complete it, or move it away to use the file names or the rate"
-        )
+def _read_stamp_file(path: Path, files: Sequence[Path]) -> tuple[FloatArray, int, list[str]]:
+    """The stamps, how many of them were replaced, and a warning where lines and scans differ in number."""
+    lines = read_stamps(path)
+    stamps, numbers = lines[np.isfinite(lines)], np.arange(len(files))
+    warnings, left = [], max(0, len(files) - len(stamps))
+    if len(stamps) > len(files):
+        named = [int(file.stem) for file in files if file.stem.isdecimal()]
+        if len(named) == len(files) and named[-1] < len(lines):  # as in KITTI, where scans may have been left away
+            stamps, numbers, which = lines[named], np.array(named), "each takes the line of its number, from 0 on"
+        else:
+            stamps, which = stamps[: len(files)], "the first are taken"
+        warnings = [f"{path.name} has {len(lines):,} stamps for {count(len(files), 'scan')}; {which}."]
+    elif left:
+        warnings = [
+            f"{path.name} has {count(len(stamps), 'stamp')} for {count(len(files), 'scan')}; those of the last {left:,}"
+            " continue at its rate."
+        ]
+        stamps = np.append(stamps, np.full(left, np.nan))
     try:
-        return mend_stamps(stamps, np.arange(len(stamps), dtype=np.float64))
+        mended, replaced = mend_stamps(stamps, numbers.astype(np.float64))
     except ValueError:
-        raise InputError(f"{path}: expected stamps that increase from line to line, no two of them do") from None
+        raise InputError(
+            f"{path}: expected stamps that increase from line to line, no two of them do; mend it, or move it away to"
+            " use the file names or the rate"
+        ) from None
+    return mended, replaced - left, warnings

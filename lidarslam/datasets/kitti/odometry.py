@@ -24,7 +24,7 @@ from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stamps import increasing_rows, read_stamps
+from lidarslam.datasets.stamps import increasing_rows, mend_stamps, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -48,7 +48,10 @@ def _find_sequence(source: Path, wanted: str | None) -> Path:
         raise InputError(f"{source}: expected sequences/NN/velodyne or velodyne below it, found neither")
     if wanted is None:
         if len(folders) > 1:
-            raise InputError(f"{source}: holds several sequences; choose one with --sequence: {available}")
+            raise InputError(
+                f"{source}: holds the sequences {available}; choose one with --sequence {folders[0].name},"
+                f" or name its folder, {folders[0]}"
+            )
         return folders[0]
     for folder in folders:
         if folder.name in (wanted, wanted.zfill(2)):
@@ -66,11 +69,9 @@ class KittiOdometryRecording(FileRecording):
         super().__init__(folder, config, files)
         self._times = self._read_times()
         last = int(self._numbers[-1])
-        if self._times is not None and last >= len(self._times):
-            raise InputError(
-                f"{folder / 'times.txt'}: expected a stamp for every scan up to {self._files[-1].name},"
-                f" {last + 1} lines, got {len(self._times)}; complete it, or remove it to use the rate"
-            )
+        self._lines = 0 if self._times is None else len(self._times)  # of times.txt
+        if self._times is not None and last >= self._lines:
+            self._times = self._continued(self._times, last + 1)
         self.stamps = self._stamps_of(self._numbers)
 
     def _read_times(self) -> FloatArray | None:
@@ -85,6 +86,17 @@ class KittiOdometryRecording(FileRecording):
                 f" {int(np.argmin(increasing)) + 1} and perhaps others do not; mend it, or remove it to use the rate"
             )
         return times
+
+    def _continued(self, times: FloatArray, length: int) -> FloatArray:
+        """The stamps (length,), the missing ones at the rate of the others."""
+        longer = np.append(times, np.full(length - len(times), np.nan))
+        try:
+            return mend_stamps(longer, np.arange(length, dtype=np.float64))[0]
+        except ValueError:
+            raise InputError(
+                f"{self._folder / 'times.txt'}: expected {length} stamps, one for every scan up to"
+                f" {self._files[-1].name}, got {len(times)}; complete it, or remove it to use the rate"
+            ) from None
 
     def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
         return numbers / self._config.rate_hz if self._times is None else self._times[numbers]
@@ -137,16 +149,21 @@ class KittiOdometryRecording(FileRecording):
         return tuple(self._warnings())
 
     def _warnings(self) -> Iterator[str]:
-        last = int(self._numbers[-1])
+        last, poses = int(self._numbers[-1]), 0
         if self._times is None:
             yield f"There is no times.txt; the stamps assume {self._config.rate_hz:g} scans a second."
-        elif last + 1 < len(self._times):
-            yield f"times.txt has {len(self._times)} lines for the scans up to number {last}."
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
         if self._pose_file is not None and self._truth_path() is None:
             yield f"There is no calib.txt, so {self._pose_file.name}, in the camera frame, cannot be used."
         elif self._pose_file is not None:
             with suppress(InputError):  # damaged, an error of `ground_truth`
-                if (poses := len(read_kitti_poses(self._pose_file))) != last + 1:
-                    yield f"{self._pose_file} has {poses} poses for the scans up to number {last}."
+                poses = len(read_kitti_poses(self._pose_file))
+        up_to = f"for the scans up to number {last}"
+        if 0 < self._lines <= last:
+            yield f"times.txt has only {self._lines} lines {up_to}; the missing stamps continue at its rate."
+        if 0 < poses <= last:
+            yield f"{self._pose_file} has only {poses} poses {up_to}."
+        counts = ((self._lines, f"times.txt has {self._lines} lines"), (poses, f"{self._pose_file} has {poses} poses"))
+        if more := [said for number, said in counts if number > last + 1]:
+            yield f"{' and '.join(more)} {up_to}; those beyond are not used."

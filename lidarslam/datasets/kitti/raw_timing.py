@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plain_text import count
 from lidarslam.datasets.stamps import mend_stamps, read_stamps
 
 # Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
@@ -47,15 +48,14 @@ def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], rate_hz: float) -
         return SweepTiming(numbers / rate_hz, half, half, False, (note,))
     notes = []
     if replaced:
-        said = "stamps of timestamps.txt are missing, repeat or run backwards and were interpolated."
-        notes.append(f"{replaced} {said}")
+        notes.append(f"{count(replaced, 'stamp')} of timestamps.txt interpolated: missing, repeated or backwards.")
     period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / rate_hz
     start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
     before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
     after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
     if wrong_starts or wrong_ends:
-        said = "ends of sweeps are missing or implausible and were replaced: sweeps are taken to be seamless."
-        notes.append(f"{wrong_starts} starts and {wrong_ends} {said}")
+        said = "ends of sweeps missing or implausible, and replaced: sweeps are taken to be seamless."
+        notes.append(f"{count(wrong_starts, 'start')} and {wrong_ends} {said}")
     return SweepTiming(stamps, before_s, after_s, True, tuple(notes))
 
 

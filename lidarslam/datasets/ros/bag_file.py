@@ -40,6 +40,8 @@ class BagFile:
         Raises:
             InputError: nothing of the bag can be read, or it is of no readable kind.
         """
+        if path.is_file() and not path.stat().st_size:
+            raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
         self.path = path
         self._ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
         self._has_index = True
@@ -216,7 +218,9 @@ class BagFile:
             whole = min(self.path.glob("*.zstd"), default=None)
             if whole is not None:  # decompressed, it is a file that is read as far as it goes
                 return f"try `zstd -dc {whole} > {whole.with_suffix('')}` and give that file, or copy the bag again"
-            return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files instead of the folder"
+            files = sorted(str(file) for suffix in _STORAGE_SUFFIXES for file in self.path.glob(f"*{suffix}"))
+            such_as = f", such as {files[0]}" if files else ""
+            return f"try `ros2 bag reindex {self.path}`, or give one of its .db3 or .mcap files{such_as}"
         command = _REPAIR.get(self._suffix(self.path))
         if command is None:
             return "readable are .bag, .db3, .mcap and rosbag2 folders with a metadata.yaml"

@@ -15,6 +15,7 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
+from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.point_time import PointTimeModel, is_return
 from lidarslam.datasets.point_time_inference import TimedCloud, learn_point_time
 from lidarslam.datasets.recording import Recording, RecordingInfo
@@ -24,7 +25,6 @@ from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_sta
 from lidarslam.datasets.ros.bag_topics import choose_topic
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.stamp_order import in_stamp_order
-from lidarslam.datasets.truth_files import find_truth_file
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +78,15 @@ class BagRecording:
     def warnings(self) -> tuple[str, ...]:
         """A lost index, and headers without stamps."""
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        return tuple(warning for warning in (self._bag.damage, unset) if warning is not None)
+        return tuple(warning for warning in (self._bag.damage, unset, self._part()) if warning is not None)
+
+    def _part(self) -> str | None:
+        """That the file is one of several of a rosbag2."""
+        folder = self._source.absolute().parent
+        if self._source.is_dir() or not (folder / "metadata.yaml").is_file():
+            return None
+        parts = len(list(folder.glob(f"*{self._source.suffix}")))
+        return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None

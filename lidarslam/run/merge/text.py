@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from lidarslam.core.plain_text import count
 from lidarslam.run.merge.merge import MergeOutcome
 from lidarslam.run.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.results import RunOutcome
@@ -14,14 +15,16 @@ def format_merge(out: Path, outcome: MergeOutcome) -> str:
     lines = [_recording(recording, run) for recording, run in zip(summary.recordings, outcome.runs, strict=True)]
     lines += [_joined(summary), format_map(summary.map), *(f"warning: {warning}" for warning in summary.warnings)]
     if summary.lost_scans:
-        lines.append(f"tracking was lost on {summary.lost_scans:,} scans; the summaries of the recordings say where")
+        lines.append(
+            f"tracking was lost on {count(summary.lost_scans, 'scan')}; the summaries of the recordings say where"
+        )
     return "\n".join([*lines, f"written to {out}"])
 
 
 def _recording(recording: MergedRecording, run: RunOutcome | None) -> str:
     if run is None:
         return f"{recording.name}: no scan used"
-    parts = [f"{recording.directory}: {recording.scans:,} scans, {recording.length_m:.1f} m"]
+    parts = [f"{recording.directory}: {count(recording.scans, 'scan')}, {recording.length_m:.1f} m"]
     if run.metrics is not None:
         parts.append(f"ATE {run.metrics.errors.ate_rmse_m:.3f} m by itself")
     if recording.lost_scans:

@@ -3,6 +3,7 @@
 import shlex
 from importlib.metadata import version
 
+from lidarslam.core.plain_text import count, small_length
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.simulation.recording.request import RecordingSummary, RecordRequest
 from lidarslam.simulation.writers.registry import find_format
@@ -29,7 +30,7 @@ _README = """\
 - **{ground_truth}**: the exact pose of the sensor at each scan's stamp, T_world_lidar, as
   `stamp tx ty tz qx qy qz qw`.
 - **{reference_map}**: {map_points:,} points with normals, exact, on the surfaces that the sensor saw, about
-  {spacing_cm:.0f} cm apart, in the same world frame; nothing that moves is in it.
+  {spacing} apart, in the same world frame; nothing that moves is in it.
 
 ## Frames and times
 
@@ -58,7 +59,7 @@ def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
         layout=find_format(request.format).layout,
         ground_truth=GROUND_TRUTH,
         reference_map=REFERENCE_MAP,
-        spacing_cm=100.0 * summary.map_spacing_m,
+        spacing=small_length(summary.map_spacing_m),
         info=shlex.join(["lidarslam", "info", str(summary.source)]),
         run=_run_command(summary),
     )
@@ -68,7 +69,7 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
     """The last lines of `lidarslam simulate`."""
     how = f"{request.mount}, {request.moved}"
     return (
-        f"{summary.scans:,} scans of a {request.sensor} ({how}) in {request.world}, seed {request.seed}\n"
+        f"{count(summary.scans, 'scan')} of a {request.sensor} ({how}) in {request.world}, seed {request.seed}\n"
         f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points a scan,"
         f" reference map of {summary.map_points:,} points\n"
         f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what\n"
