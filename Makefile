@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test check docs install clean
 
-demo: install
+demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
 
 # A file's tests stay together, so that their fixtures are made once; single-threaded, as there is a process a core.
@@ -30,9 +30,14 @@ docs: install
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml constraints.txt scripts/system_libraries.sh
+# What users install: no PyTorch.
+$(VENV)/.base: pyproject.toml constraints.txt scripts/system_libraries.sh
 	sh scripts/system_libraries.sh
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.base
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	$(BIN)/python -m lidarslam.pipeline.compile_ahead

@@ -19,6 +19,9 @@ from lidarslam.storage.state_file import read_state, write_state
 # The benchmarks are scripts that import one another from their own folder.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
+# Hints name a program by its path unless the shell finds it.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+
 # The first call of a compiled loop takes as long as compiling it.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.compare.plan import REPORT_HTML, REPORT_MD
+from lidarslam.core.plain_text import as_typed
 from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.quantities import QUANTITIES
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
@@ -52,7 +53,7 @@ def _lines(comparison: Comparison, out: Path) -> Iterator[str]:
     yield f"report    {out / REPORT_HTML}, {out / REPORT_MD}, {out / COMPARISON}"
     runs = [str(out / result.run) for sequence in comparison.sequences[:1] for result in sequence.methods if result.run]
     if runs:
-        yield f"look      {shlex.join(['lidarslam', 'view', *runs])}"
+        yield f"look      {shlex.join([as_typed('lidarslam'), 'view', *runs])}"
 
 
 def _table(sequence: SequenceComparison) -> Table:

@@ -1,6 +1,9 @@
-"""Text of unknown origin, such as names in a recording, made safe for a terminal."""
+"""Text for a terminal: names of unknown origin made safe, numbers with nouns, programs as the shell finds them."""
 
 import re
+import shutil
+import sys
+from pathlib import Path
 
 # Control characters steer terminals, bidirectional marks reorder what is read, lone surrogates cannot be encoded.
 _UNSEEN = (
@@ -31,6 +34,18 @@ def printable(text: str) -> str:
 def count(number: int, noun: str) -> str:
     """A number with its noun: 1 scan, 2,000 scans."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def as_typed(program: str) -> str:
+    """The word that starts a program of this environment: its name where the shell finds it, else the path of its file.
+
+    In a virtual environment that is not activated, such as that of `make demo`, the name alone is not found.
+    """
+    beside, here = Path(sys.executable).parent / program, Path.cwd()
+    found = shutil.which(program)
+    if not beside.is_file() or (found is not None and beside.samefile(found)):
+        return program
+    return f"./{beside.relative_to(here)}" if beside.is_relative_to(here) else str(beside)
 
 
 def small_length(metres: float) -> str:

@@ -1,27 +1,13 @@
-"""The environment: how its programs are called, their versions, and the machine, for reports of measurements."""
+"""Versions of the programs and description of the machine, for reports of measurements."""
 
 import contextlib
 import os
 import platform
-import shutil
 import subprocess
-import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 _PROGRAMS = ("lidarslam", "kiss-icp", "numpy", "onnxruntime", "open3d", "open3d-cpu", "torch")
-
-
-def as_typed(program: str) -> str:
-    """The word that starts a program of this environment: its name where the shell finds it, else the path of its file.
-
-    In a virtual environment that is not activated, such as that of `make demo`, the name alone is not found.
-    """
-    beside, here = Path(sys.executable).parent / program, Path.cwd()
-    found = shutil.which(program)
-    if not beside.is_file() or (found is not None and beside.samefile(found)):
-        return program
-    return f"./{beside.relative_to(here)}" if beside.is_relative_to(here) else str(beside)
 
 
 def versions() -> dict[str, str]:

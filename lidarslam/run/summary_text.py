@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.plain_text import count, small_length
+from lidarslam.core.plain_text import as_typed, count, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
@@ -44,9 +44,9 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield f"warning: {warning}"
     yield from _lost(summary)
     yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
-    yield f"next: {shlex.join(['lidarslam', 'view', str(out)])}"
+    yield f"next: {shlex.join([as_typed('lidarslam'), 'view', str(out)])}"
     if outcome.metrics is not None:
-        yield f"      {shlex.join(['lidarslam', 'evaluate', str(out)])}"
+        yield f"      {shlex.join([as_typed('lidarslam'), 'evaluate', str(out)])}"
 
 
 def _speed(realtime_factor: float | None) -> str:

@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 
-from lidarslam.core.plain_text import count
+from lidarslam.core.plain_text import as_typed, count
 from lidarslam.odometry.training.training import Validation
-from lidarslam.run.machine import as_typed
 
 
 def format_step(step: int, steps: int, losses: Mapping[str, float], pairs_per_s: float, left_s: float) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 
 from lidarslam.compare.assessment.evaluate import Evaluation
 from lidarslam.compare.assessment.map_evaluation import MapEvaluation
+from lidarslam.core.plain_text import as_typed
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
@@ -38,7 +39,7 @@ def _lines(evaluation: Evaluation) -> Iterator[str]:
     if evaluation.written:
         yield from ("", f"written to {', '.join(map(str, evaluation.written))}")
     if evaluation.estimate.run is not None:
-        yield f"next: {shlex.join(['lidarslam', 'view', str(evaluation.estimate.run)])}"
+        yield f"next: {shlex.join([as_typed('lidarslam'), 'view', str(evaluation.estimate.run)])}"
 
 
 def _row(label: str, text: str) -> str:

@@ -3,7 +3,7 @@
 import shlex
 from importlib.metadata import version
 
-from lidarslam.core.plain_text import count, small_length
+from lidarslam.core.plain_text import as_typed, count, small_length
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.simulation.recording.request import RecordingSummary, RecordRequest
 from lidarslam.simulation.writers.registry import find_format
@@ -73,7 +73,7 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
         f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points a scan,"
         f" reference map of {summary.map_points:,} points\n"
         f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what\n"
-        f"next: {_run_command(summary)}"
+        f"next: {_run_command(summary, as_typed('lidarslam'))}"
     )
 
 
@@ -87,5 +87,5 @@ def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
     return shlex.join([*words, "--format", request.format])
 
 
-def _run_command(summary: RecordingSummary) -> str:
-    return shlex.join(["lidarslam", "run", str(summary.source)])
+def _run_command(summary: RecordingSummary, program: str = "lidarslam") -> str:
+    return shlex.join([program, "run", str(summary.source)])
