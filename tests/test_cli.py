@@ -335,7 +335,9 @@ def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path: Path, record
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_verbose_says_what_is_chosen_before_the_command_or_after(recording: Path, tmp_path: Path, before: bool) -> None:
+def test_verbose_says_what_is_chosen_before_the_command_or_after(
+    recording: Path, tmp_path: Path, before: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     command = ["run", recording, "--out", tmp_path / "run", "--odometry", "constant-velocity"]
     lidarslam(*(["-v", *command] if before else [*command, "-v"]), "--stop", 3)
     said = [record.message for record in caplog.records]
