@@ -35,6 +35,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt scripts/system_libraries.sh
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m lidarslam.pipeline.compile_ahead
 	touch $@
 
 clean:

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, log
 from lidarslam.core.state import Shape
 
@@ -98,7 +98,7 @@ def _move(points: FloatArray, t: FloatArray, velocity: FloatArray, moved: FloatA
         moved[n, 2] = z + sine * pz + versine * (qz + gz) + w + cubic * hz
 
 
-@compiled
+@compiled_part
 def _coefficients(squared: float) -> tuple[float, float, float]:
     """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3 of a^2, by their series for small angles."""
     if squared < _SERIES_ANGLE2:

@@ -135,7 +135,7 @@ def test_a_pose_graph_is_built_when_it_is_asked_for(
     """The room is too small for a loop: what the map said stays, and the map drawn from submaps is as exact."""
     out = tmp_path / "run"
     settings = (*MAPPING, "pose_graph.enabled=true", "pose_graph.keyframes.distance_m=0.4")
-    outcome = execute(RunRequest(recording, out, load_config(None, settings), rerun="save"), quiet)
+    outcome = execute(RunRequest(recording, out, load_config(None, settings), rerun="save", report=True), quiet)
     assert outcome.metrics is not None
     assert outcome.metrics.errors.ate_rmse_m < 0.005
     graph = json.loads((out / "summary.json").read_text())["pose_graph"]

@@ -16,6 +16,8 @@ _LEAST_SPREAD_M = 0.01
 _LEAST_RELATIVE_SPREAD = 0.04
 # Weight of the orientations beside the positions' main direction: it affects only the unobservable rotation.
 _TIE_BREAK = 1e-8
+# Where the positions leave a rotation as uncertain as this, orientations determine it too.
+_MOST_UNCERTAIN_RAD = np.deg2rad(5.0)
 # Smaller errors are those of rounding, and say nothing of the weights.
 _LEAST_DISTANCE_M, _LEAST_ANGLE_RAD = 1e-3, 2e-4
 
@@ -65,30 +67,41 @@ def align_se3(estimate: FloatArray, reference: FloatArray) -> FloatArray:
 def align_poses(
     estimate: Trajectory, reference: Trajectory, T_reference_estimate: FloatArray, method: AlignmentMethod = "se3"
 ) -> FloatArray:
-    """Maximum-likelihood `T_reference_estimate` (4, 4) by positions and orientations; of both the most certain counts.
+    """`T_reference_estimate` (4, 4) for the orientations: that of the positions, unless they leave a rotation open.
 
     Positions determine the rotation about an axis as well as their errors are small beside their distances from the
-    axis: on a straight stretch, or with a weak reference, not at all. Orientations determine all of it directly. With
-    isotropic errors, d the positions' RMS distance after their own alignment and a the RMS angle after that of the
-    orientations, the rotation minimises sum |p_ref - R p_est|^2 / d^2 + sum angle(R_ref, R R_est)^2 / a^2, the angle
-    by its chord. `first_pose` and `none` are what they are in `align`.
+    axis: on a straight stretch, or with a weak reference, hardly. Where they leave one open by more than 5 degrees, the
+    alignment is the maximum-likelihood one of both: with isotropic errors, d the positions' RMS distance after their
+    own alignment and a the RMS angle after that of the orientations, the rotation minimises
+    sum |p_ref - R p_est|^2 / d^2 + sum angle(R_ref, R R_est)^2 / a^2, the angle by its chord.
 
     Args:
         estimate, reference: of the same instants.
         T_reference_estimate: that of `align`.
-        method: of `align`.
+        method: of `align`; `first_pose` and `none` hold for the orientations too.
     """
     if method != "se3":
         return T_reference_estimate
     T_estimate, T_reference = estimate.T_world_lidar, reference.T_world_lidar
-    orientations = _mean_difference(T_estimate, T_reference)
     aligned = transform_points(T_reference_estimate, estimate.positions)
-    distance_squared = np.mean(np.sum((aligned - reference.positions) ** 2, axis=1))
+    distance_m = np.sqrt(np.mean(np.sum((aligned - reference.positions) ** 2, axis=1)))
+    covariance, orientations = _covariance(T_estimate, T_reference), _mean_difference(T_estimate, T_reference)
+    if distance_m < _MOST_UNCERTAIN_RAD * _least_lever_m(covariance):
+        return T_reference_estimate
     # Of a mean rotation M the nearest rotation R has the mean squared chord 2 (3 - trace(R^T M)), twice the angle's.
     angle_squared = 3.0 - np.sum(_nearest_rotation(orientations) * orientations)
-    weight_m2 = max(distance_squared, _LEAST_DISTANCE_M**2) / (2.0 * max(angle_squared, _LEAST_ANGLE_RAD**2))
-    R = _nearest_rotation(_covariance(T_estimate, T_reference) + weight_m2 * orientations)
+    weight_m2 = max(distance_m, _LEAST_DISTANCE_M) ** 2 / (2.0 * max(angle_squared, _LEAST_ANGLE_RAD**2))
+    R = _nearest_rotation(covariance + weight_m2 * orientations)
     return make_transform(R, reference.positions.mean(axis=0) - R @ estimate.positions.mean(axis=0))
+
+
+def _least_lever_m(covariance: FloatArray) -> float:
+    """RMS distance of the positions from their main direction; 0 where they have none, or a line has all of them."""
+    spread_squared = np.linalg.svd(covariance, compute_uv=False)
+    spread_m = np.sqrt(spread_squared)
+    if spread_m[1] < max(_LEAST_SPREAD_M, _LEAST_RELATIVE_SPREAD * spread_m[0]):
+        return 0.0
+    return float(np.sqrt(spread_squared[1] + spread_squared[2]))
 
 
 def _covariance(estimate: FloatArray, reference: FloatArray) -> FloatArray:

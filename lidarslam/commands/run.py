@@ -56,25 +56,27 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -> None:
     """Build trajectory and map of a recording."""
     from lidarslam.run.progress import show_progress
-    from lidarslam.run.request import RunRequest
-    from lidarslam.run.resuming import abandoned, lost_when_finished
-    from lidarslam.run.run import execute
-    from lidarslam.run.summary_text import format_outcome, format_stop
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    config, map_formats = take_config(options, source), take_map_formats(options)
-    out = out or _default_out(source, config.reader.sequence, options["resume"])
-    request = RunRequest(source, out, config, map_formats=map_formats, **options)
-    if request.resume and (lost := lost_when_finished(request)) is not None:
-        say(f"{out}: is finished already")
-        ctx.exit(EXIT_LOST if lost else 0)
-    try:
-        with show_progress(source.name) as progress:
-            outcome = execute(request, progress)
-    except KeyboardInterrupt:
-        note(abandoned(out))
-        ctx.exit(EXIT_MENDABLE)
+    with show_progress(source.name) as progress:
+        progress.phase("loading the program")
+        from lidarslam.run.request import RunRequest
+        from lidarslam.run.resuming import abandoned, lost_when_finished
+        from lidarslam.run.run import execute
+        from lidarslam.run.summary_text import format_outcome, format_stop
+
+        config, map_formats = take_config(options, source), take_map_formats(options)
+        out = out or _default_out(source, config.reader.sequence, options["resume"])
+        request = RunRequest(source, out, config, map_formats=map_formats, **options)
+        if request.resume and (lost := lost_when_finished(request)) is not None:
+            say(f"{out}: is finished already")
+            ctx.exit(EXIT_LOST if lost else 0)
+        try:
+            outcome = execute(request, progress, progress.phase)
+        except KeyboardInterrupt:
+            note(abandoned(out))
+            ctx.exit(EXIT_MENDABLE)
     say(format_outcome(out, outcome))
     if outcome.stopped is not None:
         note(format_stop(out, outcome))

@@ -4,8 +4,14 @@ They are compiled on their first call and run without the interpreter's lock, so
 side. Both need this file and share nothing else but the core.
 """
 
+import hashlib
 import logging
+import os
+import tempfile
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -13,6 +19,11 @@ import numba
 _log = logging.getLogger(__name__)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_njit: Any = numba.njit
+_config: Any = numba.config
+# Nothing calls these loops by their addresses: an entry less to compile.
+_OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 def compiled(function: Function) -> Function:
@@ -22,29 +33,73 @@ def compiled(function: Function) -> Function:
     their own names: what is kept on disk is outdated when a file of these functions changes. Arithmetic is IEEE's, in
     the order that is written; divisions by zero give infinity or NaN, as in NumPy. Indices are not checked.
 
-    Where nothing can be kept (a read-only installation without a home, a full disk, a damaged file), every process
-    compiles anew.
+    Kept beside the source, else in the user's cache folder, else in a temporary folder of the user. Where nothing can
+    be kept (a full disk, a damaged file), every process compiles anew.
     """
-    try:
-        dispatcher: Any = numba.njit(function, cache=True, nogil=True, error_model="numpy")
-    except RuntimeError as reason:  # no folder to keep machine code in
-        _log.info("%s", reason)
-        dispatcher = numba.njit(function, nogil=True, error_model="numpy")
-    else:
-        if hasattr(dispatcher, "_cache"):  # not where numba is switched off
-            _watch_callees(dispatcher)
-            dispatcher._cache = _ForgivingCache(dispatcher._cache)
+    dispatcher = _kept_on_disk(function)
+    if hasattr(dispatcher, "_cache"):  # not where numba is switched off
+        _watch_callees(dispatcher)
+        if hasattr(dispatcher._cache, "_cache_file"):
+            dispatcher._cache._cache_file._source_stamp = dispatcher.source_stamps
+        dispatcher._cache = _ForgivingCache(dispatcher._cache)
     return cast(Function, dispatcher)
 
 
+def compiled_part(function: Function) -> Function:
+    """A part of compiled functions: compiled and kept along with them, and never called from the interpreter."""
+    dispatcher: Any = _njit(function, no_cpython_wrapper=True, **_OPTIONS)
+    if hasattr(dispatcher, "_cache"):
+        _watch_callees(dispatcher)
+    return cast(Function, dispatcher)
+
+
+def is_compiled(module: ModuleType) -> bool:
+    """Whether machine code of all compiled functions of a module is on disk; also where none can be kept there."""
+    own = [value for value in vars(module).values() if getattr(value, "__module__", None) == module.__name__]
+    caches = [value._cache for value in own if hasattr(value, "_cache")]
+    return all(cache.has_overloads() for cache in caches if isinstance(cache, _ForgivingCache))
+
+
+def _kept_on_disk(function: Function) -> Any:
+    try:
+        return _njit(function, cache=True, **_OPTIONS)
+    except RuntimeError as reason:  # neither beside the source nor in a cache folder of the user
+        _log.info("%s", reason)
+    configured, _config.CACHE_DIR = _config.CACHE_DIR, _temporary_folder()
+    try:
+        return _njit(function, cache=True, **_OPTIONS)
+    except RuntimeError:
+        return _njit(function, **_OPTIONS)
+    finally:
+        _config.CACHE_DIR = configured
+
+
+@lru_cache(maxsize=1)
+def _temporary_folder() -> str:
+    """A folder for compiled code that no other user can write; empty where there is none."""
+    folder = Path(tempfile.gettempdir()) / f"lidarslam-{os.getuid() if hasattr(os, 'getuid') else 0}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return ""
+    is_own = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
+    return str(folder) if is_own and not folder.is_symlink() else ""
+
+
 def _watch_callees(dispatcher: Any) -> None:
-    """Numba keeps machine code with the age of the function's file; add those of the functions compiled into it."""
-    function = dispatcher.py_func
-    named = (function.__globals__.get(name) for name in function.__code__.co_names)
-    callees = [other for other in named if hasattr(other, "py_func")]
-    files = [other._cache._cache_file for other in (dispatcher, *callees) if hasattr(other._cache, "_cache_file")]
-    if files:
-        files[0]._source_stamp = tuple(file._source_stamp for file in files)
+    """Numba keeps machine code with the state of the function's file; add those of the functions compiled into it."""
+    code, names = dispatcher.py_func.__code__, dispatcher.py_func.__globals__
+    callees = [names[name] for name in code.co_names if hasattr(names.get(name), "source_stamps")]
+    stamps = {stamp for callee in callees for stamp in callee.source_stamps}
+    dispatcher.source_stamps = (*sorted({_stamp(code.co_filename), *stamps}),)
+
+
+def _stamp(file: str) -> str:
+    try:
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    except OSError:  # made up by the program
+        return ""
 
 
 class _ForgivingCache:
@@ -55,6 +110,16 @@ class _ForgivingCache:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._cache, name)
+
+    def has_overloads(self) -> bool:
+        """Whether anything is kept; True where nothing can be."""
+        if not hasattr(self._cache, "_cache_file"):
+            return True
+        try:
+            return bool(self._cache._cache_file._load_index())
+        except Exception as reason:  # a damaged pickle may raise anything
+            _log.info("compiled code cannot be read: %s", reason)
+            return False
 
     def load_overload(self, *arguments: Any) -> Any:
         """What is kept for these types; None when there is nothing, or nothing that can be read."""

@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
@@ -87,6 +86,8 @@ def log(T: FloatArray) -> FloatArray:
     """SE(3) logarithm (..., 6) of transforms (..., 4, 4), rotation first; the inverse of `exp` for angles below pi."""
     if T.size == 16:
         return _log_one(T).reshape(*T.shape[:-2], 6)
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     flat = T.reshape(-1, 4, 4)  # SciPy goes through quaternions, which stay accurate close to pi
     omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec().reshape(*T.shape[:-2], 3)
     angle = np.linalg.norm(omega, axis=-1)

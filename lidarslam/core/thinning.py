@@ -5,7 +5,7 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 
 # Cells share this many slots; where two meet in one slot, one of them is dropped (a few per cent of a large scan).
@@ -62,7 +62,7 @@ def _slot_values() -> NDArray[np.int32]:
     return values
 
 
-@compiled
+@compiled_part
 def _cell(scaled: np.float32) -> int:
     cell = np.floor(scaled)
     # Written so that NaN goes to zero.

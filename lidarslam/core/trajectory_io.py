@@ -8,7 +8,6 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
@@ -80,12 +79,16 @@ def read_tum(path: Path) -> Trajectory:
     _require_near(path, table[:, 1:4])
     _, first = np.unique(table[:, 0], return_index=True)
     table = table[first]
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     R = Rotation.from_quat(table[:, 4:]).as_matrix()
     return Trajectory(table[:, 0], make_transform(R, table[:, 1:4]))
 
 
 def format_tum(trajectory: Trajectory) -> str:
     """The trajectory as TUM text, nine decimals, quaternions with qw >= 0."""
+    from scipy.spatial.transform import Rotation
+
     quaternions = Rotation.from_matrix(trajectory.T_world_lidar[:, :3, :3]).as_quat(canonical=True)
     table = np.column_stack([trajectory.stamps, trajectory.positions, quaternions])
     out = StringIO()

@@ -80,6 +80,8 @@ def _known(info: RecordingInfo) -> dict[str, Any]:
         "first_scan": {
             "points": len(info.first),
             "dropped_points": info.first.dropped,
+            "has_intensities": info.first.intensities is not None,
+            "has_colours": info.first.colours is not None,
             "has_rings": info.first.rings is not None,
         },
         "point_time": _known_point_time(info),

@@ -84,7 +84,7 @@ class Pipeline(Stateful):
                 if previous is None:
                     continue
                 jobs.append(map_worker.submit(self._process, previous, estimated))
-                if len(jobs) > _SCANS_BEHIND:
+                while jobs and (jobs[0].done() or len(jobs) > _SCANS_BEHIND):
                     yield jobs.popleft().result()
                 if self._checkpointer is not None and self._checkpointer.is_due():
                     while jobs:

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -10,8 +11,9 @@ from rich.text import Text
 
 from lidarslam.core.plain_text import one_line
 from lidarslam.core.tracking import Status
-from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.run.tracking import Progress as ProgressCallback
+
+if TYPE_CHECKING:  # what a bar does not need takes a while to load
+    from lidarslam.pipeline.estimates import ScanResult
 
 _COLOURS = {Status.OK: "green", Status.DEGRADED: "yellow", Status.LOST: "red"}
 
@@ -24,32 +26,57 @@ class _RateColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:5.1f} scans/s")
 
 
+class _CountColumn(MofNCompleteColumn):
+    """Scans that are done, of how many; nothing before that is known."""
+
+    def render(self, task: Task) -> Text:
+        return Text() if task.total is None else super().render(task)
+
+
+class _RemainingColumn(TimeRemainingColumn):
+    """The time to the end; nothing before the number of scans is known."""
+
+    def render(self, task: Task) -> Text:
+        return Text() if task.total is None else super().render(task)
+
+
 def _bar(*more: ProgressColumn) -> Progress:
     """A bar on standard error; silent where no terminal is attached."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
+        _CountColumn(),
         _RateColumn(),
-        TimeRemainingColumn(),
+        _RemainingColumn(),
     )
     return Progress(*columns, *more, console=Console(stderr=True), disable=not sys.stderr.isatty())
 
 
+class RunProgress:
+    """A bar with scans a second and the state of tracking; before the first scan, what goes on."""
+
+    def __init__(self, bar: Progress, name: str) -> None:
+        self._bar = bar
+        self._task = bar.add_task(one_line(name), total=None, state="")
+        self._lost = 0
+
+    def __call__(self, number: int, total: int, result: "ScanResult") -> None:
+        """Show that a scan is done, its number from 1, and how many there are."""
+        self._lost += result.status is Status.LOST
+        lost = f" [red]{self._lost} lost[/]" if self._lost else ""
+        state = f"[{_COLOURS[result.status]}]{result.status.value}[/]{lost}"
+        self._bar.update(self._task, completed=number, total=total, state=state)
+
+    def phase(self, words: str) -> None:
+        """Show what goes on."""
+        self._bar.update(self._task, state=words)
+
+
 @contextlib.contextmanager
-def show_progress(name: str) -> Iterator[ProgressCallback]:
-    """A bar with scans a second and the state of tracking."""
+def show_progress(name: str) -> Iterator[RunProgress]:
+    """The bar of a run."""
     with _bar(TextColumn("{task.fields[state]}")) as bar:
-        task = bar.add_task(one_line(name), total=None, state="")
-        lost = 0
-
-        def update(number: int, total: int, result: ScanResult) -> None:
-            nonlocal lost
-            lost += result.status is Status.LOST
-            state = f"[{_COLOURS[result.status]}]{result.status.value}[/]" + (f" [red]{lost} lost[/]" if lost else "")
-            bar.update(task, completed=number, total=total, state=state)
-
-        yield update
+        yield RunProgress(bar, name)
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
 """One run on disk: from a source to a run directory."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest, describe_run, log_choices
@@ -27,11 +28,16 @@ if TYPE_CHECKING:
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 
-def execute(request: RunRequest, progress: Progress) -> RunOutcome:
+def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None] = lambda _: None) -> RunOutcome:
     """Run, and write the run directory.
 
     A damaged recording or an interruption ends the run early, with the results so far. A run that is killed can be
     resumed, to the same results.
+
+    Args:
+        request: what is run.
+        progress: called after every scan.
+        phase: called with a few words on what goes on before the first scan and after the last.
 
     Raises:
         LidarSlamError: the source, the configuration or the output directory is not usable, or there is nothing to
@@ -39,6 +45,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     """
     require_apart(request.out, request.source)
     config = request.config
+    phase("opening the recording")
     recording = open_recording(request.source, config.reader)
     chosen = range(len(recording))[request.start : request.stop : request.step]
     if not chosen:
@@ -48,6 +55,8 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
     log_choices(request, chosen, len(recording))
     with Interruptions() as interruptions:
         with ExitStack() as stack:
+            compiling = stack.enter_context(CompileAhead(parts_of(config)))
+            phase("loading the odometry")
             odometry = open_odometry(config, request.prior)
             stack.callback(odometry.close)
             directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
@@ -59,8 +68,12 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
             if graph is not None:
                 stack.callback(graph.close)
             with _viewing(request, recording.name, directory, log) as viewer:
+                compiling.wait_for_first_scan(phase)
+                phase("reading the first scans")
                 tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
                 interruptions.protect_results()
+                compiling.wait_for_all(phase)
+                phase("writing the results")
                 closed = close_loops(graph, tracked.global_map, log, viewer)
                 drawn = final_map(tracked, closed, config.global_map)
                 if drawn.cloud is not None:
@@ -74,6 +87,7 @@ def execute(request: RunRequest, progress: Progress) -> RunOutcome:
         if request.report:
             from lidarslam.viewer.page.run_report import Accuracy, leave_report
 
+            phase("drawing the report")
             leave_report(request.out, Accuracy(outcome.metrics))
     return outcome
 

@@ -8,7 +8,7 @@ from lidarslam.core.plain_text import count, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
-from lidarslam.storage.directory import SCANS_CSV, SUMMARY
+from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # A speed that differs less is that of the recording.
 _ALIKE = 1.05
@@ -43,7 +43,7 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     for warning in summary.warnings:
         yield f"warning: {warning}"
     yield from _lost(summary)
-    yield f"written to {out}"
+    yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
     yield f"next: {shlex.join(['lidarslam', 'view', str(out)])}"
     if outcome.metrics is not None:
         yield f"      {shlex.join(['lidarslam', 'evaluate', str(out)])}"

@@ -49,7 +49,8 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, summed: int, unique:
         row = order[n]
         if count == 0 or keys[row] != unique[count - 1]:
             unique[count] = keys[row]
-            totals[count] = sums[row]
+            for column in range(7):  # copying a whole row brings the text of its error, which takes 4 s to compile
+                totals[count, column] = sums[row, column]
             count += 1
         else:
             for column in range(summed):

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 
 Ranges = NDArray[np.float32]
@@ -90,7 +90,7 @@ def judge(
         moved[m] = through >= _LEAST_THROUGH and weight >= support
 
 
-@compiled
+@compiled_part
 def _vote(
     a: float,
     b: float,
@@ -133,7 +133,7 @@ def _vote(
     return _THROUGH if is_looked_at and returns >= _LEAST_RETURNS and not is_hidden else _UNKNOWN
 
 
-@compiled
+@compiled_part
 def _column(x: float, y: float, columns: int) -> int:
     """The column of a direction."""
     azimuth = math.atan2(y, x)

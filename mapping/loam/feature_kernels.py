@@ -6,7 +6,7 @@ Zhang and Singh, "LOAM", RSS 2014, section V-A; thresholds as in the authors' pr
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 
 EDGE, PLANE = 1, 2
@@ -71,7 +71,7 @@ def classify(
             begin = end
 
 
-@compiled
+@compiled_part
 def _exclude_unreliable(
     points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], free: NDArray[np.bool_]
 ) -> None:
@@ -93,7 +93,7 @@ def _exclude_unreliable(
         before = after
 
 
-@compiled
+@compiled_part
 def _pick_edges(
     points: FloatArray, curvature: FloatArray, edge_above: float, first: int, last: int, free: NDArray[np.bool_],
     kinds: NDArray[np.int8],
@@ -115,6 +115,6 @@ def _pick_edges(
                 free[j + step] = False
 
 
-@compiled
+@compiled_part
 def _squared_distance(p: FloatArray, q: FloatArray) -> float:
     return float((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)

@@ -11,7 +11,6 @@ Not `gtsam.writeG2o`, whose six digits are a millimetre at a kilometre.
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.loops.closure import RelativePose
@@ -32,6 +31,8 @@ def format_g2o(poses: FloatArray, edges: Sequence[RelativePose]) -> str:
 
 def _seven(T: FloatArray) -> FloatArray:
     """x y z qx qy qz qw, qw >= 0."""
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)])
 
 

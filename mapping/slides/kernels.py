@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 
 # Pixels of one degree.
@@ -108,7 +108,7 @@ def vote(
             votes[blocks[m], s] += own[s]
 
 
-@compiled
+@compiled_part
 def _vote_once(shift: float, half: float, bin_m: float, votes: NDArray[np.float32]) -> None:
     """Raise the votes (S,) around a shift to a triangle of half-width `half`."""
     middle = len(votes) // 2
@@ -119,6 +119,6 @@ def _vote_once(shift: float, half: float, bin_m: float, votes: NDArray[np.float3
         votes[s] = max(votes[s], weight)
 
 
-@compiled
+@compiled_part
 def _dot(a: FloatArray, b: FloatArray) -> float:
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 
 Keys = NDArray[np.int64]
@@ -50,31 +50,31 @@ class Cells(NamedTuple):
     sums: Floats  # (M, 15) moments
 
 
-@compiled
+@compiled_part
 def cell_of(coordinate: float) -> int:
     """Cell along one axis; never the last one, so that no key is `EMPTY`."""
     return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 2))
 
 
-@compiled
+@compiled_part
 def key_of(i: int, j: int, k: int) -> int:
     return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
 
 
-@compiled
+@compiled_part
 def neighbour_key(key: int, i: int, j: int, k: int) -> int:
     """Key of the cell at an offset of (i, j, k) cells from a cell or from its other side."""
     return int((key & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k)
 
 
-@compiled
+@compiled_part
 def _home(key: int, bits: int) -> int:
     """First slot of a key; cells above one another share a cache line."""
     column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
     return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
 
 
-@compiled
+@compiled_part
 def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
     slot = _home(key, bits)
     while table_keys[slot] != EMPTY:
@@ -191,7 +191,7 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
         rows[n] = row if row != ABSENT else _nearest(i, j, k, x, y, z, cells)
 
 
-@compiled
+@compiled_part
 def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
     """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells."""
     nearest, least = ABSENT, np.inf
@@ -211,7 +211,7 @@ def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells)
     return nearest
 
 
-@compiled
+@compiled_part
 def middle_of(key: int) -> tuple[float, float, float]:
     """Centre of a cell, in units of cells."""
     mask = (1 << BITS) - 1

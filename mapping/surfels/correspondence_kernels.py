@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.surfel_kernels import is_steep
 
@@ -109,7 +109,7 @@ def match_compact(
     return count
 
 
-@compiled
+@compiled_part
 def _axis(p: FloatArray, axis: int) -> tuple[float, float, float]:
     """A principal axis of a surfel (15,), by ascending extent."""
     if axis == 0:
@@ -119,7 +119,7 @@ def _axis(p: FloatArray, axis: int) -> tuple[float, float, float]:
     return p[6], p[7], p[8]
 
 
-@compiled
+@compiled_part
 def _write(
     found: Rows, row: int, n: int, point: FloatArray, u: float, v: float, w: float, thickness_m: float, tilt: float
 ) -> None:

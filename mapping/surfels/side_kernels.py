@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.cell_kernels import Cells
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one
@@ -73,7 +73,7 @@ def turn_to_sensor(
             rows[n] = other
 
 
-@compiled
+@compiled_part
 def _facing(row: int, x: float, y: float, z: float, cells: Cells, surfels: FloatArray) -> float:
     """Cosine of a view with a cell's normal, where it has a plane, else with the cell's mean view."""
     p, sums = surfels[row], cells.sums[row]

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
@@ -39,19 +39,19 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
             refresh_one(row, cells, surfels, counts, scratch)
 
 
-@compiled
+@compiled_part
 def is_steep(along: float, distance: float) -> bool:
     """Whether a ray of some length meets a plane at no grazing angle, from the side of its normal."""
     return along > _LEAST_SINE * distance
 
 
-@compiled
+@compiled_part
 def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -> bool:
     """Whether the cell in a row has grown since its surfel was computed."""
     return bool(counts[row] * _GROWTH <= sums[row, 0])
 
 
-@compiled
+@compiled_part
 def refresh_one(
     row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
     scratch: tuple[FloatArray, FloatArray, FloatArray],
@@ -83,7 +83,7 @@ def refresh_one(
     surfel[14] = enough and thickness < _MOST_THICKNESS * width and width > _LEAST_WIDTH * length
 
 
-@compiled
+@compiled_part
 def _gather(row: int, cells: Cells, total: FloatArray) -> None:
     """Write the weighted sums (15,) of a cell and its 26 neighbours, about its own centre.
 
@@ -105,7 +105,7 @@ def _gather(row: int, cells: Cells, total: FloatArray) -> None:
                     _add_shifted(sums, i, j, k, total)
 
 
-@compiled
+@compiled_part
 def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
     """The row of that side of a cell whose view direction is nearer to that of the sums (15,)."""
     other = cells.others[row]
@@ -114,14 +114,14 @@ def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
     return row
 
 
-@compiled
+@compiled_part
 def _view_cosine(own: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
     """Cosine between the view directions of two cells, times the length of the first."""
     length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
     return float((own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9))
 
 
-@compiled
+@compiled_part
 def _add_shifted(sums: NDArray[np.float32], i: int, j: int, k: int, total: FloatArray) -> None:
     """Add moments about the centre of a cell at an offset of (i, j, k) cells to moments about the own centre."""
     weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.odometry.images.projection import Floats, column_of, row_of, write_angles
 
@@ -105,7 +105,7 @@ def accumulate(
     return seen, matches
 
 
-@compiled
+@compiled_part
 def _correspond(points: Floats, planes: Planes, motion: Motion, scale_m: float, block: _Block) -> None:
     """Find the correspondences of a block of points.
 
@@ -147,7 +147,7 @@ def _correspond(points: Floats, planes: Planes, motion: Motion, scale_m: float, 
         block.residuals[i] = dx * u + dy * v + dz * w
 
 
-@compiled
+@compiled_part
 def _compensate(x: float, y: float, z: float, t: float, velocity: FloatArray) -> tuple[float, float, float]:
     """A point measured t seconds after the middle of the sweep, in the frame of the middle, at an even velocity.
 
@@ -165,7 +165,7 @@ def _compensate(x: float, y: float, z: float, t: float, velocity: FloatArray) ->
     )
 
 
-@compiled
+@compiled_part
 def _project(size: int, planes: Planes, block: _Block) -> None:
     """Write the pixels of a block of points, and whether they are in view."""
     x, y, z = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
@@ -182,7 +182,7 @@ def _project(size: int, planes: Planes, block: _Block) -> None:
         block.pixels[i] = int(row) * planes.width + int(column_of(azimuths[i], planes.width))
 
 
-@compiled
+@compiled_part
 def _write_row(i: int, block: _Block, root: float, row: FloatArray) -> None:
     """Write a point's Jacobian (12,) and residual, times the root of its weight.
 
@@ -197,21 +197,21 @@ def _write_row(i: int, block: _Block, root: float, row: FloatArray) -> None:
     row[12] = root * block.residuals[i]
 
 
-@compiled
+@compiled_part
 def _rotate(T: FloatArray, point: Floats, turned: FloatArray) -> None:
     """Write the normal (3,) of a point (7,) in the previous frame."""
     for j in range(3):
         turned[j] = T[j, 0] * point[3] + T[j, 1] * point[4] + T[j, 2] * point[5]
 
 
-@compiled
+@compiled_part
 def _add_square(vector: FloatArray, total: FloatArray) -> None:
     for i in range(3):
         for j in range(3):
             total[i, j] += vector[i] * vector[j]
 
 
-@compiled
+@compiled_part
 def _room() -> _Block:
     # Arrays of their own: views of one might overlap, and the compiler would not vectorise.
     x, y, z, residuals = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)

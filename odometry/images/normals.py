@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 
 Floats = NDArray[np.float32]
 
@@ -95,7 +95,7 @@ def _fit_planes(padded: Floats, patch: Patch, normals: Floats) -> None:
                         normals[axis, i, j] = found[axis * _STRIDE + j - begin]
 
 
-@compiled
+@compiled_part
 def _scatter(padded: Floats, i: int, begin: int, size: int, patch: Patch, work: Floats) -> None:
     """Write the moments of the neighbours of a block of pixels, all of row i, about each pixel itself.
 
@@ -123,7 +123,7 @@ def _scatter(padded: Floats, i: int, begin: int, size: int, patch: Patch, work: 
             _add(size, gate_m, itself, x[first:last], y[first:last], z[first:last], ranges[first:last], work)
 
 
-@compiled
+@compiled_part
 def _add(
     size: int, gate_m: np.float32, itself: np.float32, x: Floats, y: Floats, z: Floats, ranges: Floats, work: Floats
 ) -> None:
@@ -148,7 +148,7 @@ def _add(
         work[14 * _STRIDE + k] += dx * dz
 
 
-@compiled
+@compiled_part
 def _fit(size: int, work: Floats, patch: Patch, found: Floats) -> None:
     """Write the normals (3 * STRIDE,) of a block of pixels by the moments of their neighbours; zero without a plane.
 
@@ -206,7 +206,7 @@ def _fit(size: int, work: Floats, patch: Patch, found: Floats) -> None:
         found[2 * _STRIDE + k] = w * each if is_plane else _ZERO
 
 
-@compiled
+@compiled_part
 def _slope(s: np.float32, pairs: np.float32) -> np.float32:
     """The derivative of the characteristic polynomial, which is positive below the smallest eigenvalue."""
     slope = (_THREE * s - _TWO) * s + pairs

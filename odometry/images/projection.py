@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 
 Floats = NDArray[np.float32]
@@ -138,13 +138,13 @@ def _write_pixels(x: Floats, y: Floats, z: Floats, ranges: Floats, index: NDArra
             image[0, pixel], image[1, pixel], image[2, pixel], image[3, pixel] = x[n], y[n], z[n], ranges[n]
 
 
-@compiled
+@compiled_part
 def row_of(elevation: float, low: float, rows_per_radian: float) -> float:
     """A whole number, which may lie outside of the image."""
     return float(np.floor((elevation - low) * rows_per_radian + 0.5))
 
 
-@compiled
+@compiled_part
 def column_of(azimuth: float, width: int) -> float:
     """A whole number inside the image."""
     azimuth = azimuth + _TURN if azimuth < 0.0 else azimuth
@@ -161,7 +161,7 @@ def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: 
         azimuths[i] = _arc_tangent(y[i], x[i])
 
 
-@compiled
+@compiled_part
 def _arc_tangent(y: np.float32, x: np.float32) -> np.float32:
     """atan2 in single precision without branches, so that the processor takes several at once; NaN for NaN.
 

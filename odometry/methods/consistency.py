@@ -9,7 +9,6 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
@@ -89,6 +88,8 @@ def plane_distances(queries: FloatArray, points: FloatArray) -> tuple[FloatArray
         Distances (M,), NaN where the nearest points form no plane, and the axis (M,), 0 to 2, that the plane's normal
         is closest to.
     """
+    from scipy.spatial import cKDTree  # takes a while to load
+
     _, nearest = cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False).query(queries, _PLANE_POINTS)
     neighbourhood = points[nearest]
     centre = neighbourhood.mean(axis=1)

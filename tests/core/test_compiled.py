@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, is_compiled
 
 SOURCE = """
 from lidarslam.core.compiled import compiled
@@ -38,6 +38,8 @@ from callee import factor
 def scaled(value):
     return factor(value)
 """
+
+PART = CALLEE.replace("import compiled", "import compiled_part").replace("@compiled", "@compiled_part")
 
 Load = Callable[[str, str], ModuleType]
 
@@ -118,14 +120,40 @@ def test_numba_may_be_switched_off() -> None:
     assert done.stdout.strip() == "[2]", done.stderr
 
 
-def test_a_change_of_what_is_called_outdates_what_calls(load: Load) -> None:
+@pytest.mark.parametrize("callee", [CALLEE, PART])
+def test_a_change_of_what_is_called_outdates_what_calls(load: Load, callee: str) -> None:
     for factor in (2.0, 10.0):
-        load("callee", CALLEE.format(factor=factor))
+        load("callee", callee.format(factor=factor))
         assert load("caller", CALLER).scaled(3.0) == 3.0 * factor
-    load("callee", CALLEE.format(factor=10.0))
+    load("callee", callee.format(factor=10.0))
     unchanged = load("caller", CALLER)
     assert unchanged.scaled(3.0) == 30.0
     assert loaded_from_disk(unchanged.scaled) == 1
+
+
+def test_a_module_is_compiled_once_all_its_functions_are_on_disk(load: Load) -> None:
+    source = SOURCE + "@compiled\ndef least(values):\n    return min(values[0], values[1])\n"
+    module = load("sums", source)
+    assert not is_compiled(module)
+    module.total(np.arange(4.0))
+    assert not is_compiled(module)
+    module.least(np.arange(4.0))
+    assert is_compiled(module)
+    assert is_compiled(load("sums", source))
+    assert not is_compiled(load("sums", f"{source}# changed"))
+
+
+def test_a_user_without_a_home_keeps_code_in_a_temporary_folder(tmp_path: Path) -> None:
+    (tmp_path / "sums.py").write_text(SOURCE)
+    (tmp_path / "__pycache__").write_text("a file, where no folder can be made")
+    (tmp_path / "tmp").mkdir()
+    code = "import numpy, sums; sums.total(numpy.arange(4.0)); print(sum(sums.total.stats.cache_hits.values()))"
+    environment = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    environment |= {"HOME": os.devnull, "TMPDIR": str(tmp_path / "tmp")}
+    environment["PYTHONPATH"] = f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}"
+    command = [sys.executable, "-c", code]
+    runs = [subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2)]
+    assert [int(done.stdout) for done in runs] == [0, 1]
 
 
 def test_division_by_zero_gives_infinity_as_in_numpy() -> None:

@@ -43,7 +43,7 @@ def described(bag: Path, monkeypatch: pytest.MonkeyPatch, info: RecordingInfo | 
 
 def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.array([[1.0, 0, 0], [2.0, 0, 0], [0, 0, 0]])
-    first = Scan.from_raw(points, 10.0, np.array([-0.05, 0.05, 0.0]), np.array([0, 1, 2]))
+    first = Scan.from_raw(points, 10.0, np.array([-0.05, 0.05, 0.0]), np.array([0, 1, 2]), np.arange(3.0))
     info = RecordingInfo(
         "rosbag",
         3,
@@ -65,7 +65,13 @@ def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "last_stamp_s": 10.2,
         "duration_s": pytest.approx(0.2),
         "rate_hz": pytest.approx(10.0),
-        "first_scan": {"points": 2, "dropped_points": 1, "has_rings": True},
+        "first_scan": {
+            "points": 2,
+            "dropped_points": 1,
+            "has_intensities": True,
+            "has_colours": False,
+            "has_rings": True,
+        },
         "fields": [{"name": "x", "type": "float32"}, {"name": "t", "type": "uint32"}],
         "point_time": {"field": "t", "unit": "ns", "reference": "relative", "first_s": -0.05, "last_s": 0.05},
         "ground_truth": str(bag.with_suffix(".tum")),
@@ -85,7 +91,8 @@ def test_what_is_not_there_is_null(bag: Path, monkeypatch: pytest.MonkeyPatch) -
     assert [key for key in KEYS if content[key] is None] == [
         key for key in KEYS if key in ("topic", "rate_hz", "point_time", "ground_truth")
     ]
-    assert content["first_scan"] == {"points": 1, "dropped_points": 0, "has_rings": False}
+    none = dict.fromkeys(("has_intensities", "has_colours", "has_rings"), False)
+    assert content["first_scan"] == {"points": 1, "dropped_points": 0, **none}
 
 
 def test_topics_to_choose_from(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:

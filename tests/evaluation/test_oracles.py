@@ -37,9 +37,7 @@ def test_absolute_errors_equal_those_of_evo(pair):
         ape[relation] = APE(relation)
         ape[relation].process_data((as_evo(reference), aligned))
     assert metrics.errors.ate_rmse_m == pytest.approx(rmse(ape[PoseRelation.translation_part]), rel=1e-9)
-    # evo aligns by the positions alone, the orientations count too here.
-    evo_deg = rmse(ape[PoseRelation.rotation_angle_deg])
-    assert 0.75 * evo_deg < metrics.errors.ate_rotation_rmse_deg < evo_deg
+    assert metrics.errors.ate_rotation_rmse_deg == pytest.approx(rmse(ape[PoseRelation.rotation_angle_deg]), rel=1e-6)
     np.testing.assert_allclose(distances_m, ape[PoseRelation.translation_part].error, atol=1e-9)
     np.testing.assert_allclose(np.rad2deg(angles_rad), ape[PoseRelation.rotation_angle_deg].error, atol=1e-5)
 

@@ -98,9 +98,9 @@ def test_asking_for_the_map_on_the_way_changes_no_pose(room_scans: list[Scan]) -
     poses = []
     for asks in (False, True):
         with Slam(GRAPH) as slam:
-            for scan in room_scans:
+            for number, scan in enumerate(room_scans[:12]):
                 slam.register_frame(scan)
-                if asks:
+                if asks and number % 4 == 1:
                     slam.map()
                     slam.trajectory()
             poses.append((slam.trajectory().T_world_lidar, len(slam.map())))

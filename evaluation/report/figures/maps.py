@@ -2,7 +2,6 @@
 
 import numpy as np
 import plotly.graph_objects as go
-from scipy.stats import binned_statistic_2d
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.evaluation.comparison.comparison import MapErrors, SequenceComparison
@@ -50,6 +49,8 @@ def entropy_figure(sequence: SequenceComparison, styles: Styles) -> Figure | Non
 
 def raster(errors: MapErrors, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
     """Median distance (rows, columns) of the points in each cell; NaN where there is none."""
+    from scipy.stats import binned_statistic_2d  # takes longer to load than the rest of a page
+
     x, y = errors.points[:, 0], errors.points[:, 1]
     finite = np.isfinite(errors.distances_m)
     bins = [y_edges, x_edges]

@@ -1,0 +1,127 @@
+"""Loops are compiled ahead: those of a run, for the types that it calls them with, by processes that end."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarslam.config.settings import load_config
+from lidarslam.pipeline import compile_ahead
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.pipeline.rehearsal import PARTS
+
+REPOSITORY = Path(__file__).parents[2]
+# Loops that only some runs need, and that take no more than a second to compile.
+LEFT_OUT = {"lidarslam.core.thinning", "lidarslam.mapping.surfels.symmetric"}
+# Rehearse everything, take a recording through the pipeline, and print the loops that are called with other types.
+REHEARSE_AND_RUN = """
+import gc, sys
+from pathlib import Path
+from numba.core.dispatcher import Dispatcher
+from lidarslam.config.settings import load_config
+from lidarslam.pipeline.rehearsal import PARTS, main
+from lidarslam.run.request import RunRequest
+from lidarslam.run.run import execute
+
+def called():
+    loops = (o for o in gc.get_objects() if isinstance(o, Dispatcher) and o.py_func.__module__.startswith("lidarslam"))
+    return {(o.py_func.__module__, o.py_func.__name__): set(o.overloads) for o in loops if hasattr(o._cache, "_cache")}
+
+main([])
+before = called()
+modules = {f"lidarslam.{module}" for part in PARTS.values() for module in part.modules}
+for loop, types in before.items():
+    if loop[0] in modules and not types:
+        print("not rehearsed", *loop)
+for method in ("surfels", "loam"):
+    config = load_config(None, [f"mapping.method={method}"])
+    execute(RunRequest(Path(sys.argv[1]), Path(sys.argv[2]), config, overwrite=True), lambda *_: None)
+for loop, types in called().items():
+    if types - before.get(loop, set()):
+        print("other types", *loop, types)
+"""
+
+
+def test_a_rehearsal_compiles_all_that_a_run_calls(tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    angles, heights = np.meshgrid(np.linspace(-np.pi, np.pi, 600), np.deg2rad(np.linspace(-15.0, 15.0, 16)))
+    rays = np.stack([np.cos(heights) * np.cos(angles), np.cos(heights) * np.sin(angles), np.sin(heights)], axis=-1)
+    rays = rays.reshape(-1, 3)
+    for number in range(4):
+        ranges = (np.array([9.0, 7.0, 2.0]) / np.abs(rays)).min(axis=1) + rng.normal(0.0, 0.01, len(rays))
+        np.save(folder / f"{number:06d}.npy", ranges[:, None] * rays - np.array([0.1 * number, 0.0, 0.0]))
+    command = [sys.executable, "-c", REHEARSE_AND_RUN, str(folder), str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    assert not done.stdout
+
+
+def test_every_file_with_compiled_loops_belongs_to_a_part() -> None:
+    sources = [path for top in ("odometry", "mapping", "lidarslam/core") for path in (REPOSITORY / top).rglob("*.py")]
+    with_loops = {path for path in sources if "\n@compiled\n" in path.read_text(encoding="utf-8")}
+    paths = [path.relative_to(REPOSITORY).with_suffix("").parts for path in with_loops]
+    names = {".".join(parts if parts[0] == "lidarslam" else ("lidarslam", *parts)) for parts in paths}
+    in_parts = {f"lidarslam.{module}" for part in PARTS.values() for module in part.modules}
+    assert names - LEFT_OUT == in_parts
+
+
+@pytest.mark.parametrize(
+    ("settings", "parts"),
+    [
+        ([], ["surfels", "alignment", "images", "map", "checks"]),
+        (["mapping.method=loam", "odometry.method=kiss-icp"], ["loam", "map", "checks"]),
+        (["mapping.method=off", "odometry.method=kiss-icp"], ["map", "checks"]),
+    ],
+)
+def test_a_run_compiles_the_parts_that_it_uses(settings: list[str], parts: list[str]) -> None:
+    assert parts_of(load_config(None, settings)) == parts
+
+
+class Popen(subprocess.Popen[bytes]):
+    """A process that sleeps, or fails, in place of one that compiles."""
+
+    code = "import time; time.sleep(60)"
+
+    def __init__(self, command: list[str], **options: object) -> None:
+        super().__init__([command[0], "-c", self.code], **options)  # type: ignore[call-overload]
+
+
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compile_ahead, "uncompiled", lambda names: names)
+    monkeypatch.setattr(subprocess, "Popen", Popen)
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_an_interruption_ends_the_processes() -> None:
+    def interrupt(_: str) -> None:
+        raise KeyboardInterrupt
+
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), CompileAhead(parts_of(load_config(None, []))) as compiling:
+        compiling.wait_for_first_scan(interrupt)
+    assert compiling._running
+    assert all(process.poll() is not None for process in compiling._running)
+    assert time.monotonic() - started < 50.0  # they would sleep for 60 s
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_a_process_that_fails_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Popen, "code", "raise SystemExit(1)")
+    lines: list[str] = []
+    with CompileAhead(parts_of(load_config(None, []))) as compiling:
+        compiling.wait_for_first_scan(lines.append)
+        compiling.wait_for_all(lines.append)
+    assert lines[0] == "compiling loops, once on this machine (0 of 4)"
+
+
+def test_nothing_is_waited_for_once_all_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda _: True)
+    with CompileAhead(parts_of(load_config(None, []))) as compiling:
+        compiling.wait_for_all(pytest.fail)
+    assert not compiling._running

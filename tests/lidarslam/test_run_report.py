@@ -1,0 +1,214 @@
+"""The page and the pictures of one run: left by run and evaluate, drawn from its files, never in its way."""
+
+import json
+import re
+import shutil
+from base64 import b64decode, b64encode
+from collections.abc import Sequence
+from hashlib import sha256
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.core.errors import InputError
+from lidarslam.storage.comparison_folder import run_directories
+from lidarslam.viewer.page.run_report import Accuracy, leave_report
+from lidarslam.viewer.page.run_text import changed_settings, describe_source, describe_warnings
+
+PAGE = ("report.html", "map.png", "trajectory.png")
+FAST = ("--odometry", "constant-velocity")
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def there(run: Path) -> list[str]:
+    return [name for name in PAGE if (run / name).exists()]
+
+
+def figures(html: str) -> list[str]:
+    """Titles of the figures in order."""
+    return re.findall(r"<figcaption><b>Figure \d+\. (.*?)\.</b>", html)
+
+
+def plots(html: str) -> list[dict]:
+    return [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', html, re.DOTALL)]
+
+
+def replace_statuses(run: Path, statuses: Sequence[str]) -> None:
+    rows = (run / "scans.csv").read_text().splitlines()
+    changed = [row.replace(",ok,", f",{status},", 1) for row, status in zip(rows[1:], statuses, strict=True)]
+    (run / "scans.csv").write_text("\n".join([rows[0], *changed]) + "\n")
+
+
+def test_a_run_leaves_a_page_with_its_picture_its_errors_and_what_was_changed(whole_run: Path) -> None:
+    assert there(whole_run) == list(PAGE)
+    for name in PAGE[1:]:
+        pixels = np.asarray(o3d.io.read_image(str(whole_run / name)))
+        assert pixels.shape[1] == 1600
+        assert (pixels < 250).any()
+    html = (whole_run / "report.html").read_text()
+    embedded = re.findall(r'<img src="data:image/png;base64,([\w+/=]+)"', html)
+    assert len(embedded) == 1
+    assert b64decode(embedded[0]) == (whole_run / "map.png").read_bytes()
+    assert figures(html)[:3] == ["Map and trajectory", "Trajectories", "Absolute errors"]
+    assert "Registration over time" in figures(html)
+    text = unescape(re.sub(r"<script.*?</script>|<[^>]+>", "", html, flags=re.DOTALL))
+    assert "odometry.methodconstant-velocity (default learned)" in text
+    assert "6 ok, 0 degraded, 0 lost" in text
+    metrics = json.loads((whole_run / "metrics.json").read_text())
+    assert f"{metrics['trajectory']['ate_rmse_m']:.3f}" in text
+
+
+def test_the_page_runs_its_own_scripts_alone_and_fetches_nothing(whole_run: Path) -> None:
+    html = (whole_run / "report.html").read_text()
+    allowed = re.search(r"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src([^\"]*)", html)
+    assert allowed is not None
+    scripts = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
+    hashes = {f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts}
+    assert set(allowed[1].split()) == hashes
+    outside = re.sub(r"<script>.*?</script>", "", html, flags=re.DOTALL)
+    assert not re.findall(r"(?:src|href)=\"(?!data:|#)", outside)
+
+
+def test_a_run_can_do_without_and_takes_an_earlier_page_away(tmp_path: Path, small_recording: Path) -> None:
+    out = tmp_path / "run"
+    assert lidarslam("run", small_recording, "--out", out, *FAST).exit_code == 0
+    assert there(out) == list(PAGE)
+    command = ("run", small_recording, "--out", out, *FAST, "--no-report", "--overwrite")
+    assert lidarslam(*command).exit_code == 0
+    assert there(out) == []
+
+
+def test_a_page_that_cannot_be_drawn_costs_itself_alone(tmp_path: Path, small_recording: Path) -> None:
+    out = tmp_path / "run"
+    (out / "report.html").mkdir(parents=True)
+    result = lidarslam("run", small_recording, "--out", out, *FAST)
+    assert result.exit_code == 1, "the folder is not a run's"
+    assert leave_report(out, Accuracy()) is False
+
+
+def test_a_page_that_finds_a_folder_in_its_place_is_a_warning(
+    finished_run: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (finished_run / "report.html").unlink()
+    (finished_run / "report.html").mkdir()
+    assert leave_report(finished_run, Accuracy()) is False
+    assert "no report.html was drawn: " in caplog.text
+    assert "is a folder" in caplog.text
+    result = lidarslam("evaluate", finished_run)
+    assert result.exit_code == 0
+    assert json.loads((finished_run / "metrics.json").read_text())["trajectory"] is not None
+
+
+def test_an_interruption_ends_the_drawing_alone(finished_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarslam.viewer.page.run_report.render_run", interrupted)
+    assert leave_report(finished_run, Accuracy()) is False
+
+
+def test_evaluate_draws_the_page_again_with_the_errors(finished_run: Path, small_recording: Path) -> None:
+    assert leave_report(finished_run, Accuracy())
+    assert "Absolute errors" not in figures((finished_run / "report.html").read_text())
+    for option in ("--no-report", f"--out={finished_run.parent / 'elsewhere.json'}"):
+        assert lidarslam("evaluate", finished_run, option).exit_code == 0
+        assert "Absolute errors" not in figures((finished_run / "report.html").read_text())
+    assert lidarslam("evaluate", finished_run, "--reference-map", finished_run / "map.ply").exit_code == 0
+    shown = figures((finished_run / "report.html").read_text())
+    assert {"Absolute errors", "Error components", "Map errors"} <= set(shown)
+
+
+def test_evaluate_against_camera_poses_draws_these(finished_run: Path) -> None:
+    kitti = finished_run.parent / "truth.txt"
+    shutil.copyfile(finished_run / "trajectory.kitti", kitti)
+    assert lidarslam("evaluate", finished_run, "--reference", kitti).exit_code == 0
+    html = (finished_run / "report.html").read_text()
+    assert "Absolute errors" in figures(html)
+    assert "truth.txt" in html
+
+
+def test_bands_show_where_tracking_was_degraded_and_lost(finished_run: Path) -> None:
+    replace_statuses(finished_run, ["ok", "degraded", "degraded", "ok", "lost", "ok"])
+    assert leave_report(finished_run, Accuracy())
+    (residual,) = (
+        plot for plot in plots((finished_run / "report.html").read_text())
+        if plot["layout"].get("shapes") and plot["data"][0]["hovertemplate"] == "%{y:.4f}"
+    )  # fmt: skip
+    bands = [(shape["fillcolor"], shape["x0"], shape["x1"]) for shape in residual["layout"]["shapes"]]
+    assert [colour for colour, _, _ in bands] == ["#e69f00", "#d4003c"]
+    np.testing.assert_allclose([band[1:] for band in bands], [[0.1, 0.3], [0.4, 0.5]], atol=1e-6)
+
+
+def test_names_are_shown_as_they_are(tmp_path: Path, whole_run: Path) -> None:
+    run = Path(shutil.copytree(whole_run, tmp_path / "<b>&amp;"))
+    assert leave_report(run, Accuracy())
+    html = (run / "report.html").read_text()
+    assert "<h1>&lt;b&gt;&amp;amp;</h1>" in html
+    assert "<b>&amp;amp;" not in html.replace("<b>Table", "")
+
+
+def test_a_run_without_a_map_has_a_page_without_a_picture(finished_run: Path) -> None:
+    for name in ("map.ply", *PAGE):
+        (finished_run / name).unlink()
+    assert leave_report(finished_run, Accuracy())
+    assert there(finished_run) == ["report.html", "trajectory.png"]
+    assert '<img src="data:' not in (finished_run / "report.html").read_text()
+
+
+def test_settings_of_another_version_are_not_called_the_defaults() -> None:
+    assert changed_settings({"run": {"version": "0"}}) == {}
+    assert changed_settings({"mapping": {"method": "off"}}) == {"mapping.method": "off (default surfels)"}
+    assert changed_settings({"no_longer": {"there": 1}}) is None
+
+
+def test_a_part_of_a_recording_is_named() -> None:
+    whole = {"version": "1.0", "source": "a.mcap", "start": 0, "stop": None, "step": 1, "prior": None}
+    assert describe_source(whole) == ["Source: a.mcap", "lidarslam 1.0"]
+    part = describe_source({**whole, "stop": 50, "prior": "wheels.tum"})
+    assert part == ["Source: a.mcap", "Scans: start 0, stop 50, step 1", "Prior: wheels.tum", "lidarslam 1.0"]
+
+
+def test_many_losses_are_counted() -> None:
+    lost = [{"first": n, "last": n + n % 2, "reason": "dark"} for n in range(5)]
+    told = list(describe_warnings({"lost": lost, "warnings": ["a gap"]}))
+    assert told[:2] == ["tracking was lost on scan 0: dark", "tracking was lost on scans 1 to 2: dark"]
+    assert told[3:] == ["tracking was lost on 2 more stretches; scans.csv lists them", "a gap"]
+
+
+def test_the_runs_of_a_comparison_are_found_from_its_folder(tmp_path: Path, whole_run: Path) -> None:
+    methods = {"a": {"run": "room/a"}, "b": {"run": "room/b"}, "failed": {"run": None}}
+    for name in "ab":
+        shutil.copytree(whole_run, tmp_path / "room" / name)
+    (tmp_path / "comparison.json").write_text(json.dumps({"sequence": "room", "methods": methods}))
+    expected = [tmp_path / "room" / "a", tmp_path / "room" / "b"]
+    assert run_directories(tmp_path) == expected
+    assert run_directories(whole_run) == [whole_run]
+    drawn = lidarslam("view", tmp_path, "--picture", tmp_path / "maps.png")
+    assert drawn.exit_code == 0
+    assert np.asarray(o3d.io.read_image(str(tmp_path / "maps.png"))).shape[1] == 1600
+    # One of several recordings: its folder has the same content, and its runs lie in it.
+    shutil.move(tmp_path / "comparison.json", tmp_path / "room" / "comparison.json")
+    assert run_directories(tmp_path / "room") == expected
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"sequences": [{"sequence": "north"}, {"sequence": "south"}]}', "several recordings.*name one of .*north"),
+        ('{"methods": {"a": {"run": null}}}', "none of its methods came to a result"),
+        ("{}", "not a comparison"),
+        ("no json", "not a comparison"),
+    ],
+)
+def test_a_comparison_that_cannot_be_drawn_says_why(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "comparison.json").write_text(content)
+    with pytest.raises(InputError, match=message):
+        run_directories(tmp_path)
