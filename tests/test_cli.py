@@ -1,6 +1,5 @@
 """The command line as a stranger meets it: help, exit statuses, one-line errors."""
 
-import contextlib
 import json
 import os
 import re
@@ -271,11 +270,11 @@ def test_view_writes_a_recording_and_a_picture(recording: Path, tmp_path: Path) 
     saved = lidarslam("view", tmp_path / "run", tmp_path / "run", "--save", tmp_path / "both.rrd")
     assert saved.exit_code == 0
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "both.rrd").stream()}
-    assert {"/world/0_run/map", "/world/0_run/trajectory", "/world/1_run/map"} <= entities
+    first, second = r"/world/run\ \(1\)", r"/world/run\ \(2\)"
+    assert {f"{first}/map", f"{first}/trajectory", f"{second}/map", "/world/ground\\ truth"} <= entities
     drawn = lidarslam("view", tmp_path / "run", "--picture", tmp_path / "map.png")
     assert drawn.exit_code == 0
     assert (tmp_path / "map.png").stat().st_size > 1_000
-    assert lidarslam("view", recording).exit_code == 1
     assert lidarslam("view", recording, "--picture", tmp_path / "none.png").exit_code == 1
 
 
@@ -306,16 +305,33 @@ def test_a_file_that_may_not_be_read_gets_one_line(recording: Path, monkeypatch:
     assert (result.exit_code, result.stderr) == (1, f"lidarslam: {recording}/000000.npy: Permission denied\n")
 
 
-def test_view_says_where_the_browser_is_served(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert lidarslam("run", recording, "--out", tmp_path / "run", "--stop", 2).exit_code == 0
-    served = contextlib.nullcontext("http://127.0.0.1:9090/?url=there")
-    monkeypatch.setattr("lidarslam.viewer.rerun_runs.served_runs", lambda *_: served)
-    monkeypatch.setattr("signal.pause", lambda: None)
-    lines = lidarslam("view", tmp_path / "run", "--web").stdout.splitlines()
-    assert lines[0] == "http://127.0.0.1:9090/?url=there"
-    assert lines[1].startswith("serving this machine until Ctrl-C; ")
+def test_view_shows_the_scans_of_a_recording(recording: Path, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    done = lidarslam("view", recording, "--save", tmp_path / "scans.rrd", "--start", 1, "--step", 2)
+    assert (done.exit_code, done.stderr) == (0, "")
+    chunks = list(RrdReader(tmp_path / "scans.rrd").stream())
+    scans = [chunk for chunk in chunks if chunk.entity_path == "/world/lidar/scan"]
+    assert sum(chunk.num_rows for chunk in scans) == 2
+    assert any(chunk.entity_path == r"/world/ground\ truth" for chunk in chunks)
+    assert not (tmp_path / "room" / "trajectory.tum").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "--step", 2], "--step belongs to a recording"),
+        (["run", "--reader", "rosbag"], "--reader belongs to a recording"),
+        (["some.rrd", "run"], "is shown alone"),
+        (["some.rrd", "--save", "other.rrd"], "is shown alone"),
+        (["run", "--web", "--save", "other.rrd"], "exclude one another"),
+    ],
+)
+def test_options_that_view_cannot_follow_are_named(arguments: list[object], said: str, tmp_path: Path) -> None:
+    places = [tmp_path / one if one in ("run", "some.rrd") else one for one in arguments]
+    result = lidarslam("view", *places)
+    assert result.exit_code == 2
+    assert said in result.stderr
 
 
 def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path: Path, recording: Path) -> None:
@@ -335,7 +351,9 @@ def test_packages_named_as_our_folders_are_not_in_the_way(tmp_path: Path, record
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_verbose_says_what_is_chosen_before_the_command_or_after(recording: Path, tmp_path: Path, before: bool) -> None:
+def test_verbose_says_what_is_chosen_before_the_command_or_after(
+    recording: Path, tmp_path: Path, before: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     command = ["run", recording, "--out", tmp_path / "run", "--odometry", "constant-velocity"]
     lidarslam(*(["-v", *command] if before else [*command, "-v"]), "--stop", 3)
     said = [record.message for record in caplog.records]

@@ -1,6 +1,7 @@
 """SLAM in a program's own loop, one scan after the other."""
 
 import copy
+import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,12 +26,15 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.pipeline.background_worker import BackgroundWorker
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import Estimated, Localised
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.stages import Stages
 from lidarslam.run.loop_closing import begin_graph
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
+
+logger = logging.getLogger(__name__)
 
 # Scans whose points may wait for the map, to bound the memory they hold.
 _SCANS_BEHIND = 8
@@ -40,6 +44,7 @@ class Slam:
     """Estimates the pose of each scan as it comes, and builds the map in the background.
 
     A context manager: `close` ends its threads. Methods may be called from several threads; one waits for the other.
+    The first one on a machine compiles loops before it is ready, so that no scan has to wait for them.
 
     Args:
         config: the path of a YAML file, or the name of one that comes with the program; settings such as
@@ -57,6 +62,8 @@ class Slam:
             raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
         with python_names():
             self._odometry = open_odometry(self._config, None)
+        with CompileAhead(parts_of(self._config)) as compiling:
+            compiling.wait_for_all(logger.info)
         self._graph = begin_graph(self._config)
         self._stages = Stages(self._odometry, make_localiser(self._config), self._config.global_map, self._graph)
         self._builder = BackgroundWorker("map", _SCANS_BEHIND)

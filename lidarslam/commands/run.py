@@ -1,5 +1,6 @@
 """`lidarslam run`: trajectory and map of a recording."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from lidarslam.commands.options import (
     take_config,
     take_map_formats,
 )
-from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
+from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
 
 
 @click.command(
@@ -41,10 +42,10 @@ from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 @scan_options
 @click.option(
     "--rerun",
-    type=click.Choice(["off", "save", "spawn"]),
+    type=click.Choice(["off", "save", "web", "spawn"]),
     default="off",
     show_default=True,
-    help="Save a Rerun recording; spawn opens a window too.",
+    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
 )
 @map_options
 @click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
@@ -59,25 +60,31 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
 
     if options["resume"] and options["overwrite"]:
         raise click.UsageError("--resume continues a run, --overwrite replaces it; choose one")
-    with show_progress(source.name) as progress:
-        progress.phase("loading the program")
-        from lidarslam.run.request import RunRequest
-        from lidarslam.run.resuming import abandoned, lost_when_finished
-        from lidarslam.run.run import execute
-        from lidarslam.run.summary_text import format_outcome, format_stop
+    with contextlib.ExitStack() as serve:
+        with show_progress(source.name) as progress:
+            progress.phase("loading the program")
+            from lidarslam.run.request import RunRequest
+            from lidarslam.run.resuming import abandoned, lost_when_finished
+            from lidarslam.run.run import execute
+            from lidarslam.run.summary_text import format_outcome, format_stop
+            from lidarslam.storage.directory import RERUN
 
-        config, map_formats = take_config(options, source), take_map_formats(options)
-        out = out or _default_out(source, config.reader.sequence, options["resume"])
-        request = RunRequest(source, out, config, map_formats=map_formats, **options)
-        if request.resume and (lost := lost_when_finished(request)) is not None:
-            say(f"{out}: is finished already")
-            ctx.exit(EXIT_LOST if lost else 0)
-        try:
-            outcome = execute(request, progress, progress.phase)
-        except KeyboardInterrupt:
-            note(abandoned(out))
-            ctx.exit(EXIT_MENDABLE)
-    say(format_outcome(out, outcome))
+            config, map_formats = take_config(options, source), take_map_formats(options)
+            out = out or _default_out(source, config.reader.sequence, options["resume"])
+            request = RunRequest(source, out, config, map_formats=map_formats, **options)
+            if request.resume and (lost := lost_when_finished(request)) is not None:
+                say(f"{out}: is finished already")
+                ctx.exit(EXIT_LOST if lost else 0)
+            page = serve.enter_context(serving()) if request.rerun == "web" else None
+            try:
+                outcome = execute(request, progress, progress.phase, page)
+            except KeyboardInterrupt:
+                note(abandoned(out))
+                ctx.exit(EXIT_MENDABLE)
+        say(format_outcome(out, outcome))
+        if page is not None and outcome.stopped is None:
+            say(f"serving {page.address} until Ctrl-C; later: lidarslam view {out / RERUN} --web")
+            wait_for_interrupt()
     if outcome.stopped is not None:
         note(format_stop(out, outcome))
         ctx.exit(EXIT_MENDABLE)

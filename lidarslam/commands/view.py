@@ -1,66 +1,136 @@
-"""`lidarslam view`: finished runs in Rerun."""
+"""`lidarslam view`: finished runs, raw scans and Rerun recordings."""
 
-import signal
+import contextlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
-from lidarslam.commands.options import PATH, CommandWithExample, config_options, latest_run
-from lidarslam.commands.terminal import say
+from lidarslam.commands.options import (
+    PATH,
+    CommandWithExample,
+    config_options,
+    latest_run,
+    reader_options,
+    scan_options,
+    take_config,
+)
+from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
+from lidarslam.core.errors import InputError
+
+if TYPE_CHECKING:
+    from lidarslam.viewer.web_page import WebPage
+
+_RRD = ".rrd"
 
 
 @click.command(
     cls=CommandWithExample,
     epilog="""lidarslam view
     lidarslam view runs/04 runs/wheels --web
+    lidarslam view office.mcap --web
+    lidarslam view runs/04/recording.rrd
     lidarslam view runs/04 --picture map.png
     lidarslam view compared/04 --picture maps.png""",
 )
-@click.argument("runs", type=PATH, nargs=-1, metavar="[RUN]...")
+@click.argument("places", type=PATH, nargs=-1, metavar="[RUN... | SOURCE | FILE.rrd]")
 @click.option("--web", is_flag=True, help="Serve a browser on this machine instead of opening a window.")
 @click.option("--save", type=PATH, metavar="FILE.rrd", help="Save a Rerun recording instead of opening a window.")
 @click.option("--picture", type=PATH, metavar="FILE.png", help="Draw runs, or .ply files, in one picture instead.")
 @click.option("--oblique", is_flag=True, help="Draw the picture obliquely instead of from above.")
+@scan_options
+@reader_options
 @config_options
+@click.pass_context
 def view(
-    runs: tuple[Path, ...],
+    ctx: click.Context,
+    /,
+    places: tuple[Path, ...],
     web: bool,
     save: Path | None,
     picture: Path | None,
     oblique: bool,
-    config_file: Path | None,
-    settings: tuple[str, ...],
+    **options: Any,
 ) -> None:
-    """Show finished runs: trajectories, maps, and where tracking was lost.
+    """Show finished runs, the raw scans of a recording, or a Rerun recording.
 
-    RUN is a run directory.  [default: the latest run in runs]  With --picture, it may also be the folder of a
-    comparison, or a cloud (.ply or .pcd).
+    RUN is a run directory; several are shown in one space, aligned with the ground truth if there is one.  [default:
+    the latest run in runs]  SOURCE is a recording; --start, --stop and --step choose its scans. With --picture, RUN may
+    also be the folder of a comparison, or a cloud (.ply or .pcd).
     """
-    from lidarslam.config.settings import load_config
-    from lidarslam.storage.finished_run import load_run
-
     if sum([web, save is not None, picture is not None]) > 1:
         raise click.UsageError("--web, --save and --picture exclude one another; choose one")
-    runs = runs or (latest_run(),)
+    places = places or (latest_run(),)
     if picture is not None:
-        _draw(runs, picture, oblique)
-        return
-    if save is not None and save.suffix.lower() != ".rrd":
-        raise click.UsageError(f"{save}: a Rerun recording must end in .rrd; for a picture use --picture {save}")
-    config = load_config(config_file, settings).viewer
-    finished = [load_run(path) for path in runs]
-    from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs
-
-    if save is not None:
-        save_runs(finished, config, save)
-        say(f"written to {save}")
-    elif web:
-        with served_runs(finished, config) as address:
-            say(address)
-            say("serving this machine until Ctrl-C; from another machine, forward ports 9090 and 9876 with ssh -L")
-            signal.pause()
+        _draw(places, picture, oblique)
+    elif any(place.suffix.lower() == _RRD for place in places):
+        if len(places) > 1 or save is not None:
+            raise click.UsageError(f"a {_RRD} file is shown alone, in a window or with --web")
+        _replay(places[0], web)
+    elif save is not None and save.suffix.lower() != _RRD:
+        raise InputError(f"{save}: a Rerun recording must end in {_RRD}; for a picture use --picture {save}")
     else:
-        open_runs(finished, config)
+        _show(_to_show(ctx, places, options), web, save)
+
+
+def _replay(file: Path, web: bool) -> None:
+    from lidarslam.viewer.rerun_output import show_file_in_window, show_file_on_page
+
+    if web:
+        _serve(lambda page: show_file_on_page(file, page))
+    else:
+        show_file_in_window(file)
+
+
+def _show(show: Any, web: bool, file: Path | None) -> None:
+    from lidarslam.viewer.rerun_output import save, show_in_window, show_on_page
+
+    if file is not None:
+        save(show, file)
+        say(f"written to {file}")
+    elif web:
+        _serve(lambda page: show_on_page(show, page))
+    else:
+        show_in_window(show)
+
+
+def _serve(show: "Callable[[WebPage], None]") -> None:
+    with contextlib.suppress(KeyboardInterrupt), serving() as page:  # Ctrl-C is how it ends well
+        show(page)
+        wait_for_interrupt()
+
+
+def _to_show(ctx: click.Context, places: tuple[Path, ...], options: dict[str, Any]) -> Any:
+    """What is shown; its type is not named because that would import Rerun."""
+    from lidarslam.compare.assessment.inputs import truth_of_run
+    from lidarslam.config.settings import load_config
+    from lidarslam.datasets.registry import is_recording
+    from lidarslam.storage.finished_run import is_run, load_run
+
+    if len(places) == 1 and not is_run(places[0]) and is_recording(places[0], options["reader"]):
+        return _scans(places[0], options)
+    for name in ("start", "stop", "step", "reader", "topic", "sequence"):
+        if ctx.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise click.UsageError(f"--{name} belongs to a recording, and {places[0]} is none")
+    config = load_config(options["config_file"], options["settings"]).viewer
+    finished = [load_run(path) for path in places]
+    from lidarslam.viewer.rerun_runs import show_runs
+
+    return show_runs(finished, truth_of_run(places[0]), config)
+
+
+def _scans(source: Path, options: dict[str, Any]) -> Any:
+    from lidarslam.datasets.intake import choose_scans
+    from lidarslam.datasets.registry import open_recording
+    from lidarslam.run.progress import show_count
+    from lidarslam.viewer.rerun_scans import show_scans
+
+    config = take_config(options, source)
+    recording = open_recording(source, config.reader)
+    chosen = choose_scans(recording, source, options["start"], options["stop"], options["step"])
+    return show_scans(recording, source, chosen, config.viewer, show_count, note)
 
 
 def _draw(runs: tuple[Path, ...], picture: Path, oblique: bool) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lidarslam.compare.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
 from lidarslam.compare.methods import parse_methods
 from lidarslam.compare.plan import REPORT_HTML
@@ -63,9 +64,11 @@ def run_demo(out: Path, scans: int = 400, seed: int = 0, tell: Callable[[str], N
     (sequence,) = outcome.comparison.sequences
     runs = [out / result.run for result in sequence.methods if result.run and result.trajectory is not None]
     if runs:
-        from lidarslam.viewer.rerun_runs import save_runs
+        from lidarslam.viewer.rerun_output import save
+        from lidarslam.viewer.rerun_runs import show_runs
 
-        save_runs([load_run(run) for run in runs], ViewerConfig(), out / REPLAY)
+        finished, truth = [load_run(run) for run in runs], truth_of_run(runs[0])
+        save(show_runs(finished, truth, ViewerConfig()), out / REPLAY)
     return Demo(out, outcome, tuple(_picture(out, place) for place in (source, *runs)))
 
 
@@ -80,7 +83,7 @@ def format_demo(demo: Demo) -> str:
     return f"""
 {format_comparison(demo.outcome.comparison, demo.out)}
 maps      {", ".join(str(picture) for picture in demo.pictures)}
-replay    {as_typed("rerun")} {demo.out / REPLAY}
+replay    {as_typed("lidarslam")} view {demo.out / REPLAY} --web
 
 Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that; the
 network measures a turn whatever its size, and the map corrects the rest."""

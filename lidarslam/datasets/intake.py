@@ -1,9 +1,11 @@
 """Scans of a recording on their way to a run: ordered by stamp, thinned where too large, checked once."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
@@ -21,6 +23,18 @@ _SAMPLE = 4096
 _THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most so many, one in a cell of 2 cm"
 _MILLIMETRES = "scans look like millimetres, where metres are expected: convert the points"
 _ONE_PLACE = "scans have all their points at one place and carry no geometry"
+
+
+def choose_scans(recording: Recording, source: Path, start: int, stop: int | None, step: int) -> range:
+    """Indices of the scans that --start, --stop and --step choose.
+
+    Raises:
+        InputError: none is left.
+    """
+    chosen = range(len(recording))[start:stop:step]
+    if not chosen:
+        raise InputError(f"{source}: none of its {len(recording)} scans is left after --start, --stop and --step")
+    return chosen
 
 
 def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Scan]:

@@ -92,6 +92,11 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
 
 
+def is_recording(source: Path, name: str | None = None) -> bool:
+    """Whether a reader was named for an existing source, or one recognises it."""
+    return source.exists() and (name is not None or _recognise(source) is not None)
+
+
 def _recognise(source: Path) -> str | None:
     """The first reader in the table that recognises a path by its names."""
     return next((name for name, reader in READERS.items() if reader.recognises(source)), None)

@@ -44,7 +44,7 @@ def _bar(*more: ProgressColumn) -> Progress:
     """A bar on standard error; silent where no terminal is attached."""
     columns = (
         TextColumn("{task.description}", markup=False),
-        BarColumn(),
+        BarColumn(bar_width=20),  # so that all columns fit into a terminal of 80 characters
         _CountColumn(),
         _RateColumn(),
         _RemainingColumn(),

@@ -27,7 +27,7 @@ class RunRequest:
     stop: int | None = None
     step: int = 1
     prior: Path | None = None  # TUM file of an external odometry, for `odometry.method: external`
-    rerun: RerunMode = "off"  # no Rerun recording, one in the run directory, or that and a window
+    rerun: RerunMode = "off"  # no Rerun recording, one in the run directory, or that and a browser or a window
     map_formats: tuple[MapFormat, ...] = ()  # what the map is written as beside .ply
     overwrite: bool = False  # whether an earlier run in `out` is replaced
     resume: bool = False  # whether the run in `out`, which was killed or stopped, is continued

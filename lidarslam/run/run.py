@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config
-from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.errors import ConfigError, OutputError
 from lidarslam.core.trajectory_io import read_tum
+from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
@@ -22,13 +23,20 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Progress, track
 from lidarslam.storage.directory import RERUN, RunDirectory
 from lidarslam.storage.unfinished import Unfinished
+from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.viewer import Viewer
+from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 
-def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None] = lambda _: None) -> RunOutcome:
+def execute(
+    request: RunRequest,
+    progress: Progress,
+    phase: Callable[[str], None] = lambda _: None,
+    page: WebPage | None = None,
+) -> RunOutcome:
     """Run, and write the run directory.
 
     A damaged recording or an interruption ends the run early, with the results so far. A run that is killed can be
@@ -38,20 +46,19 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
         request: what is run.
         progress: called after every scan.
         phase: called with a few words on what goes on before the first scan and after the last.
+        page: shows the run in browsers, with `rerun="web"`.
 
     Raises:
         LidarSlamError: the source, the configuration or the output directory is not usable, or there is nothing to
             resume.
     """
     require_apart(request.out, request.source)
+    if request.rerun == "spawn":
+        require_window("serve a browser with --rerun web, or write a file with --rerun save")
     config = request.config
     phase("opening the recording")
     recording = open_recording(request.source, config.reader)
-    chosen = range(len(recording))[request.start : request.stop : request.step]
-    if not chosen:
-        raise InputError(
-            f"{request.source}: none of its {len(recording)} scans is left after --start, --stop and --step"
-        )
+    chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
     log_choices(request, chosen, len(recording))
     with Interruptions() as interruptions:
         with ExitStack() as stack:
@@ -67,7 +74,7 @@ def execute(request: RunRequest, progress: Progress, phase: Callable[[str], None
             log, graph = ScanLog(), _open_graph(config, directory, unfinished)
             if graph is not None:
                 stack.callback(graph.close)
-            with _viewing(request, recording.name, directory, log) as viewer:
+            with _viewing(request, recording.name, directory, log, page) as viewer:
                 compiling.wait_for_first_scan(phase)
                 phase("reading the first scans")
                 tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
@@ -107,7 +114,9 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
 
 
 @contextmanager
-def _viewing(request: RunRequest, name: str, directory: RunDirectory, log: ScanLog) -> Iterator[Viewer]:
+def _viewing(
+    request: RunRequest, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
+) -> Iterator[Viewer]:
     """The viewer of a run; a Rerun recording that cannot be written is a warning."""
     if request.rerun == "off":
         yield Viewer()
@@ -118,7 +127,7 @@ def _viewing(request: RunRequest, name: str, directory: RunDirectory, log: ScanL
     try:
         with (
             directory.replacing(RERUN) as path,
-            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn") as viewer,
+            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn", page) as viewer,
         ):
             yield viewer
     except IncompleteRecordingError as error:

@@ -43,6 +43,11 @@ class FinishedRun:
     map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
 
 
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, finished or not."""
+    return (path / files.TRAJECTORY_TUM).is_file() or (path / files.ABOUT).is_file()
+
+
 def load_run(path: Path) -> FinishedRun:
     """Read a run directory.
 

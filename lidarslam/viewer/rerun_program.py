@@ -1,6 +1,6 @@
-"""Rerun's program: its window, and its page for browsers.
+"""Rerun's program: its window, and the files of its page for browsers.
 
-Both listen on this machine alone; started by Rerun's library they would be open to the network.
+It listens on this machine alone; started by Rerun's library it would be open to the network.
 """
 
 import contextlib
@@ -11,16 +11,26 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from lidarslam.core.errors import OutputError
+from lidarslam.viewer.web_page import LOCAL, WebPage
 
-LOCAL = "127.0.0.1"
-# Rerun's own defaults.
-GRPC_PORT, WEB_PORT = 9876, 9090
+# Rerun's own default.
+GRPC_PORT = 9876
 
+# What says that Linux has a display.
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 _START_S, _POLL_S = 30.0, 0.05
+_PAGE_FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico")
+# It asks GitHub for a newer version of itself, by way of a proxy if there is one; at this port there is none.
+_NOWHERE = f"http://{LOCAL}:1"
+_NO_NETWORK = dict.fromkeys(("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy"), _NOWHERE)
+# The program serves its page alone, and no recordings, where it is given a server of recordings.
+_NO_SERVER = f"rerun+http://{LOCAL}:1/proxy"
 
 
 def is_taken(port: int) -> bool:
@@ -29,33 +39,80 @@ def is_taken(port: int) -> bool:
         return probe.connect_ex((LOCAL, port)) == 0
 
 
-def open_window(port: int) -> None:
+def require_window(instead: str) -> None:
+    """Check that a window can be opened, before anything is computed for it.
+
+    Args:
+        instead: what to do where there is no display.
+
+    Raises:
+        OutputError: there is no display.
+    """
+    # A viewer that runs already, perhaps at the other end of a tunnel, needs no display here.
+    if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not is_taken(GRPC_PORT):
+        raise OutputError(f"no display to open a window on; {instead}")
+
+
+def open_window(port: int, recording: Path | None = None) -> None:
     """Open the viewer, which takes recordings at a port, unless it is open already.
+
+    Args:
+        port: of the viewer.
+        recording: a file to show.
 
     Raises:
         OutputError: it cannot be opened.
     """
-    options = ("--port", str(port), "--memory-limit", "75%", "--expect-data-soon", "--hide-welcome-screen")
-    if not is_taken(port) and _start(port, *options) is None:
+    options = ["--port", str(port), "--memory-limit", "75%", "--expect-data-soon", "--hide-welcome-screen"]
+    if recording is not None:
+        options.append(str(recording.resolve()))
+    if not is_taken(port):
+        opened = _start(port, *options) is not None
+    else:  # a second one sends the file to the first and ends
+        opened = recording is None or _launch(*options).wait() == 0
+    if not opened:
         raise OutputError("the Rerun window cannot be opened; write a file instead")
 
 
 @contextlib.contextmanager
-def page_served(port: int, server: str) -> Iterator[None]:
-    """Serve the page that shows a recording's server, for the time of the block.
+def served_page(announce: Callable[[str], None]) -> Iterator[WebPage]:
+    """A page for browsers on this machine, for the time of the block.
 
     Args:
-        port: of the page.
-        server: address of the recording's server.
+        announce: called with its address when there is something to show.
 
     Raises:
         OutputError: it cannot be served.
     """
-    process = _start(port, "--serve-web", "--web-viewer-port", str(port), server)
-    if process is None:
-        raise OutputError("the browser cannot be served; write a file with --save FILE.rrd instead")
+    page = WebPage(_page_files(), announce)
     try:
-        yield
+        yield page
+    finally:
+        page.close()
+
+
+def _page_files() -> dict[str, bytes]:
+    """The files of the viewer for browsers, by their paths on its page; they are part of the program.
+
+    Raises:
+        OutputError: they cannot be had.
+    """
+    with socket.socket() as probe:
+        probe.bind((LOCAL, 0))
+        port = probe.getsockname()[1]
+    process = _start(port, "--serve-web", "--web-viewer-port", str(port), _NO_SERVER)
+    if process is None:
+        raise OutputError("Rerun's page for browsers cannot be had; write a file instead")
+    # No proxy, which would not reach this machine.
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        files = {}
+        for path in _PAGE_FILES:
+            with opener.open(f"http://{LOCAL}:{port}{path}", timeout=_START_S) as response:
+                files[path] = response.read()
+        return files
+    except (urllib.error.URLError, OSError) as error:
+        raise OutputError(f"Rerun's page for browsers cannot be had ({error}); write a file instead") from error
     finally:
         _end(process)
 
@@ -71,15 +128,7 @@ def _program() -> str:
 
 def _start(port: int, *options: str) -> "subprocess.Popen[bytes] | None":
     """Start the program and wait until it listens; None where it does not."""
-    process = subprocess.Popen(
-        [_program(), "--bind", LOCAL, *options],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        # No module from the current folder, no questions.
-        env=os.environ | {"PYTHONSAFEPATH": "1", "RERUN_APP_ONLY": "true"},
-        start_new_session=True,  # Ctrl-C is not meant for it
-    )
+    process = _launch(*options)
     begun, listens = time.monotonic(), False
     try:
         while process.poll() is None and time.monotonic() - begun < _START_S and not listens:
@@ -91,8 +140,21 @@ def _start(port: int, *options: str) -> "subprocess.Popen[bytes] | None":
     return process if listens else None
 
 
+def _launch(*options: str) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(
+        [_program(), "--bind", LOCAL, *options],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        # No module from the current folder, no questions.
+        env=os.environ | {"PYTHONSAFEPATH": "1", "RERUN_APP_ONLY": "true"} | _NO_NETWORK,
+        start_new_session=True,  # Ctrl-C is not meant for it
+    )
+
+
 def _end(process: "subprocess.Popen[bytes]") -> None:
     """With whatever it started."""
     if process.poll() is None:
-        os.killpg(process.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -1,4 +1,4 @@
-"""Rerun recordings: to a file, a window or a browser; the colours and sizes they share.
+"""Rerun recordings: to a file, a window or both; the colours, sizes and timelines they share.
 
 Rerun 0.41 waits without end for a file on a full disk. Its file writer is therefore given a pipe, and the file is
 written here; on failure it is emptied, which frees its space, and the rest of the pipe is discarded.
@@ -8,8 +8,9 @@ import contextlib
 import logging
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -30,13 +31,20 @@ _FOOTER, _FLAG_BYTES = b"RRF2FOOT", 4
 # Timeouts against a writer that died; there is hardly anything left to write by then.
 FLUSH_S, _DISCONNECT_S, _PIPE_S = 20.0, 10.0, 60.0
 # Where an open file of this process has a path, and how much is written at a time.
-_OPEN_FILES = Path("/dev/fd")
+OPEN_FILES = Path("/dev/fd")
 _PIECE = 1 << 20
 
 # Okabe and Ito's palette, distinguishable under every common colour blindness.
 STATUS_COLOURS = {Status.OK: (0, 114, 178), Status.DEGRADED: (230, 159, 0), Status.LOST: (213, 94, 0)}
 REFERENCE_COLOUR = (0, 158, 115)
 _LOOP_COLOUR = (204, 121, 167)
+# Ours are chosen for a dark ground; the viewer's own may be light.
+BACKGROUND = (13, 16, 17)
+_DARK_TO_BRIGHT = (0.3, 1.0)
+# Names of the timelines: the stamps of the scans, and their numbers.
+TIME, SCAN = "time", "scan"
+# Stamps below, three years after 1970, count from the beginning of the recording.
+_FIRST_DATE_S = 1e8
 # Negative radii are in points on the screen, whatever the zoom.
 PATH_RADIUS, SCAN_RADIUS, MAP_RADIUS = -3.0, -1.5, -1.0
 
@@ -47,9 +55,15 @@ class IncompleteRecordingError(OutputError):
 
 @contextlib.contextmanager
 def rerun_recording(
-    path: Path | None, sinks: Sequence[rr.GrpcSink | rr.GrpcServerSink] = (), blueprint: rrb.Blueprint | None = None
+    name: str, path: Path | None, window: rr.GrpcSink | None = None, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A recording that goes to a file, to other sinks or both; it is written when the block ends.
+    """A recording that goes to a file, to a window or both; it is written when the block ends.
+
+    Args:
+        name: as the viewer lists it.
+        path: the file.
+        window: the viewer.
+        blueprint: the layout of the viewer.
 
     Raises:
         IncompleteRecordingError: it was not written to its end.
@@ -60,13 +74,17 @@ def rerun_recording(
     file = None if path is None else _PipedFile(path)
     try:
         files = [] if file is None else [rr.FileSink(file.entrance)]
+        windows = [] if window is None else [window]
         try:
-            recording.set_sinks(*files, *sinks, default_blueprint=blueprint)
+            recording.set_sinks(*files, *windows)
         except RuntimeError as error:
             raise OutputError(f"the Rerun recording cannot be begun ({one_line(str(error))})") from error
         finally:
             if file is not None:
                 file.close_entrance()
+        if blueprint is not None:  # active at once, in place of that of an earlier recording in the same window
+            recording.send_blueprint(blueprint)
+        recording.send_recording_name(name)
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         yield recording
         try:
@@ -94,11 +112,31 @@ def require_complete(path: Path) -> None:
         raise IncompleteRecordingError("the Rerun recording was not written to its end; is the disk full?")
 
 
-def log_map(recording: rr.RecordingStream, entity: str | list[object], points: FloatArray, count: int) -> None:
-    """A cloud (N, 3) coloured by height, thinned to this many points; static where the entity is a list."""
+def log_map(
+    recording: rr.RecordingStream,
+    entity: str,
+    points: FloatArray,
+    count: int,
+    colour: tuple[int, int, int] | None = None,
+    static: bool = False,
+) -> None:
+    """A cloud (N, 3) coloured by height, thinned to this many points.
+
+    With a colour, the height is its brightness.
+    """
     points = every_nth(points, count)
-    cloud = rr.Points3D(points, colors=height_colours(points), radii=MAP_RADIUS)
-    recording.log(entity, cloud, static=isinstance(entity, list))
+    colours = height_colours(points) if colour is None else _shades(points, colour)
+    cloud = rr.Points3D(points, colors=colours, radii=MAP_RADIUS)
+    recording.log(entity, cloud, static=static)
+
+
+def _shades(points: FloatArray, colour: tuple[int, int, int]) -> NDArray[np.uint8]:
+    if not len(points):
+        return np.empty((0, 3), dtype=np.uint8)
+    low, high = np.percentile(points[:, 2], [2.0, 98.0])
+    brightness = np.interp(points[:, 2], [low, max(high, low + 1e-6)], _DARK_TO_BRIGHT)
+    shades: NDArray[np.uint8] = (brightness[:, None] * np.array(colour)).astype(np.uint8)
+    return shades
 
 
 def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3D:
@@ -106,9 +144,33 @@ def loop_lines(positions: FloatArray, loops: NDArray[np.intp]) -> rr.LineStrips3
     return rr.LineStrips3D(list(positions[loops]), colors=[_LOOP_COLOUR], radii=PATH_RADIUS)
 
 
-def every_nth(points: FloatArray, count: int) -> FloatArray:
-    """So many points (N, 3) at most."""
-    return points[:: max(1, -(-len(points) // count))]
+def set_stamp(recording: rr.RecordingStream, index: int, stamp: float) -> None:
+    """Set the time of what is logged next: that of the scan with this number."""
+    recording.set_time(SCAN, sequence=index)
+    if _is_date(stamp):
+        recording.set_time(TIME, timestamp=stamp)
+    else:
+        recording.set_time(TIME, duration=stamp)
+
+
+def stamp_column(stamps: FloatArray) -> rr.TimeColumn:
+    """The times of several rows that are sent at once."""
+    return rr.TimeColumn(TIME, timestamp=stamps) if _is_date(stamps[0]) else rr.TimeColumn(TIME, duration=stamps)
+
+
+def whole_past() -> list[rr.VisibleTimeRange]:
+    """For entities whose pieces stay visible, on whichever timeline."""
+    start, end = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
+    return [rr.VisibleTimeRange(timeline, start=start, end=end) for timeline in (SCAN, TIME)]
+
+
+def _is_date(stamp: float) -> bool:
+    return bool(stamp >= _FIRST_DATE_S)
+
+
+def every_nth(rows: NDArray[Any], count: int) -> NDArray[Any]:
+    """So many rows at most."""
+    return rows[:: max(1, -(-len(rows) // count))]
 
 
 def _disconnect(recording: rr.RecordingStream, file: "_PipedFile | None") -> None:
@@ -126,7 +188,7 @@ class _PipedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb", buffering=0)
         self._outlet, self._inlet = os.pipe()
-        self.entrance = _OPEN_FILES / str(self._inlet)
+        self.entrance = OPEN_FILES / str(self._inlet)
         self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
         self._thread.start()
 

@@ -1,156 +1,143 @@
-"""Finished runs and map errors in Rerun: saved, in a window, or served to a browser."""
+"""Finished runs in Rerun, each with a colour and an entity of its own."""
 
-import contextlib
-import os
-import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from urllib.parse import quote
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.core.errors import OutputError
-from lidarslam.core.files import cannot_write, replacing
-from lidarslam.core.geometry import FloatArray
-from lidarslam.core.plain_text import one_line
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.tracking import Status
-from lidarslam.evaluation.map.metrics import CloudErrors, MapComparison
-from lidarslam.evaluation.report.error_colours import error_colours
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
-from lidarslam.viewer import rerun_environment
-from lidarslam.viewer.rerun_program import GRPC_PORT, LOCAL, WEB_PORT, is_taken, open_window, page_served
+from lidarslam.viewer.rerun_output import Show
 from lidarslam.viewer.rerun_recording import (
-    FLUSH_S,
-    MAP_RADIUS,
+    BACKGROUND,
     PATH_RADIUS,
     REFERENCE_COLOUR,
     STATUS_COLOURS,
-    IncompleteRecordingError,
+    TIME,
     log_map,
-    loop_lines,
-    rerun_recording,
+    stamp_column,
+    whole_past,
 )
 
-# What says that Linux has a display.
-_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
-_RUN_COLOURS = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0))
+# The rest of Okabe and Ito's palette, without those of the reference and of lost scans.
+_COLOURS = ((86, 180, 233), (230, 159, 0), (204, 121, 167), (240, 228, 66), (0, 114, 178))
+_ERRORS = "errors"
 
 
-def save_runs(runs: Sequence[FinishedRun], config: ViewerConfig, path: Path) -> None:
-    """Write trajectories, lost scans, loops and maps of runs to a .rrd file.
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A run in the world of the view."""
 
-    Raises:
-        OutputError: it cannot be written.
-    """
-    try:
-        with replacing(path) as partial, rerun_recording(partial) as recording:
-            _log_runs(recording, runs, config)
-    except (OSError, IncompleteRecordingError) as error:
-        raise cannot_write(path, error, "; name another file") from error
+    run: FinishedRun
+    name: str  # different from those of the others
+    colour: tuple[int, int, int]
+    error_stamps: FloatArray  # (M,) where there is a reference, none without
+    errors_m: FloatArray  # (M,) distance to the reference
 
-
-def open_runs(runs: Sequence[FinishedRun], config: ViewerConfig) -> None:
-    """Show runs in a window.
-
-    Raises:
-        OutputError: there is no display, or the window cannot be opened.
-    """
-    # A viewer that runs already, perhaps at the other end of a tunnel, needs no display here.
-    if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not is_taken(GRPC_PORT):
-        raise OutputError("no display to open a window on; write a file with --save FILE.rrd, or use --web")
-    open_window(GRPC_PORT)
-    with rerun_recording(None, [rr.GrpcSink()]) as recording:
-        _log_runs(recording, runs, config)
-        try:
-            recording.flush(timeout_sec=FLUSH_S)
-        except RuntimeError as error:
-            rerun_environment.abandoned = True
-            raise OutputError(
-                f"the Rerun window cannot be reached ({one_line(str(error))});"
-                " write a file with --save FILE.rrd, or use --web"
-            ) from error
+    @property
+    def entity(self) -> str:
+        """Path of its entity."""
+        return rr.new_entity_path(["world", self.name])
 
 
-@contextlib.contextmanager
-def served_runs(runs: Sequence[FinishedRun], config: ViewerConfig) -> Iterator[str]:
-    """Serve runs to browsers on this machine for the time of the block; the address.
-
-    Raises:
-        OutputError: a port is in use, or the page cannot be served.
-    """
-    for port in (GRPC_PORT, WEB_PORT):
-        if is_taken(port):
-            raise OutputError(
-                f"port {port} is in use; close the Rerun viewer or the lidarslam view --web that has it,"
-                " or write a file with --save FILE.rrd"
-            )
-    with rerun_recording(None, [rr.GrpcServerSink(bind_ip=LOCAL, port=GRPC_PORT)]) as recording:
-        _log_runs(recording, runs, config)
-        server = f"rerun+http://{LOCAL}:{GRPC_PORT}/proxy"
-        with page_served(WEB_PORT, server):
-            yield f"http://{LOCAL}:{WEB_PORT}/?url={quote(server, safe='')}"
-
-
-def _log_runs(recording: rr.RecordingStream, runs: Sequence[FinishedRun], config: ViewerConfig) -> None:
-    for number, run in enumerate(runs):
-        entity: list[object] = ["world", f"{number}_{run.name}"]
-        positions, colour = run.trajectory.positions, _RUN_COLOURS[number % len(_RUN_COLOURS)]
-        path = rr.LineStrips3D([positions], colors=[colour], radii=PATH_RADIUS, labels=[run.name])
-        recording.log([*entity, "trajectory"], path, static=True)
-        lost = rr.Points3D(positions[run.lost], colors=[STATUS_COLOURS[Status.LOST]], radii=2.0 * PATH_RADIUS)
-        recording.log([*entity, "lost"], lost, static=True)
-        if len(run.loops):
-            recording.log([*entity, "loops"], loop_lines(positions, run.loops), static=True)
-        log_map(recording, [*entity, "map"], run.map_points, config.map_points)
-
-
-def save_errors(path: Path, comparison: MapComparison, positions: FloatArray | None, clip_m: float) -> None:
-    """Write a .rrd file of a map coloured by its distance to the reference, and of the reference by that to the map.
+def show_runs(runs: Sequence[FinishedRun], reference: Trajectory | None, config: ViewerConfig) -> Show:
+    """Trajectories in time, lost scans, loops, maps, and errors of runs.
 
     Args:
-        path: the file.
-        comparison: shown about its middle, because the viewer counts in single precision.
-        positions: (K, 3) where the sensor was, in the reference's frame.
-        clip_m: the distance of the brightest colour.
-
-    Raises:
-        OutputError: the file cannot be written.
+        runs: at least one.
+        reference: the true trajectory; the runs are aligned with it if they share instants with it, and are otherwise
+            shown each in its own world, which begins at its first scan.
+        config: how many points are shown.
     """
-    points = comparison.reference_errors.points
-    middle = np.round(points.mean(axis=0)) if len(points) else np.zeros(3)
+    if reference is not None and len(reference):
+        reference = reference.transformed(inverse(reference.T_world_lidar[0]))  # the viewer counts in single precision
+    else:
+        reference = None
+    shown = list(_in_one_world(runs, reference))
+
+    def log(recording: rr.RecordingStream) -> None:
+        if reference is not None:
+            line = rr.LineStrips3D([reference.positions], colors=[REFERENCE_COLOUR], labels=["ground truth"])
+            recording.log("world/ground truth", line, static=True)
+        for one in shown:
+            _log_run(recording, one, len(shown) > 1, config)
+
+    return Show(" ".join(one.name for one in shown), _blueprint(shown), log)
+
+
+def _in_one_world(runs: Sequence[FinishedRun], reference: Trajectory | None) -> Iterator[_Shown]:
+    names = [run.name for run in runs]
+    for number, run in enumerate(runs):
+        name = run.name if names.count(run.name) == 1 else f"{run.name} ({number + 1})"
+        shown = _Shown(run, name, _COLOURS[number % len(_COLOURS)], np.empty(0), np.empty(0))
+        yield shown if reference is None else _aligned(shown, reference)
+
+
+def _aligned(shown: _Shown, reference: Trajectory) -> _Shown:
+    """With its errors; unchanged where it shares no instants with the reference, as a run of another recording."""
+    run = shown.run
     try:
-        with rerun_recording(path, blueprint=_errors_blueprint()) as recording:
-            _log_errors(recording, "world/map_to_reference", comparison.map_errors, middle, clip_m)
-            _log_errors(recording, "world/reference_to_map", comparison.reference_errors, middle, clip_m)
-            if positions is not None:
-                line = rr.LineStrips3D([positions - middle], colors=[REFERENCE_COLOUR], radii=PATH_RADIUS)
-                recording.log("world/path", line, static=True)
-            origin = ", ".join(f"{m:.0f}" for m in middle)
-            text = f"dark: 0 m, bright: {clip_m:g} m and more; the origin is at {origin}"
-            recording.log("legend", rr.TextDocument(text), static=True)
-    except (OSError, IncompleteRecordingError) as error:
-        raise cannot_write(path, error) from error
+        association = associate(run.trajectory, reference)
+    except InputError:
+        return shown
+    T_reference_world = align(association.estimate, association.reference)
+    moved = replace(
+        run,
+        trajectory=run.trajectory.transformed(T_reference_world),
+        map_points=transform_points(T_reference_world, run.map_points),
+    )
+    errors_m, _ = absolute_errors(association, T_reference_world)
+    return replace(shown, run=moved, error_stamps=association.estimate.stamps, errors_m=errors_m)
 
 
-def _log_errors(
-    recording: rr.RecordingStream, entity: str, errors: CloudErrors, middle: FloatArray, clip_m: float
-) -> None:
-    colours = error_colours(errors.distances_m, clip_m)
-    recording.log(entity, rr.Points3D(errors.points - middle, colors=colours, radii=MAP_RADIUS), static=True)
+def _log_run(recording: rr.RecordingStream, shown: _Shown, several: bool, config: ViewerConfig) -> None:
+    run, colour, entity = shown.run, shown.colour, shown.entity
+    positions, stamps = run.trajectory.positions, run.trajectory.stamps
+
+    def log(name: str, style: rr.AsComponents, stamps: FloatArray, columns: rr.ComponentColumnList) -> None:
+        if len(stamps):
+            recording.log(f"{entity}/{name}", style, static=True)
+            recording.send_columns(f"{entity}/{name}", [stamp_column(stamps)], columns)
+
+    line = rr.LineStrips3D.from_fields(colors=[colour], radii=[PATH_RADIUS])
+    pieces = np.stack([positions[:-1], positions[1:]], axis=1)
+    log("trajectory", line, stamps[1:], rr.LineStrips3D.columns(strips=[[piece] for piece in pieces]))
+    loops = rr.LineStrips3D.columns(strips=[[loop] for loop in positions[run.loops]])
+    log("loops", line, stamps[run.loops.max(axis=1, initial=0)], loops)
+    place = rr.Points3D.from_fields(colors=[colour], radii=[2.5 * PATH_RADIUS], labels=[shown.name])
+    log("lidar", place, stamps, rr.Points3D.columns(positions=positions))
+    lost = rr.Points3D.from_fields(colors=[STATUS_COLOURS[Status.LOST]], radii=[2.0 * PATH_RADIUS])
+    log("lost", lost, stamps[run.lost], rr.Points3D.columns(positions=positions[run.lost]))
+    log_map(recording, f"{entity}/map", run.map_points, config.map_points, colour if several else None, static=True)
+    if len(shown.errors_m):
+        series = rr.new_entity_path([_ERRORS, shown.name])
+        recording.log(series, rr.SeriesLines(names=shown.name, colors=[colour]), static=True)
+        values = rr.Scalars.columns(scalars=shown.errors_m)
+        recording.send_columns(series, [stamp_column(shown.error_stamps)], values)
 
 
-def _errors_blueprint() -> rrb.Blueprint:
-    """Both clouds side by side, above the legend."""
-    titles = {
-        "map_to_reference": "Map: distance to the reference",
-        "reference_to_map": "Reference: distance to the map",
-    }
-    views = [
-        rrb.Spatial3DView(origin="/world", name=title, contents=["/world/path", f"/world/{entity}"])
-        for entity, title in titles.items()
-    ]
-    legend = rrb.TextDocumentView(origin="/legend", name="Colours")
-    return rrb.Blueprint(rrb.Vertical(rrb.Horizontal(*views), legend, row_shares=[8, 1]), collapse_panels=True)
+def _blueprint(shown: Sequence[_Shown]) -> rrb.Blueprint:
+    """One space for all, with the map of the first; the eye beside an entity's name shows and hides it."""
+    overrides: dict[rr.encodings.EntityPath | str, rrb.VisibleTimeRanges | rrb.EntityBehavior] = {}
+    for number, one in enumerate(shown):
+        for name in ("trajectory", "loops", "lost"):
+            overrides[f"{one.entity}/{name}"] = rrb.VisibleTimeRanges(whole_past())
+        overrides[f"{one.entity}/map"] = rrb.EntityBehavior(visible=number == 0)
+    space = rrb.Spatial3DView(origin="/world", name="Trajectories and maps", background=BACKGROUND, overrides=overrides)
+    views: list[rrb.View] = [space]
+    if any(len(one.errors_m) for one in shown):
+        views.append(rrb.TimeSeriesView(origin=f"/{_ERRORS}", name="Distance to the ground truth [m]"))
+    return rrb.Blueprint(
+        rrb.Vertical(*views, row_shares=[4, 1][: len(views)]),
+        rrb.TimePanel(timeline=TIME, play_state="following", state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+    )

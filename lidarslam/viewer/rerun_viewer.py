@@ -15,18 +15,22 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import STAGES, ScanResult
 from lidarslam.viewer.rerun_program import GRPC_PORT, open_window
 from lidarslam.viewer.rerun_recording import (
+    BACKGROUND,
     PATH_RADIUS,
     REFERENCE_COLOUR,
+    SCAN,
     SCAN_RADIUS,
     STATUS_COLOURS,
     every_nth,
     log_map,
     loop_lines,
     rerun_recording,
+    set_stamp,
+    whole_past,
 )
 from lidarslam.viewer.viewer import Viewer
+from lidarslam.viewer.web_page import WebPage
 
-_SCAN_TIMELINE, _TIME_TIMELINE = "scan", "time"
 _SCAN_COLOUR, _CLOSED_COLOUR = (240, 228, 66), (86, 180, 233)
 # The growing map is shown this far around the sensor.
 _NEAR_M = 60.0
@@ -41,11 +45,10 @@ _PLOTS = (
 class RerunViewer(Viewer):
     """Logs a run to a Rerun recording."""
 
-    def __init__(self, recording: rr.RecordingStream, name: str, config: ViewerConfig) -> None:
+    def __init__(self, recording: rr.RecordingStream, config: ViewerConfig) -> None:
         self._recording = recording
         self._config = config
         self._last_position: FloatArray | None = None
-        recording.send_recording_name(name)
         for plot, _, names in _PLOTS:
             recording.log(f"plots/{plot}", rr.SeriesLines(names=names), static=True)
 
@@ -60,8 +63,7 @@ class RerunViewer(Viewer):
 
     def show_scan(self, index: int, result: ScanResult) -> None:
         """The scan at its pose, the next piece of the trajectory, the next value of every plot."""
-        self._recording.set_time(_SCAN_TIMELINE, sequence=index)
-        self._recording.set_time(_TIME_TIMELINE, timestamp=result.stamp)
+        set_stamp(self._recording, index, result.stamp)
         T = result.T_world_lidar
         self._recording.log("world/lidar", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
         points = every_nth(result.points, self._config.scan_points)
@@ -101,8 +103,10 @@ class RerunViewer(Viewer):
 
 
 @contextlib.contextmanager
-def rerun_viewer(name: str, config: ViewerConfig, path: Path, window: bool) -> Iterator[RerunViewer]:
-    """A viewer that writes the recording `path`, and shows it in a window too if asked for.
+def rerun_viewer(
+    name: str, config: ViewerConfig, path: Path, window: bool = False, page: WebPage | None = None
+) -> Iterator[RerunViewer]:
+    """A viewer that writes the recording `path`, and shows it in a window or on a page too if asked for.
 
     Raises:
         IncompleteRecordingError: the recording was not written to its end.
@@ -110,27 +114,27 @@ def rerun_viewer(name: str, config: ViewerConfig, path: Path, window: bool) -> I
     """
     if window:
         open_window(GRPC_PORT)
-    with rerun_recording(path, [rr.GrpcSink()] if window else [], _blueprint()) as recording:
-        yield RerunViewer(recording, name, config)
+    with (
+        contextlib.ExitStack() as shown,
+        rerun_recording(name, path, rr.GrpcSink() if window else None, _blueprint()) as recording,
+    ):
+        if page is not None:
+            shown.enter_context(page.showing(path))
+        yield RerunViewer(recording, config)
 
 
 def _blueprint() -> rrb.Blueprint:
     """A 3D view beside time series; the other panels are folded."""
-    whole_past = [
-        rrb.VisibleTimeRange(
-            timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-        )
-        for timeline in (_SCAN_TIMELINE, _TIME_TIMELINE)
-    ]
     space = rrb.Spatial3DView(
         origin="/world",
         name="Trajectory and map",
-        overrides={"world/trajectory": [rrb.VisibleTimeRanges(whole_past)]},
+        background=BACKGROUND,
+        overrides={"world/trajectory": [rrb.VisibleTimeRanges(whole_past())]},
     )
     plots = [rrb.TimeSeriesView(origin=f"/plots/{plot}", name=title) for plot, title, _ in _PLOTS]
     messages = rrb.TextLogView(origin="/log", name="Messages")
     return rrb.Blueprint(
         rrb.Horizontal(space, rrb.Vertical(*plots, messages), column_shares=[3, 1]),
-        rrb.TimePanel(timeline=_SCAN_TIMELINE, state="collapsed"),
+        rrb.TimePanel(timeline=SCAN, play_state="following", state="collapsed"),
         collapse_panels=True,
     )

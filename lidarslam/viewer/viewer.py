@@ -7,7 +7,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanResult
 
-RerunMode = Literal["off", "save", "spawn"]
+RerunMode = Literal["off", "save", "web", "spawn"]
 
 
 class Viewer:

@@ -49,18 +49,22 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, summed: int, unique:
         row = order[n]
         if count == 0 or keys[row] != unique[count - 1]:
             unique[count] = keys[row]
-            for column in range(7):  # copying a whole row brings the text of its error, which takes 4 s to compile
+            for column in range(
+                columns
+            ):  # copying a whole row brings the text of its error, which takes 4 s to compile
                 totals[count, column] = sums[row, column]
             count += 1
         else:
             for column in range(summed):
                 totals[count - 1, column] += sums[row, column]
-            if summed < columns and _is_earlier(sums[row, summed:], totals[count - 1, summed:]):
-                totals[count - 1, summed:] = sums[row, summed:]
+            if summed < columns and _is_earlier(sums[row], totals[count - 1], summed):
+                for column in range(summed, columns):
+                    totals[count - 1, column] = sums[row, column]
     return count
 
 
 @compiled
-def _is_earlier(time: Sums, other: Sums) -> bool:
-    """Whether one time is before another, each the sum of its first two numbers, the second the rest of the first."""
-    return bool(time[0] < other[0] or (time[0] == other[0] and time[1] < other[1]))
+def _is_earlier(row: Sums, other: Sums, column: int) -> bool:
+    """Whether the time of one row (C,) is before another's: a column and the rest of it in the next one."""
+    high, rest = row[column] - other[column], row[column + 1] - other[column + 1]
+    return bool(high < 0.0 or (high == 0.0 and rest < 0.0))

@@ -1,5 +1,6 @@
 """Rerun's window is asked to listen on this machine alone."""
 
+import ast
 import os
 import signal
 import socket
@@ -47,6 +48,19 @@ def test_a_window_listens_on_this_machine_alone(tmp_path: Path, monkeypatch: pyt
         assert (tmp_path / "pid").read_text() == before
     finally:
         os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
+
+
+def test_the_window_is_kept_from_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
+    """It asks for a newer version by way of a proxy: one that is not there."""
+    for name in ("ALL_PROXY", "HTTPS_PROXY", "https_proxy"):
+        monkeypatch.setenv(name, "http://elsewhere.example:3128")
+    told = 'Path(__file__).with_name("told").write_text(repr(dict(os.environ)))\n'
+    pretend(monkeypatch, tmp_path / "rerun", LISTENER.replace("with socket", told + "with socket"))
+    open_window(port)
+    os.kill(int((tmp_path / "pid").read_text()), signal.SIGKILL)
+    environment = ast.literal_eval((tmp_path / "told").read_text())
+    for name in ("ALL_PROXY", "all_proxy", "HTTPS_PROXY", "https_proxy"):
+        assert environment[name] == "http://127.0.0.1:1"
 
 
 def test_a_window_that_does_not_open_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> None:

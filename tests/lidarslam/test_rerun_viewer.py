@@ -2,24 +2,24 @@
 
 import resource
 import signal
-import socket
 import threading
 import time
 from pathlib import Path
-from urllib.request import urlopen
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from lidarslam.config.settings import ViewerConfig
-from lidarslam.core.errors import OutputError
+from lidarslam.config.settings import ViewerConfig, load_config
+from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.run.request import RunRequest
+from lidarslam.run.run import execute
 from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer import rerun_environment
-from lidarslam.viewer.rerun_program import is_taken
+from lidarslam.viewer.rerun_output import save, show_file_in_window, show_in_window
 from lidarslam.viewer.rerun_recording import IncompleteRecordingError
-from lidarslam.viewer.rerun_runs import open_runs, save_runs, served_runs
+from lidarslam.viewer.rerun_runs import show_runs
 from lidarslam.viewer.rerun_viewer import rerun_viewer
 
 
@@ -32,54 +32,16 @@ def finished() -> FinishedRun:
 def test_a_name_with_a_space_is_one_entity(
     finished: FinishedRun, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    save_runs([finished], ViewerConfig(), tmp_path / "runs.rrd")
+    save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "runs.rrd").stream()}
-    assert r"/world/0_my\ run/map" in entities
+    assert r"/world/my\ run/map" in entities
     assert capfd.readouterr().err == ""
 
 
 def test_a_file_that_cannot_be_written_gets_one_line(finished: FinishedRun, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"runs\.rrd: cannot be written \(.*\); name another") as caught:
-        save_runs([finished], ViewerConfig(), tmp_path / "none" / "runs.rrd")
+        save(show_runs([finished], None, ViewerConfig()), tmp_path / "none" / "runs.rrd")
     assert "\n" not in str(caught.value)
-
-
-def test_a_port_in_use_gets_one_line(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        monkeypatch.setattr("lidarslam.viewer.rerun_runs.GRPC_PORT", port)
-        with (
-            pytest.raises(OutputError, match=f"port {port} is in use; .* --save"),
-            served_runs([finished], ViewerConfig()),
-        ):
-            pass
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def test_a_browser_is_served_to_this_machine_alone(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A server on all interfaces would be there on each address of the loopback; one on 127.0.0.1 is on that alone."""
-    ports = free_port(), free_port()
-    monkeypatch.setattr("lidarslam.viewer.rerun_runs.GRPC_PORT", ports[0])
-    monkeypatch.setattr("lidarslam.viewer.rerun_runs.WEB_PORT", ports[1])
-    with served_runs([finished], ViewerConfig()) as address:
-        assert address.startswith(f"http://127.0.0.1:{ports[1]}/?url=")
-        with urlopen(address, timeout=10) as page:
-            assert b"<html" in page.read().lower()
-        for port in ports:
-            assert is_taken(port)
-            with socket.socket() as probe:
-                assert probe.connect_ex(("127.0.0.2", port)) != 0
-    begun = time.monotonic()
-    while is_taken(ports[1]) and time.monotonic() - begun < 10:
-        time.sleep(0.05)
-    assert not is_taken(ports[1]), "the page goes with whoever served it"
 
 
 @pytest.mark.parametrize("size", [0, 1_000, 100_000])
@@ -95,7 +57,7 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
     try:
         with (
             pytest.raises(IncompleteRecordingError, match="is the disk full"),
-            rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd", window=False) as viewer,
+            rerun_viewer("run", ViewerConfig(), tmp_path / "recording.rrd") as viewer,
         ):
             for seed in range(20):
                 viewer.show_map(np.random.default_rng(seed).normal(size=(5_000, 3)))
@@ -109,17 +71,41 @@ def test_a_full_disk_neither_holds_a_run_nor_leaves_half_a_recording(
 
 def test_a_recording_that_cannot_be_begun_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where there is no /dev/fd."""
-    monkeypatch.setattr("lidarslam.viewer.rerun_recording._OPEN_FILES", tmp_path / "none")
+    monkeypatch.setattr("lidarslam.viewer.rerun_recording.OPEN_FILES", tmp_path / "none")
     with pytest.raises(OutputError, match=r"cannot be begun \(.*\)") as caught:
-        save_runs([], ViewerConfig(), tmp_path / "recording.rrd")
+        save(show_runs([], None, ViewerConfig()), tmp_path / "recording.rrd")
     assert "\n" not in str(caught.value)
     assert not any(thread.name == "recording" for thread in threading.enumerate())  # its file is finished
 
 
-def test_no_display_gets_one_line(finished: FinishedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.setattr("lidarslam.viewer.rerun_runs.is_taken", lambda _: False)
+    monkeypatch.setattr("lidarslam.viewer.rerun_program.is_taken", lambda _: False)
+
+
+@pytest.mark.usefixtures("no_display")
+def test_no_display_gets_one_line(finished: FinishedRun, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"no display .* --save FILE\.rrd, or use --web"):
-        open_runs([finished], ViewerConfig())
+        show_in_window(show_runs([finished], None, ViewerConfig()))
+    save(show_runs([finished], None, ViewerConfig()), tmp_path / "runs.rrd")
+    with pytest.raises(OutputError, match=r"no display .* --web"):
+        show_file_in_window(tmp_path / "runs.rrd")
+
+
+@pytest.mark.usefixtures("no_display")
+def test_a_run_with_a_window_and_no_display_ends_before_it_begins(small_recording: Path, tmp_path: Path) -> None:
+    request = RunRequest(small_recording, tmp_path / "run", load_config(None), rerun="spawn")
+    with pytest.raises(OutputError, match=r"no display .* --rerun web, .* --rerun save"):
+        execute(request, lambda *_: None)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not a recording"])
+def test_a_file_that_is_no_recording_gets_one_line(tmp_path: Path, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / "some.rrd").write_bytes(content)
+    with pytest.raises(InputError, match=r"some\.rrd: no"):
+        show_file_in_window(tmp_path / "some.rrd")

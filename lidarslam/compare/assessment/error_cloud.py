@@ -44,7 +44,7 @@ def write_errors(path: Path, comparison: MapComparison, positions: FloatArray, c
     """
     with replacing(path) as partial:
         if path.suffix.lower() == ".rrd":
-            from lidarslam.viewer.rerun_runs import save_errors
+            from lidarslam.viewer.rerun_errors import save_errors
 
             save_errors(partial, comparison, positions, clip_m)
             return

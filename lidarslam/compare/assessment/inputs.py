@@ -141,6 +141,22 @@ def recording_truth(source: Path, config: ReaderConfig) -> Poses:
     return Poses(f"the ground truth of {source}", truth.stamps, truth.T_world_lidar, recording.T_cam_lidar)
 
 
+def truth_of_run(run: Path) -> Trajectory | None:
+    """The ground truth that came with the recording of a run; None without, or where it is not at hand.
+
+    Raises:
+        InputError: there is no run, or it is damaged.
+    """
+    estimate = read_estimate(run)
+    if estimate.source is None or not estimate.source.exists():
+        return None
+    try:
+        truth = recording_truth(estimate.source, estimate.config.reader)
+    except InputError:
+        return None
+    return None if truth.stamps is None else Trajectory(truth.stamps, truth.T_world_lidar)
+
+
 def read_poses(path: Path) -> Poses:
     """A trajectory file, TUM or KITTI text by its columns.
 
