@@ -4,6 +4,7 @@ It listens on this machine alone; started by Rerun's library it would be open to
 """
 
 import contextlib
+import http.client
 import os
 import shutil
 import signal
@@ -11,8 +12,6 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -103,18 +102,22 @@ def _page_files() -> dict[str, bytes]:
     process = _start(port, "--serve-web", "--web-viewer-port", str(port), _NO_SERVER)
     if process is None:
         raise OutputError("Rerun's page for browsers cannot be had; write a file instead")
-    # No proxy, which would not reach this machine.
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        files = {}
-        for path in _PAGE_FILES:
-            with opener.open(f"http://{LOCAL}:{port}{path}", timeout=_START_S) as response:
-                files[path] = response.read()
-        return files
-    except (urllib.error.URLError, OSError) as error:
+        return {path: _fetch(port, path) for path in _PAGE_FILES}
+    except (http.client.HTTPException, OSError) as error:
         raise OutputError(f"Rerun's page for browsers cannot be had ({error}); write a file instead") from error
     finally:
         _end(process)
+
+
+def _fetch(port: int, path: str) -> bytes:
+    """A file of the page, from this machine."""
+    with contextlib.closing(http.client.HTTPConnection(LOCAL, port, timeout=_START_S)) as connection:
+        connection.request("GET", path)
+        response = connection.getresponse()
+        if response.status != http.client.OK:
+            raise OSError(f"{path}: {response.status} {response.reason}")
+        return response.read()
 
 
 def _program() -> str:

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.cell_kernels import cell_of, key_of
 
@@ -63,7 +63,7 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, summed: int, unique:
     return count
 
 
-@compiled
+@compiled_part
 def _is_earlier(row: Sums, other: Sums, column: int) -> bool:
     """Whether the time of one row (C,) is before another's: a column and the rest of it in the next one."""
     high, rest = row[column] - other[column], row[column + 1] - other[column + 1]

@@ -231,7 +231,8 @@ def test_a_message_that_is_too_short_costs_no_other(make_bag_kit, write_drive, k
     kit.serialize = cut
     file, _, points = write_drive(kind, kit=kit)
     recording = open_recording(file)
-    told = f"{len(places)} scans were left out: they could not be read; the first: {file}: a message of {length} bytes"
+    left_out = "1 scan was left out: it" if len(places) == 1 else f"{len(places)} scans were left out: they"
+    told = f"{left_out} could not be read; the first: {file}: a message of {length} bytes"
     assert_all_but(recording, points, places, told)
     assert recording.describe().first_stamp == (STAMP_NS + (0 in places) * PERIOD_NS) / 10**9
     with pytest.raises(InputError, match=f"a message of {length} bytes"):
@@ -281,9 +282,11 @@ def test_what_lies_behind_a_damaged_chunk_of_an_indexed_bag_is_read(write_drive,
     recording = open_recording(file)
     assert len(recording) == 8
     lost = [2 * chunk + i for chunk in damaged for i in (0, 1)]
+    passed_over = (
+        "1 damaged place in the bag was" if len(damaged) == 1 else f"{len(damaged)} damaged places in the bag were"
+    )
     told = (
-        f"{len(damaged)} damaged places in the bag were passed over; the first: {file}: reading stopped after"
-        f" {2 * damaged[0]} messages of /points",
+        f"{passed_over} passed over; the first: {file}: reading stopped after {2 * damaged[0]} messages of /points",
         f"{len(lost)} scans are missing that the index lists; the first: its index lists 8 scans, it holds",
     )
     assert_all_but(recording, points, lost, *told)
@@ -320,7 +323,7 @@ def test_a_damaged_chunk_is_counted_once_for_each_topic(make_bag_kit, make_sweep
         scans = list(open_recording(file, ReaderConfig(topic=topic)).scans(faults=faults))
         assert [scan.stamp for scan in scans] == [stamp_ns(i) / 10**9 for i in times]
         assert [warning.split(";")[0] for warning in faults.warnings()] == [
-            "1 damaged place in the bag were passed over",
+            "1 damaged place in the bag was passed over",
             "1 scan is missing that the index lists",
         ]
 

@@ -206,7 +206,7 @@ def test_implausible_starts_are_replaced(tmp_path, rng):
     recording = open_recording(drive)
     for scan in recording.scans():
         assert -0.053 < scan.time_offsets.min() < -0.04
-    assert any("1 starts and 0 ends" in note for note in recording.describe().notes)
+    assert any("1 start and 0 ends" in note for note in recording.describe().notes)
 
 
 def test_without_stamps_the_rate_gives_scans_truth_and_offsets(tmp_path, rng):

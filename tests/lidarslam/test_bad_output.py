@@ -310,10 +310,11 @@ def test_a_summary_cannot_send_merge_to_remove_a_run_elsewhere(
 
 
 def test_a_second_writer_is_turned_away(tmp_path: Path, small_recording: Path, finished_run: Path) -> None:
-    before = {path.name: path.read_bytes() for path in finished_run.iterdir()}
-    with only_writer(finished_run):
+    before, compared = {path.name: path.read_bytes() for path in finished_run.iterdir()}, tmp_path / "compared"
+    compared.mkdir()
+    with only_writer(finished_run), only_writer(compared):
         result = lidarslam("run", small_recording, "--out", finished_run, *FAST, "--overwrite")
-        other = lidarslam("compare", small_recording, "--methods", "constant-velocity+map", "--out", finished_run)
+        other = lidarslam("compare", small_recording, "--methods", "constant-velocity+map", "--out", compared)
     for refused in (result, other):
         assert refused.exit_code == 1
         assert refused.stderr.count("\n") == 1

@@ -23,7 +23,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.folders.ply import read_ply
 
-FAST = ("--odometry", "constant-velocity", "--no-pose-graph")
+FAST = ("--odometry", "constant-velocity", "--no-pose-graph", "--no-report")
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")]
 STAMP_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
@@ -83,7 +83,9 @@ def run(source: Path, *options: str, asked: int | None = None) -> tuple[int, dic
 
 def left_out(summary: dict[str, Any]) -> int:
     """How many scans its warnings say were left out."""
-    return sum(int(found[1]) for w in summary["warnings"] if (found := re.match(r"(\d+) scans were left out", w)))
+    return sum(
+        int(found[1]) for w in summary["warnings"] if (found := re.match(r"(\d+) scans? (?:was|were) left out", w))
+    )
 
 
 def check(out: Path, summary: dict[str, Any]) -> None:
@@ -444,7 +446,7 @@ def test_poses_of_which_some_are_missing_are_counted(tmp_path, tables):
         warnings = " ".join(summary["warnings"])
         assert f"has {'only ' * (lines == 2)}{lines} poses for the scans up to number 3" in warnings
         assert ("times.txt has 7 lines and" in warnings) == (lines == 9)
-        assert len(summary["warnings"]) == 1
+        assert warnings.count("poses for the scans up to") == 1
 
 
 @pytest.mark.parametrize("stamp", ["1e300", "-1e300", "1e12", "123456789012345", "inf", "nan"])

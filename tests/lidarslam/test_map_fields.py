@@ -132,9 +132,9 @@ def test_further_formats(source: Path, tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     out = tmp_path / "run"
     run(source, out, *WAYS["true poses"], "--pcd", "--map-format", "laz", "--map-format", "e57", "--map-format", "pcd")
-    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", *MAPS.values()}
+    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png", *MAPS.values()}
     run(source, out, *WAYS["true poses"], "--overwrite")
-    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply"}
+    assert {path.name for path in out.iterdir() if path.stem == "map"} == {"map.ply", "map.png"}
 
 
 @pytest.mark.parametrize("command", ["run", "merge"])

@@ -161,7 +161,15 @@ METHODS = {
     ],
     "kiss-icp": ["--odometry", "kiss-icp", "--no-mapping", "--set", "odometry.kiss_icp.threads=1", "--stop", "12"],
 }  # fmt: skip
-FAST = ["--set", "checkpoints.every_scans=3", "--set", "global_map.voxel_size_m=0.1", "--set", "mapping.keypoints=800"]
+FAST = [
+    "--no-report",
+    "--set",
+    "checkpoints.every_scans=3",
+    "--set",
+    "global_map.voxel_size_m=0.1",
+    "--set",
+    "mapping.keypoints=800",
+]
 
 
 def there_and_back(time: FloatArray) -> FloatArray:
