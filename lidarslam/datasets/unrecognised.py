@@ -39,7 +39,7 @@ _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ((".las", ".laz", ".e57"), "survey formats, which are not read as scans", _CONVERT),
     ((".csv", ".xyz", ".pts", ".asc"), "points as text, which are not read as scans", _CONVERT),
     ((".tum", ".g2o"), "poses, not scans", "name the recording; lidarslam evaluate compares trajectories"),
-    ((".rrd",), "a Rerun recording", "open it with `rerun FILE`"),
+    ((".rrd",), "a Rerun recording", "lidarslam view shows it"),
     (
         (".txt",),
         "text",

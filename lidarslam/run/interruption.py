@@ -12,7 +12,7 @@ logger = logging.getLogger(__name__)
 
 _REQUESTS = (signal.SIGTERM, signal.SIGHUP)
 # Requests while results are written: so many, each at least so long after the one before, abandon them. A key that is
-# held down or hit in anger is one request.
+# held down or hit repeatedly is one request.
 _INSISTENT = 3
 _APART_S = 0.5
 
