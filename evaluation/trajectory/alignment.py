@@ -57,7 +57,7 @@ def align_se3(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     spread_m = np.sqrt(spread_squared)
     if spread_m[0] < _LEAST_SPREAD_M:
         R = _nearest_rotation(orientations)
-    elif spread_m[1] < max(_LEAST_SPREAD_M, _LEAST_RELATIVE_SPREAD * spread_m[0]):
+    elif _are_on_a_line(spread_m):
         R = _nearest_rotation(np.outer(U[:, 0], Vt[0]) + _TIE_BREAK * orientations)
     else:
         R = _nearest_rotation(covariance)
@@ -99,9 +99,12 @@ def _least_lever_m(covariance: FloatArray) -> float:
     """RMS distance of the positions from their main direction; 0 where they have none, or a line has all of them."""
     spread_squared = np.linalg.svd(covariance, compute_uv=False)
     spread_m = np.sqrt(spread_squared)
-    if spread_m[1] < max(_LEAST_SPREAD_M, _LEAST_RELATIVE_SPREAD * spread_m[0]):
-        return 0.0
-    return float(np.sqrt(spread_squared[1] + spread_squared[2]))
+    return 0.0 if _are_on_a_line(spread_m) else float(np.sqrt(spread_squared[1] + spread_squared[2]))
+
+
+def _are_on_a_line(spread_m: FloatArray) -> bool:
+    """Whether positions with this spread (3,) along their main directions, the largest first, lie on a line."""
+    return bool(spread_m[1] < max(_LEAST_SPREAD_M, _LEAST_RELATIVE_SPREAD * spread_m[0]))
 
 
 def _covariance(estimate: FloatArray, reference: FloatArray) -> FloatArray:

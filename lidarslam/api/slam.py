@@ -60,9 +60,8 @@ class Slam:
         self._config = make_config(config)
         if self._config.odometry.method == "external":
             raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
-        with python_names():
+        with CompileAhead(parts_of(self._config)) as compiling, python_names():
             self._odometry = open_odometry(self._config, None)
-        with CompileAhead(parts_of(self._config)) as compiling:
             compiling.wait_for_all(logger.info)
         self._graph = begin_graph(self._config)
         self._stages = Stages(self._odometry, make_localiser(self._config), self._config.global_map, self._graph)
@@ -115,7 +114,7 @@ class Slam:
         """
         with self._entered():
             self._settle()
-            trajectory, graph = self._log.trajectory, self._built().graph
+            trajectory, graph = self._log.trajectory, self._graph if self._has_whole_graph() else None
             result = None if graph is None else graph.present()
             return trajectory if result is None else Trajectory(trajectory.stamps, result.T_world_lidar)
 
@@ -202,9 +201,12 @@ class Slam:
         self._log.add(self._stages.build(estimated, localised), total_ms)
 
     def _built(self) -> Built:
-        """What there is so far, once the background is done; a graph that missed a scan is left out."""
-        graph = self._graph if self._graph is not None and len(self._graph.scan_poses) == len(self._log) else None
+        """What there is so far, once the background is done."""
+        graph = self._graph if self._has_whole_graph() else None
         return Built(self._config, copy.deepcopy(self._log), copy.copy(self._faults), self._stages.map, graph)
+
+    def _has_whole_graph(self) -> bool:
+        return self._graph is not None and len(self._graph.scan_poses) == len(self._log)
 
     def _settle(self) -> None:
         """Wait for the background, and add the last scan to the map."""

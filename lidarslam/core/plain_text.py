@@ -36,6 +36,11 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
+def scan_span(first: int, last: int) -> str:
+    """A stretch of scans by its first and last one: scan 3, scans 3 to 7."""
+    return f"scan {first}" if first == last else f"scans {first} to {last}"
+
+
 def as_typed(program: str) -> str:
     """The word that starts a program of this environment: its name where the shell finds it, else the path of its file.
 

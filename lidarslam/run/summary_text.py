@@ -4,10 +4,10 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.plain_text import as_typed, count, small_length
+from lidarslam.core.plain_text import as_typed, count, scan_span, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
+from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap
 from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # A speed that differs less is that of the recording.
@@ -91,13 +91,9 @@ def _accuracy(metrics: TrajectoryMetrics) -> Iterator[str]:
 
 def _lost(summary: RunSummary) -> Iterator[str]:
     for stretch in summary.lost[:_LISTED]:
-        yield f"LOST on {_scans(stretch)}: {stretch.reason}"
+        yield f"LOST on {scan_span(stretch.first, stretch.last)}: {stretch.reason}"
     if more := max(0, len(summary.lost) - _LISTED):
         yield f"LOST on {more} more {'stretch' if more == 1 else 'stretches'}"
     if summary.lost_scans:
         share = f"{summary.lost_scans:,} of {count(summary.scans, 'scan')}"
         yield f"tracking was lost on {share}; {SUMMARY} and {SCANS_CSV} list them"
-
-
-def _scans(stretch: LostStretch) -> str:
-    return f"scan {stretch.first}" if stretch.first == stretch.last else f"scans {stretch.first} to {stretch.last}"

@@ -18,15 +18,11 @@ TIME = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d"
 FAST = ("--odometry", "constant-velocity", "--stop", "3")
 
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
 def lidarslam(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
-
-
-@pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty current folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def only(folder: str) -> Path:
@@ -143,20 +139,20 @@ def test_a_killed_run_is_resumed_without_its_name(small_recording: Path, monkeyp
     assert f"runs: holds no unfinished run of {small_recording}; name one with --out" in again.stderr
 
 
-def test_the_run_to_resume_is_one_of_the_same_recording(place: Path) -> None:
-    (place / "runs").mkdir()
-    (place / "runs" / "notes.txt").touch()
-    unfinished("other", place / "other.mcap")
-    unfinished("part", place / "site.mcap", merge="00_site")
-    unfinished("five", place / "site.mcap", "05")
-    damaged = unfinished("damaged", place / "site.mcap")
+def test_the_run_to_resume_is_one_of_the_same_recording(empty_folder: Path) -> None:
+    (empty_folder / "runs").mkdir()
+    (empty_folder / "runs" / "notes.txt").touch()
+    unfinished("other", empty_folder / "other.mcap")
+    unfinished("part", empty_folder / "site.mcap", merge="00_site")
+    unfinished("five", empty_folder / "site.mcap", "05")
+    damaged = unfinished("damaged", empty_folder / "site.mcap")
     (damaged / "unfinished" / "run.json").write_text("{")
     with pytest.raises(InputError, match=r"runs: holds no unfinished run of site\.mcap"):
         unfinished_run(Path("site.mcap"))
-    mine = unfinished("mine", place / "site.mcap")
+    mine = unfinished("mine", empty_folder / "site.mcap")
     assert unfinished_run(Path("site.mcap")) == mine
     assert unfinished_run(Path("site.mcap"), "05") == Path("runs/five")
-    unfinished("twin", place / "site.mcap")
+    unfinished("twin", empty_folder / "site.mcap")
     with pytest.raises(InputError, match=r"has several unfinished runs \(runs/mine, runs/twin\); name the one"):
         unfinished_run(Path("site.mcap"))
 

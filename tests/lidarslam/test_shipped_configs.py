@@ -14,15 +14,11 @@ ROOT = Path(__file__).parents[2]
 FILES = [*shipped_files(CONFIGS).values(), *shipped_files(BENCHMARKS).values()]
 
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
 def lidarslam(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
-
-
-@pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty current folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def test_every_file_of_the_repository_has_a_name() -> None:
@@ -43,10 +39,10 @@ def test_a_configuration_is_found_by_its_name() -> None:
     assert lidarslam("config", "-c", "indoor").stdout == expected
 
 
-def test_a_path_is_a_file_of_the_user(place: Path) -> None:
+def test_a_path_is_a_file_of_the_user(empty_folder: Path) -> None:
     for name in ("indoor", "indoor.yaml", "mine"):
-        (place / name).write_text("global_map: {voxel_size_m: 0.77}\n")
-    for path in ("./indoor", "indoor.yaml", "mine", place / "indoor"):
+        (empty_folder / name).write_text("global_map: {voxel_size_m: 0.77}\n")
+    for path in ("./indoor", "indoor.yaml", "mine", empty_folder / "indoor"):
         assert "voxel_size_m: 0.77" in lidarslam("config", "-c", path).stdout
     assert "voxel_size_m: 0.77" not in lidarslam("config", "-c", "indoor").stdout
 
@@ -86,13 +82,13 @@ def test_a_benchmark_without_its_data_says_what_it_needs() -> None:
     assert "none of its recordings is in /nowhere; --data is the root" in elsewhere.stderr
 
 
-def test_a_benchmark_of_ones_own_finds_its_recordings(place: Path, small_recording: Path) -> None:
-    (place / "mine.yaml").write_text(
+def test_a_benchmark_of_ones_own_finds_its_recordings(empty_folder: Path, small_recording: Path) -> None:
+    (empty_folder / "mine.yaml").write_text(
         "title: Mine\nrecordings: [{name: a, source: room}]\nmethods: [constant-velocity+map]\n"
     )
     compared = lidarslam("compare", "--benchmark", "mine.yaml", "--data", small_recording.parent)
     assert compared.exit_code == 0
-    (out,) = (place / "compared").iterdir()
+    (out,) = (empty_folder / "compared").iterdir()
     assert out.name.startswith("mine_")
     refused = lidarslam("compare", "--benchmark", "mine.yaml")
     assert "Mine: none of its recordings is in the current folder; name their folder with --data" in refused.stderr

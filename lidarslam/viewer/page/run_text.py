@@ -7,7 +7,7 @@ import yaml
 from pydantic import ValidationError
 
 from lidarslam.config.settings import Config
-from lidarslam.core.plain_text import count
+from lidarslam.core.plain_text import count, scan_span, small_length
 from lidarslam.storage.directory import RUN_SECTION, SCANS_CSV
 
 # Stretches of lost scans that are listed; scans.csv has them all.
@@ -34,9 +34,8 @@ def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
     if summary["map_points"]:
         moved = summary["map_points_moved"]
         removed = f"; {count(moved, 'point')} of moving objects removed" if moved else ""
-        shown["map"] = (
-            f"{count(summary['map_points'], 'point')}, voxels of {100.0 * summary['map_voxel_size_m']:.0f} cm{removed}"
-        )
+        voxel = small_length(summary["map_voxel_size_m"])
+        shown["map"] = f"{count(summary['map_points'], 'point')}, voxels of {voxel}{removed}"
     if summary["pose_graph"] is not None:
         graph = summary["pose_graph"]
         closed = count(summary["loop_closures"], "loop")
@@ -50,9 +49,7 @@ def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
 def describe_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
     """Lost stretches, and the warnings of summary.json."""
     for stretch in summary["lost"][:_LISTED]:
-        first, last = stretch["first"], stretch["last"]
-        scans = f"scan {first}" if first == last else f"scans {first} to {last}"
-        yield f"tracking was lost on {scans}: {stretch['reason']}"
+        yield f"tracking was lost on {scan_span(stretch['first'], stretch['last'])}: {stretch['reason']}"
     if (more := len(summary["lost"]) - _LISTED) > 0:
         yield f"tracking was lost on {more} more {'stretch' if more == 1 else 'stretches'}; {SCANS_CSV} lists them"
     yield from summary["warnings"]
