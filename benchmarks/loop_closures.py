@@ -30,9 +30,9 @@ from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import LoopConfig, PoseGraphConfig
-from lidarslam.mapping.deskew import body_velocity
 from lidarslam.mapping.global_map.global_map import voxel_size_for
 from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph

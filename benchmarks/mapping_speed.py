@@ -47,7 +47,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam import mapper as loam_mapper
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.mapper import LoamMapper
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.surfels import sampling
 from lidarslam.mapping.tracking import attempts

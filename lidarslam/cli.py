@@ -14,13 +14,13 @@ from lidarslam.commands.compare import compare
 from lidarslam.commands.config import config
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
-from lidarslam.commands.export import export
 from lidarslam.commands.info import info
 from lidarslam.commands.merge import merge
+from lidarslam.commands.network.export import export
+from lidarslam.commands.network.train import train
 from lidarslam.commands.run import run
+from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
 from lidarslam.commands.simulate import simulate
-from lidarslam.commands.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
-from lidarslam.commands.train import train
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.run.interruption import ended_like_interrupted

@@ -11,11 +11,11 @@ import numpy as np
 
 from lidarslam.core.geometry import displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import body_velocity
-from lidarslam.mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.fit import Fit

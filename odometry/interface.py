@@ -5,7 +5,7 @@ from typing import Annotated, Protocol
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, Shape, State
+from lidarslam.core.state.stateful import Saved, Shape, State
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
-from lidarslam.commands.options import take_config
 from lidarslam.commands.run import run
+from lidarslam.commands.shared.options import take_config
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
@@ -27,7 +27,7 @@ from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.run.merge.merge import MergeOutcome
 from lidarslam.run.merge.summary import MergedRecording, MergeSummary
-from lidarslam.run.summary import WrittenMap
+from lidarslam.run.summary.summary import WrittenMap
 
 
 def lidarslam(*arguments: object) -> Result:

@@ -6,8 +6,8 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.names import ShippedFile
-from lidarslam.commands.options import (
+from lidarslam.commands.shared.names import ShippedFile
+from lidarslam.commands.shared.options import (
     FILE,
     PATH,
     POSITIVE,
@@ -18,7 +18,7 @@ from lidarslam.commands.options import (
     reader_options,
     scan_options,
 )
-from lidarslam.commands.terminal import EXIT_MENDABLE, note, say
+from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, say
 
 
 @click.command(

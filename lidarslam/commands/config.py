@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import CommandWithExample, config_options
-from lidarslam.commands.terminal import say
+from lidarslam.commands.shared.options import CommandWithExample, config_options
+from lidarslam.commands.shared.terminal import say
 from lidarslam.core.plain_text import printable
 
 

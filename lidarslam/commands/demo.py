@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample
-from lidarslam.commands.terminal import note, say
+from lidarslam.commands.shared.options import PATH, CommandWithExample
+from lidarslam.commands.shared.terminal import note, say
 
 
 @click.command(cls=CommandWithExample, epilog="lidarslam demo -o demo")

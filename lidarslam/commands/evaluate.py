@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import PATH, POSITIVE, CommandWithExample, latest_run
-from lidarslam.commands.terminal import say
+from lidarslam.commands.shared.options import PATH, POSITIVE, CommandWithExample, latest_run
+from lidarslam.commands.shared.terminal import say
 
 _SECONDS = click.FloatRange(min=0.0)
 

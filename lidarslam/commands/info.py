@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import SOURCE, CommandWithExample, config_options, reader_options, take_config
-from lidarslam.commands.terminal import say
+from lidarslam.commands.shared.options import SOURCE, CommandWithExample, config_options, reader_options, take_config
+from lidarslam.commands.shared.terminal import say
 
 
 @click.command(

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import (
+from lidarslam.commands.shared.options import (
     PATH,
     CommandWithExample,
     config_options,
@@ -17,7 +17,7 @@ from lidarslam.commands.options import (
     take_config,
     take_map_formats,
 )
-from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
+from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
 @click.command(cls=CommandWithExample, epilog="lidarslam merge ground_floor.mcap stairs.mcap -o building")

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import (
+from lidarslam.commands.shared.options import (
     FILE,
     SOURCE,
     CommandWithExample,
@@ -21,7 +21,7 @@ from lidarslam.commands.options import (
     take_config,
     take_map_formats,
 )
-from lidarslam.commands.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
+from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
 
 
 @click.command(

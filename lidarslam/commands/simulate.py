@@ -5,9 +5,9 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.names import Registered
-from lidarslam.commands.options import FILE, CommandWithExample, default_out, out_option
-from lidarslam.commands.terminal import say
+from lidarslam.commands.shared.names import Registered
+from lidarslam.commands.shared.options import FILE, CommandWithExample, default_out, out_option
+from lidarslam.commands.shared.terminal import say
 
 _WORLD = Registered("lidarslam.simulation.worlds.registry", "WORLDS")
 _SENSOR = Registered("lidarslam.simulation.sensors.table", "SENSORS")

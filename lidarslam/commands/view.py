@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from lidarslam.commands.options import (
+from lidarslam.commands.shared.options import (
     PATH,
     CommandWithExample,
     config_options,
@@ -17,7 +17,7 @@ from lidarslam.commands.options import (
     scan_options,
     take_config,
 )
-from lidarslam.commands.terminal import note, say, serving, wait_for_interrupt
+from lidarslam.commands.shared.terminal import note, say, serving, wait_for_interrupt
 from lidarslam.core.errors import InputError
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.mean_table import mean_table
-from lidarslam.run.machine import machine, versions
 from lidarslam.run.request import RunRequest
+from lidarslam.run.summary.machine import machine, versions
 from lidarslam.storage.comparison_folder import COMPARISON
 from lidarslam.storage.directory import RunDirectory
 

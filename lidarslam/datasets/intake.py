@@ -10,7 +10,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stamp_order import in_stamp_order
+from lidarslam.datasets.times.stamp_order import in_stamp_order
 
 # No LiDAR measures more points in a sweep; the cells are finer than any method's.
 _MOST_POINTS = 1 << 20

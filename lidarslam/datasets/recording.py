@@ -7,9 +7,10 @@ from typing import Protocol
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan, ScanSequence
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.point_time import PointTimeModel
+from lidarslam.datasets.times.point_time import PointTimeModel
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,14 @@ class Recording(ScanSequence, Protocol):
     @property
     def T_cam_lidar(self) -> FloatArray | None:
         """Extrinsic calibration of a KITTI recording, whose pose files are in the camera frame; None elsewhere."""
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU beside the LiDAR; None without one.
+
+        Raises:
+            InputError: they cannot be read.
+        """
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -7,9 +7,9 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape
+from lidarslam.core.state.stateful import Shape
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.deskew import body_velocity, deskew
+from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.odometry.interface import Motion
 

@@ -8,9 +8,9 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, Shape, State, Stateful
+from lidarslam.core.state.stateful import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.odometry.interface import Motion

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import Estimated, ScanResult

@@ -58,7 +58,7 @@ def _alignment() -> None:
 
 def _surfels() -> None:
     from lidarslam.mapping.config import MappingConfig
-    from lidarslam.mapping.prediction import Prior
+    from lidarslam.mapping.motion.prediction import Prior
     from lidarslam.mapping.surfel_mapper import SurfelMapper
     from lidarslam.mapping.surfels.grid import SurfelGrid
 
@@ -73,7 +73,7 @@ def _surfels() -> None:
 def _loam() -> None:
     from lidarslam.mapping.config import MappingConfig
     from lidarslam.mapping.loam.mapper import LoamMapper
-    from lidarslam.mapping.prediction import Prior
+    from lidarslam.mapping.motion.prediction import Prior
 
     mapper = LoamMapper(MappingConfig(method="loam"))
     for scan in _scans():
@@ -82,8 +82,8 @@ def _loam() -> None:
 
 def _map() -> None:
     from lidarslam.core.thinning import one_per_cell
-    from lidarslam.mapping.deskew import move
     from lidarslam.mapping.global_map.global_map import GlobalMap
+    from lidarslam.mapping.motion.deskew import move
 
     global_map = GlobalMap(0.2)
     for number, scan in enumerate(_scans()):
@@ -122,7 +122,7 @@ PARTS = {
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
     "alignment": Part(_alignment, ("odometry.alignment.residuals", "odometry.alignment.point_to_plane")),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
-    "map": Part(_map, ("mapping.deskew", "mapping.global_map.kernels")),
+    "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.kernels")),
     "checks": Part(_checks, ("mapping.global_map.visibility_kernels", "mapping.slides.kernels"), is_late=True),
 }
 """The parts whose loops are compiled."""

@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.odometry.interface import Odometry

@@ -18,7 +18,7 @@ from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.summary import RunSummary, WrittenMap, summarise
+from lidarslam.run.summary.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory

@@ -13,7 +13,7 @@ from lidarslam.config.settings import Config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved
+from lidarslam.core.state.stateful import Saved
 from lidarslam.datasets.recording import Recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.run.request import RunRequest, describe_run

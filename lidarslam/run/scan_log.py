@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Saved, State, Stateful
+from lidarslam.core.state.stateful import Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import STAGES, ScanResult

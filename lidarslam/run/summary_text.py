@@ -7,7 +7,7 @@ from pathlib import Path
 from lidarslam.core.plain_text import as_typed, count, scan_span, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary import GraphSummary, RunSummary, WrittenMap
+from lidarslam.run.summary.summary import GraphSummary, RunSummary, WrittenMap
 from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # A speed that differs less is that of the recording.

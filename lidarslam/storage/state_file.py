@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, replacing
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state.stateful import Saved, State
 
 # An .npz file holds a checksum of each of its members, and is refused without its end.
 _TREE, _ARRAY = "tree", "array"

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
-from lidarslam.core.state import Saved
+from lidarslam.core.state.stateful import Saved
 from lidarslam.storage.directory import ABOUT, FILES, STATE, UNFINISHED, RunDirectory
 from lidarslam.storage.state_file import read_state
 

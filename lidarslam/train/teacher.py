@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.odometry.training.preparation import PreparedRecording
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state import State, Stateful
+from lidarslam.core.state.stateful import State, Stateful
 from lidarslam.mapping.global_map import kernels
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.global_map.visibility_kernels import NO_GAPS, TWO_PI, draw, judge
 
 _ROWS, _COLUMNS = 16, 360

@@ -8,7 +8,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.loam.neighbour_kernels import write_principal_axes
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 

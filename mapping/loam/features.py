@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.thinning import one_per_cell
-from lidarslam.mapping.deskew import Sweep
 from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE, classify, write_curvatures
 from lidarslam.mapping.loam.rings import ring_order
+from lidarslam.mapping.motion.deskew import Sweep
 
 # Curvature above which a point is an edge, and below which it is planar, square metres: that of the authors' program.
 _CURVATURE_M2 = 0.1

@@ -10,14 +10,14 @@ import numpy as np
 
 from lidarslam.core.geometry import adjoint, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import body_velocity
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.features import Features, extract_features
 from lidarslam.mapping.loam.registration import FeatureMaps, register
-from lidarslam.mapping.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
 from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan

@@ -10,7 +10,7 @@ from lidarslam.mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
 from lidarslam.mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from lidarslam.mapping.loam.features import Features
-from lidarslam.mapping.prediction import MotionState
+from lidarslam.mapping.motion.prediction import MotionState
 from lidarslam.mapping.tracking.fit import Fit
 
 # Iterations, and the displacement of a point at the mean range that ends them.

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.bird_eye_view import BirdEyeView, align, compare
 from lidarslam.mapping.loops.closure import RelativePose

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import LoopConfig
 from lidarslam.mapping.loops.candidates import Candidate, KeyframeDatabase, objection_to_drift
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure

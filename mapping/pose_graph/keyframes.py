@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import KeyframeConfig
 from lidarslam.mapping.surfels.voxel_hash import key_steps, point_keys
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.state import Saved, State, Stateful
+from lidarslam.core.state.stateful import Saved, State, Stateful
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxel_rows import Layout
 

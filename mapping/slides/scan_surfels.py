@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.core.state import Shape
+from lidarslam.core.state.stateful import Shape
 from lidarslam.mapping.slides.kernels import COLUMNS, ROWS, draw_indices, vote, write_moments
 
 _MIN_RANGE_M = 1.0

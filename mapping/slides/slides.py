@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.slides.scan_surfels import BIN_M, Surfels, shift_profile
 
 # A scan is kept after so many metres or scans, whichever comes first, and paired with the last two.

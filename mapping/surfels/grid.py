@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Shape, State, Stateful
+from lidarslam.core.state.stateful import Shape, State, Stateful
 from lidarslam.mapping.surfels import cell_kernels as kernels
 from lidarslam.mapping.surfels.side_kernels import belong_to_others, turn_to_sensor
 from lidarslam.mapping.surfels.surfel_kernels import refresh

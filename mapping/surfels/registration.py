@@ -12,9 +12,9 @@ import numpy as np
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
-from lidarslam.mapping.deskew import Sweep, body_velocity
 from lidarslam.mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
-from lidarslam.mapping.prediction import MotionState, Prediction
+from lidarslam.mapping.motion.deskew import Sweep, body_velocity
+from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.surfels.sampling import MIN_CORRESPONDENCES
 from lidarslam.mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import Sweep
+from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
 
 # Fewer keypoints, or correspondences of them, make no pose.

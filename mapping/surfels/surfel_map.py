@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.surfels.cell_kernels import write_views
 from lidarslam.mapping.surfels.correspondence_kernels import Rows, match_compact, match_planes
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid

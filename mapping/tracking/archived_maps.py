@@ -1,8 +1,8 @@
 """Archived maps: maps that tracking was lost in, searched now and then for the sensor's return."""
 
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.prediction import MotionState, Prediction
+from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.attempts import Attempt, ScanMatcher

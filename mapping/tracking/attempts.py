@@ -8,8 +8,8 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, inverse, log, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import body_velocity
-from lidarslam.mapping.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
 from lidarslam.mapping.surfels.registration import Registration, register, with_mean_velocity
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap

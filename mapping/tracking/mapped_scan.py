@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.prediction import MotionState
+from lidarslam.mapping.motion.prediction import MotionState
 from lidarslam.mapping.tracking.fit import Fit
 
 

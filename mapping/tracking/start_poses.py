@@ -3,7 +3,7 @@
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, transform_points
-from lidarslam.mapping.deskew import Sweep
+from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.surfels.surfel_map import LEVELS, SurfelMap
 from lidarslam.mapping.tracking.fit import translation_information
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import body_velocity
-from lidarslam.mapping.prediction import (
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import (
     LARGEST_PROCESS_NOISE,
     LOST_MOTION,
     MotionState,

@@ -1,6 +1,6 @@
 """Tracking state: how certain the sensor's pose is, and therefore how widely the next scan is searched."""
 
-from lidarslam.core.state import Stateful
+from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 
 # After such a gap between scans the pose is uncertain.

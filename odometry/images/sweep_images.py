@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals
 from lidarslam.odometry.images.projection import Floats, ImageGrid, Points, Projection, project

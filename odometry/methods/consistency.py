@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.core.tracking import Status
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, orthonormalize
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
 from lidarslam.odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
 from lidarslam.odometry.alignment.search import align_best

@@ -11,8 +11,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets import info_text
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.info_text import describe_as_json
-from lidarslam.datasets.point_time import PointTimeModel
 from lidarslam.datasets.recording import PointField, RecordingInfo, SeveralTopicsError, Topic
+from lidarslam.datasets.times.point_time import PointTimeModel
 
 KEYS = {
     "source", "reader", "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan",

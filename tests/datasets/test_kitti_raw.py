@@ -13,7 +13,7 @@ from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.oxts import oxts_poses
 from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth
 from lidarslam.datasets.registry import choose_reader, open_recording
-from lidarslam.datasets.stamps import increasing_rows, mend_stamps
+from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
 
 MIDNIGHT = np.datetime64("2011-09-26T13:04:32", "ns")
 FIRST_STAMP = 1317042272.0  # the same instant, UTC

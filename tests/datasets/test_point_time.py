@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.point_time import (
+from lidarslam.datasets.times.point_time import (
     TIME_FIELD_NAMES,
     UNITS_PER_SECOND,
     PointTimeModel,
     find_ring_field,
     find_time_field,
 )
-from lidarslam.datasets.point_time_inference import infer_point_time, value_spread
+from lidarslam.datasets.times.point_time_inference import infer_point_time, value_spread
 
 STAMP = 1_700_000_000.25  # representable exactly
 STAMP_NS = 1_700_000_000_250_000_000

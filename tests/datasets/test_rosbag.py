@@ -17,10 +17,10 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.info_text import describe_source
-from lidarslam.datasets.point_time import PointTimeModel
 from lidarslam.datasets.recording import PointField, Topic
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.times.point_time import PointTimeModel
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000

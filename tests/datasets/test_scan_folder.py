@@ -14,7 +14,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.registry import choose_reader, open_recording
-from lidarslam.datasets.stamps import read_stamps, stamps_from_names
+from lidarslam.datasets.times.stamps import read_stamps, stamps_from_names
 
 EPOCH = 1583836591.25
 RICH = np.dtype(

@@ -9,7 +9,7 @@ import pytest
 from lidarslam.mapping.loops.closure import LoopClosure
 from lidarslam.run.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
+from lidarslam.run.summary.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
 from lidarslam.run.summary_text import format_map, format_outcome
 
 

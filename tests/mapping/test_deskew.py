@@ -8,7 +8,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, transform_points
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.deskew import body_velocity, deskew
+from lidarslam.mapping.motion.deskew import body_velocity, deskew
 
 
 def exponentials(points: FloatArray, offsets: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -27,8 +27,8 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import Sweep
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.simulation.motion.carriers import mount_pose

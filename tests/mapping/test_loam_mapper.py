@@ -10,12 +10,12 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig, TrackingConfig
 from lidarslam.mapping.loam.mapper import LoamMapper
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 Path = Callable[[FloatArray], FloatArray]

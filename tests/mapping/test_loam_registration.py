@@ -9,16 +9,16 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
-from lidarslam.mapping.deskew import Sweep
 from lidarslam.mapping.loam import registration
 from lidarslam.mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from lidarslam.mapping.loam.features import Features
 from lidarslam.mapping.loam.neighbour_kernels import write_principal_axes
 from lidarslam.mapping.loam.registration import FeatureMaps, LoamRegistration
-from lidarslam.mapping.prediction import UNKNOWN_VELOCITY, MotionState
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState
 
 ThroughDisk = Callable[[State], Saved]
 ORIGIN = np.zeros(3)

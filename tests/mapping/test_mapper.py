@@ -12,7 +12,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig, TrackingConfig
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 

@@ -8,13 +8,13 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
 from lidarslam.core.scan import Scan
-from lidarslam.core.state import Saved, State
+from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import KeyframeConfig, MappingConfig
 from lidarslam.mapping.global_map import global_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
+from lidarslam.mapping.motion.prediction import OdometryNoise, Prior, ProcessNoise
 from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
-from lidarslam.mapping.prediction import OdometryNoise, Prior, ProcessNoise
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 

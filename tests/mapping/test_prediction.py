@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.prediction import (
+from lidarslam.mapping.motion.prediction import (
     LEAST_SIGMA,
     MotionState,
     OdometryNoise,

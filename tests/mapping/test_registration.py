@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
-from lidarslam.mapping.deskew import Sweep
-from lidarslam.mapping.prediction import Prediction
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.registration import Registration
 from lidarslam.mapping.surfels.registration import register as register_sweep
 from lidarslam.mapping.surfels.surfel_map import SurfelMap

@@ -7,8 +7,8 @@ from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.deskew import move
-from lidarslam.mapping.prediction import Prior
+from lidarslam.mapping.motion.deskew import move
+from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.simulation.motion.carriers import mount_pose

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
-from lidarslam.mapping.deskew import Sweep, move
+from lidarslam.mapping.motion.deskew import Sweep, move
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.start_poses import best_starts, best_velocity, turned_poses
 

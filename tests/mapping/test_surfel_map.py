@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
-from lidarslam.core.state import Saved
+from lidarslam.core.state.stateful import Saved
 from lidarslam.mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
 
 CELL = 0.4

@@ -7,7 +7,7 @@ from lidarslam.core.geometry import exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.deskew import body_velocity, deskew
+from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck, plane_distances
 
 

@@ -4,13 +4,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, scan_indices
-from lidarslam.datasets.point_time import PointTimeModel
 from lidarslam.datasets.recording import PointField, RecordingInfo
+from lidarslam.datasets.times.point_time import PointTimeModel
 
 
 class FileRecording:
@@ -38,6 +39,11 @@ class FileRecording:
     @property
     def ground_truth(self) -> Trajectory | None:
         """T_world_lidar at the truth's own stamps."""
+        return None
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """No IMU."""
         return None
 
     @property

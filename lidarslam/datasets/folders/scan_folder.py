@@ -19,7 +19,8 @@ from lidarslam.datasets.folders.formats import table_reader
 from lidarslam.datasets.folders.layout import find_layout
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
-from lidarslam.datasets.point_time import (
+from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.times.point_time import (
     CLOCK_LIMIT_S,
     UNITS_PER_SECOND,
     PointTimeModel,
@@ -27,9 +28,8 @@ from lidarslam.datasets.point_time import (
     find_time_field,
     is_return,
 )
-from lidarslam.datasets.point_time_inference import TimedCloud, learn_point_time
-from lidarslam.datasets.recording import PointField, Recording
-from lidarslam.datasets.stamps import scan_rate
+from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.times.stamps import scan_rate
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

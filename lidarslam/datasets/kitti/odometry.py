@@ -24,7 +24,7 @@ from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stamps import increasing_rows, mend_stamps, read_stamps
+from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

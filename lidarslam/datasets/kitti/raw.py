@@ -21,9 +21,9 @@ from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_raw_calibration
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
 from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth, read_sweep_timing
-from lidarslam.datasets.point_time import PointTimeModel
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.stamps import increasing_rows, read_stamps
+from lidarslam.datasets.times.point_time import PointTimeModel
+from lidarslam.datasets.times.stamps import increasing_rows, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import count
-from lidarslam.datasets.stamps import mend_stamps, read_stamps
+from lidarslam.datasets.times.stamps import mend_stamps, read_stamps
 
 # Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
 _SWEEP_TOLERANCE = 0.25

@@ -16,8 +16,8 @@ from lidarslam.datasets.folders.point_attributes import (
     read_colours,
     read_intensities,
 )
-from lidarslam.datasets.point_time import find_ring_field, find_time_field
 from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.times.point_time import find_ring_field, find_time_field
 
 # sensor_msgs/PointField, constants INT8 to FLOAT64.
 _TYPES = {1: "int8", 2: "uint8", 3: "int16", 4: "uint16", 5: "int32", 6: "uint32", 7: "float32", 8: "float64"}

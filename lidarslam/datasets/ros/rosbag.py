@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
@@ -16,15 +17,15 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
-from lidarslam.datasets.point_time import PointTimeModel, is_return
-from lidarslam.datasets.point_time_inference import TimedCloud, learn_point_time
 from lidarslam.datasets.recording import Recording, RecordingInfo
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
 from lidarslam.datasets.ros.bag_topics import choose_topic
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.stamp_order import in_stamp_order
+from lidarslam.datasets.times.point_time import PointTimeModel, is_return
+from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.times.stamp_order import in_stamp_order
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ class BagRecording:
     """
 
     T_cam_lidar: FloatArray | None = None  # no camera
+    imu: ImuSamples | None = None
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
         self._source = source

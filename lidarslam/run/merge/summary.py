@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from lidarslam.run.summary import GraphSummary, WrittenMap, graph_and_map_json
+from lidarslam.run.summary.summary import GraphSummary, WrittenMap, graph_and_map_json
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import typing
 from typing import Any
 
-from lidarslam.core.state_tree import Saved, Shape, State, checked, decode, encode, hints_of
+from lidarslam.core.state.tree import Saved, Shape, State, checked, decode, encode, hints_of
 
 __all__ = ["Saved", "Shape", "State", "Stateful", "decode"]
 

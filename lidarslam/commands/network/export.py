@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample, default_out, out_option
-from lidarslam.commands.terminal import say
+from lidarslam.commands.shared.options import PATH, CommandWithExample, default_out, out_option
+from lidarslam.commands.shared.terminal import say
 
 
 @click.command(cls=CommandWithExample, epilog="lidarslam export --weights trained/weights.safetensors -o exported")

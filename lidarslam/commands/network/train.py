@@ -6,8 +6,15 @@ from typing import Any
 
 import click
 
-from lidarslam.commands.options import PATH, CommandWithExample, config_options, default_out, out_option, reader_options
-from lidarslam.commands.terminal import EXIT_MENDABLE, say
+from lidarslam.commands.shared.options import (
+    PATH,
+    CommandWithExample,
+    config_options,
+    default_out,
+    out_option,
+    reader_options,
+)
+from lidarslam.commands.shared.terminal import EXIT_MENDABLE, say
 
 
 @click.command(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.datasets.config import TimeReference, TimeUnit
-from lidarslam.datasets.point_time import CLOCK_LIMIT_S, UNITS_PER_SECOND, PointTimeModel
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, UNITS_PER_SECOND, PointTimeModel
 
 logger = logging.getLogger(__name__)
 

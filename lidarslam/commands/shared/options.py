@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarslam.commands.names import Registered, ShippedFile
-from lidarslam.commands.terminal import note, verbose_option
+from lidarslam.commands.shared.names import Registered, ShippedFile
+from lidarslam.commands.shared.terminal import note, verbose_option
 
 if TYPE_CHECKING:
     from lidarslam.config.settings import Config

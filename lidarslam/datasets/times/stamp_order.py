@@ -10,7 +10,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.stamps import increasing_rows
+from lidarslam.datasets.times.stamps import increasing_rows
 
 T = TypeVar("T")
 

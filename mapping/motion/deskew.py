@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, log
-from lidarslam.core.state import Shape
+from lidarslam.core.state.stateful import Shape
 
 # Below this squared angle the series are exact to double precision.
 _SERIES_ANGLE2 = 0.25

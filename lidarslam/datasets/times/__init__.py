@@ -1,0 +1,1 @@
+"""Stamps of scans and times of points."""

@@ -1,0 +1,1 @@
+"""Motion of the sensor during and between sweeps."""
