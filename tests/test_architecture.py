@@ -55,6 +55,8 @@ CONFINED = {
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),
+    "ouster": ("lidarslam.datasets.packets.ouster*",),
+    "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
