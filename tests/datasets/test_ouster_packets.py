@@ -8,6 +8,7 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.info_text import describe_source
+from lidarslam.datasets.packets.ouster import find_metadata
 from lidarslam.datasets.registry import open_recording
 
 core = pytest.importorskip("ouster.sdk.core", reason="needs ouster-sdk (pip install --no-deps ouster-sdk)")
@@ -78,7 +79,7 @@ def recorded(request, tmp_path, sensor, frames, packets):
     pcap = pytest.importorskip("ouster.sdk.pcap", exc_type=ImportError)
     pcap.record(packets, str(path))
     (tmp_path / "drive_metadata.json").write_text(sensor.to_json_string())
-    (tmp_path / "driver.json").write_text("{}")
+    (tmp_path / "drive.json").write_text("{}")  # is something else
     return path
 
 
@@ -143,6 +144,15 @@ def test_damaged_files(recorded):
         assert len(list(open_recording(recorded).scans())) < COUNT
     except InputError as error:
         assert "ouster-sdk" in str(error)  # noqa: PT017
+
+
+def test_metadata_of_another_recording_is_not_taken(tmp_path, sensor):
+    (tmp_path / "office.json").write_text(sensor.to_json_string())
+    (tmp_path / "street.pcap").write_bytes(b"")
+    assert find_metadata(tmp_path / "street.pcap") == tmp_path / "office.json"  # the only recording there
+    (tmp_path / "office.pcap").write_bytes(b"")
+    assert find_metadata(tmp_path / "street.pcap") is None
+    assert find_metadata(tmp_path / "office.pcap") == tmp_path / "office.json"
 
 
 def test_a_capture_without_metadata_asks_for_it(tmp_path, packets):

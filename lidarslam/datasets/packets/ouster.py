@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,17 @@ _VALID = 1  # of a column's status
 
 
 def find_metadata(source: Path) -> Path | None:
-    """The metadata of an Ouster beside a recording: the file with the longest beginning in common."""
+    """The metadata of an Ouster beside a recording: the file whose name begins most like it, or the only one."""
+    folder = source.absolute().parent
+    found = {path: _in_common(path.stem, source.stem) for path in folder.glob("*.json") if _is_metadata(path)}
+    best = max(sorted(found), key=lambda path: found[path], default=None)
+    is_alone = len(list(folder.glob(f"*{source.suffix}"))) == 1
+    return best if best is not None and (found[best] or is_alone) else None
 
-    def common(path: Path) -> int:
-        pairs = zip(path.stem, source.stem, strict=False)
-        return next((index for index, (a, b) in enumerate(pairs) if a != b), min(len(path.stem), len(source.stem)))
 
-    found = [path for path in sorted(source.absolute().parent.glob("*.json")) if _is_metadata(path)]
-    return max(found, key=common, default=None)
+def _in_common(name: str, other: str) -> int:
+    """How many characters both begin with."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(name, other, strict=False)))
 
 
 def _is_metadata(path: Path) -> bool:
