@@ -1,7 +1,7 @@
 """The JSON tables of nuScenes, as far as LIDAR_TOP needs them.
 
-sample_data and ego_pose have millions of records, one gigabyte each in v1.0-trainval. Their records hold no others, so
-that they are found by a regular expression and only those of the scene are parsed.
+sample_data and ego_pose have millions of records in v1.0-trainval. Their records hold no others, so that the few wanted
+ones are found by their text, and only those are parsed.
 """
 
 import json
@@ -17,9 +17,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.published.poses import poses_wxyz
 
-_RECORD = re.compile(rb"\{[^{}]*\}")
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
-_CHANNEL = b"/LIDAR_TOP/"
+_LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
 _MICROSECOND = 1e-6
 _SWEEP = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "timestamp", "filename")
 _POSE = ("token", "translation", "rotation")
@@ -54,12 +53,12 @@ def read_sweeps(version: Path, scene: str) -> Sweeps:
     samples = {
         one["token"] for one in _table(version / "sample.json", "token", "scene_token") if one["scene_token"] == scene
     }
-    data = _select(version / "sample_data.json", lambda text: _CHANNEL in text, *_SWEEP)
+    data = _select(version / "sample_data.json", _LIDAR_FILE, lambda _: True, *_SWEEP)
     sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
     if not sweeps:
         raise InputError(f"{version / 'sample_data.json'}: has no sweep of LIDAR_TOP for the scene; download it again")
     wanted = {one["ego_pose_token"].encode() for one in sweeps}
-    ego_poses = _select(version / "ego_pose.json", lambda text: _token(text) in wanted, *_POSE)
+    ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, *_POSE)
     T_world_ego = _poses(version, list(ego_poses), [one["ego_pose_token"] for one in sweeps])
     sensors = _table(version / "calibrated_sensor.json", *_POSE)
     T_ego_lidar = _poses(version, sensors, [one["calibrated_sensor_token"] for one in sweeps])
@@ -86,15 +85,18 @@ def _table(path: Path, *keys: str) -> list[Record]:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
 
 
-def _select(path: Path, wanted: Callable[[bytes], bool], *keys: str) -> Iterator[Record]:
-    """The records of a large table whose text is wanted."""
+def _select(
+    path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], *keys: str
+) -> Iterator[Record]:
+    """The records of a large table in which a pattern is found, as far as the match is wanted."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
             if not text[-_TAIL:].rstrip().endswith(b"]"):
                 raise ValueError("its end is missing")
-            for match in _RECORD.finditer(text):
-                if wanted(record := match[0]):
-                    yield _checked(json.loads(record), keys)
+            for match in pattern.finditer(text):
+                if wanted(match):
+                    start, end = text.rfind(b"{", 0, match.start()), text.find(b"}", match.end()) + 1
+                    yield _checked(json.loads(text[start:end]), keys)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
 
@@ -103,8 +105,3 @@ def _checked(record: Record, keys: tuple[str, ...]) -> Record:
     if missing := [key for key in keys if key not in record]:
         raise ValueError(f"a record has no {missing[0]}")
     return record
-
-
-def _token(record: bytes) -> bytes | None:
-    found = _TOKEN.search(record)
-    return found[1] if found else None

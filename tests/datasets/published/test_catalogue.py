@@ -86,3 +86,10 @@ def test_unknown_names_are_one_line() -> None:
     result = _datasets("kitti")
     assert result.exit_code == 1
     assert "neither a known data set nor a folder; did you mean kitti_raw or kitti_odometry?" in result.output
+
+
+def test_the_page_has_the_same_table() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "data_sets.md").read_text(encoding="utf-8")
+    for one in CATALOGUE:
+        cells = [f"[{one.title}]({one.url})", f"`{one.name}`", one.sensor, f"`{one.reader}`", one.truth]
+        assert f"| {' | '.join([*cells, 'yes' if one.imu else 'no', one.tried])} |" in page
