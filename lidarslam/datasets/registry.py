@@ -8,6 +8,8 @@ from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
+from lidarslam.datasets.published.evalio_names import is_of_evalio, located
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.unrecognised import absent, result_of_program, unrecognised
 
@@ -15,7 +17,6 @@ logger = logging.getLogger(__name__)
 
 # Of rosbag2; a recorder that was killed leaves such a file without the metadata.yaml beside it.
 _BAG_SUFFIXES = (".db3", ".mcap")
-SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 
 
 class Reader(NamedTuple):
@@ -44,6 +45,11 @@ def _is_kitti_360(source: Path) -> bool:
 
 
 READERS: dict[str, Reader] = {
+    "evalio": Reader(
+        "lidarslam.datasets.published.evalio",
+        "data sets of evalio: evalio:DATASET/SEQUENCE, or that folder of its data (lidarslam datasets)",
+        is_of_evalio,
+    ),
     "kitti-odometry": Reader(
         "lidarslam.datasets.kitti.odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
@@ -84,6 +90,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     Raises:
         InputError: no such source, no such reader, or no reader recognises the source.
     """
+    source = located(source)
     try:
         exists = source.exists()
         if exists and source.is_dir():
@@ -114,6 +121,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
 
 def is_recording(source: Path, name: str | None = None) -> bool:
     """Whether a reader was named for an existing source, or one recognises it."""
+    source = located(source)
     return source.exists() and (name is not None or _recognise(source) is not None)
 
 
@@ -128,7 +136,7 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     Raises:
         InputError: the source cannot be read by the chosen reader.
     """
-    config = config or ReaderConfig()
+    config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
     why = "because the names fit" if config.name is None else "as it was named"
     logger.info("reader: %s, %s: %s", name, why, READERS[name].reads)

@@ -31,12 +31,15 @@ class CommandWithExample(click.Command):
 
 
 class _Path(click.Path):
-    """A path that is not empty, which would mean the current folder."""
+    """A path that is not empty, which would mean the current folder; for evalio:DATASET/SEQUENCE, its folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from lidarslam.datasets.published.evalio_names import located
+
         if value == "":
             self.fail("the path is empty; name a file or a folder", param, ctx)
-        return super().convert(value, param, ctx)
+        path = super().convert(value, param, ctx)
+        return located(path) if isinstance(path, Path) else path
 
 
 PATH = _Path(path_type=Path)
