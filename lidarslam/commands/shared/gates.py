@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 
-class _Gate(click.ParamType):
+class _Gate(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
     """A bound of a figure; of a comparison, of one method too."""
 
     name = "gate"
