@@ -14,6 +14,7 @@ from lidarslam.commands.compare import compare
 from lidarslam.commands.config import config
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
+from lidarslam.commands.exports.bag import export_bag
 from lidarslam.commands.info import info
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
@@ -101,7 +102,7 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, config):
+for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, export_bag, config):
     main.add_command(_command)
 
 
