@@ -20,7 +20,6 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from lidarslam.core.errors import OutputError
 from lidarslam.core.files import cannot_write, make_directory
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes, Scan
@@ -186,15 +185,3 @@ def _qos(latched: bool) -> Qos:
         liveliness_lease_duration=_LONGEST,
         avoid_ros_namespace_conventions=False,
     )
-
-
-def require_new(out: Path, overwrite: bool) -> None:
-    """Check that nothing is in the way of an exported file.
-
-    Raises:
-        OutputError: a file is there that is not to be replaced, or a folder.
-    """
-    if out.is_dir():
-        raise OutputError(f"{out}: is a folder; name another place, or remove it")
-    if out.exists() and not overwrite:
-        raise OutputError(f"{out}: exists; name another file, or replace it with --overwrite")
