@@ -43,7 +43,7 @@ class BirdsEyeMap:
     @classmethod
     def of(cls, points: FloatArray, up: FloatArray, cell_m: float) -> "BirdsEyeMap":
         """Draw points (N, 3) of the world, with the vertical `up` (3,)."""
-        R_level_world = _levelling(up)
+        R_level_world = levelling(up)
         level = points @ R_level_world.T
         middle = np.median(level[:, :2], axis=0) if len(level) else np.zeros(2)
         near = (np.abs(level[:, :2] - middle) < _MOST_CELLS * cell_m).all(axis=1)
@@ -93,7 +93,7 @@ class BirdsEyeMap:
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
 
 
-def _levelling(up: FloatArray) -> FloatArray:
+def levelling(up: FloatArray) -> FloatArray:
     """The smallest rotation (3, 3) that takes a unit vector (3,) near z to z."""
     K = skew(np.array([up[1], -up[0], 0.0]))
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + up[2]), dtype=np.float64)
