@@ -108,11 +108,12 @@ class Outcome:
         self.search_ms.append(float(ms.max()))
         placed = np.array([status is not Status.LOST for status in statuses])
         if localiser.found:
-            first = localiser.found[0]
-            self.confirmed.append(first.confirmed + 1)
-            poses[: first.scan] = first.T_map_local @ poses[: first.scan]
-            placed[list(first.followed)] = True
-            self.lost += int((~placed[first.confirmed :]).sum())
+            for number, pose in localiser.corrections.items():
+                poses[number] = pose
+            placed[localiser.placed_afterwards] = True
+            self.confirmed.append(localiser.found[0].confirmed + 1)
+            self.lost += int((~placed[localiser.found[0].confirmed :]).sum())
+        placed[localiser.unconfirmed()] = False
         if truth is None:
             self.wrong += int(placed.sum())
             return

@@ -31,18 +31,17 @@ _LEAST_OVERLAP = 0.25
 # Radius of the region that scans are registered to, in median ranges, and what it is drawn larger by, as a share.
 _RANGES = 5.0
 _SPARE = 0.5
+# The way, in median ranges, over which the recording's own map places the scans before the first place.
+_BACK_RANGES = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A place that was found and confirmed."""
+    """A place that was found and confirmed; scans are numbered from 0."""
 
-    scan: int  # number of the scan, from 0, that was found
-    confirmed: int  # number of the scan that confirmed it
+    scan: int  # that was found
+    confirmed: int  # that confirmed it
     fits: tuple[Fit, ...]  # of the scans that it was found with
-    T_map_local: FloatArray  # (4, 4) from the frame of the poses up to that scan
-    followed: tuple[int, ...]  # numbers of the scans before that are tracked without a break up to it
-    was_known: bool  # whether the recording had been found before
 
 
 class MapLocaliser(Stateful):
@@ -51,24 +50,29 @@ class MapLocaliser(Stateful):
     Args:
         config: of the mapping.
         fixed_map: the finished map.
-        guess: (4, 4) rough pose of the first scan, x, y and heading; None: anywhere.
+        guess: rough x, y and heading of the first scan; None: anywhere.
     """
 
-    def __init__(self, config: MappingConfig, fixed_map: FixedMap, guess: FloatArray | None = None) -> None:
+    def __init__(self, config: MappingConfig, fixed_map: FixedMap, guess: tuple[float, float, float] | None = None) -> None:
         self._config = config
         self._map = fixed_map
         self._sampler = Sampler(config)
         self._search = PlaceSearch(fixed_map, config.max_range_m)
-        self._local: LocalMapping | None = LocalMapping(config, guess)
-        self._is_guess = guess is not None
-        self._local_from = 0
+        self._local: LocalMapping | None = LocalMapping(config, None)
+        self._guess = guess
         self._tracker: Tracker | None = None
         self._regions: Regions | None = None
         self._last: MotionState | None = None
-        self._pending: Found | None = None
+        self._pending: tuple[Found, FloatArray] | None = None  # unconfirmed, and its `T_map_local` (4, 4)
         self._count = 0
         self.found: list[Found] = []  # one a time that it was found
-        self.refusals: list[tuple[int, str]] = []  # number of the scan, and reason, of every search without a place
+        # Of every search without a place: the number of the scan, from 0, and the reason.
+        self.refusals: list[tuple[int, str]] = []
+        # Better poses than those returned, known by now, by the numbers of the scans; and which of these scans lie on
+        # the way to the first place, and which at a place that was not confirmed.
+        self.corrections: dict[int, FloatArray] = {}
+        self.placed_afterwards: list[int] = []
+        self.revoked: list[int] = []
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan."""
@@ -77,7 +81,7 @@ class MapLocaliser(Stateful):
         if self._tracker is not None and self._last is not None:
             mapped = self._track(sampled, prior, self._tracker, self._last)
             if mapped.status is Status.LOST and own is not None:  # the place was not confirmed
-                self._tracker = self._pending = None
+                self._revoke()
                 mapped = self._dead_reckoned(own, f"the place that was found is not confirmed: {mapped.message}")
         else:
             assert own is not None
@@ -85,6 +89,11 @@ class MapLocaliser(Stateful):
         self._last = mapped.state
         self._count += 1
         return mapped
+
+    def unconfirmed(self) -> list[int]:
+        """Numbers of the scans at places that were not confirmed, by now."""
+        pending = [] if self._pending is None else range(self._pending[0].scan, self._count)
+        return [*self.revoked, *pending]
 
     def _track(self, scan: SampledScan, prior: Prior, tracker: Tracker, last: MotionState) -> MappedScan:
         """Predict, register, judge."""
@@ -101,21 +110,38 @@ class MapLocaliser(Stateful):
             return self._lose(tracker, attempt.prediction, attempt.fit, reason)
         mapped = tracker.accept(attempt, scan, prior, prediction, last)
         if self._pending is not None and not tracker.is_unconfirmed:
-            self._confirm(self._pending)
+            self._confirm(*self._pending)
         return replace(mapped, added=False)
 
-    def _confirm(self, pending: Found) -> None:
+    def _confirm(self, pending: Found, T_map_local: FloatArray) -> None:
+        """Accept a place; the scans on the way to the first one are placed too, as far as drift is small."""
+        local = self._local
+        if local is not None and not self.found:
+            self.corrections = {number: T_map_local @ T for number, T in local.poses.items() if number < pending.scan}
+            reached = set(local.followed_within(_BACK_RANGES, pending.scan))
+            self.placed_afterwards = sorted(reached)
+            self.revoked = [number for number in self.revoked if number not in reached]
         self.found.append(replace(pending, confirmed=self._count))
         self._pending = self._local = None
-        self._is_guess = False
+        self._guess = None
         logger.info("found at scan %d, confirmed at scan %d", pending.scan, self._count)
+
+    def _revoke(self) -> None:
+        """Give up a place that later scans contradict."""
+        local, pending = self._local, self._pending
+        assert local is not None and pending is not None
+        T_map_local = np.eye(4) if local.T_map_local is None else local.T_map_local
+        for number in range(pending[0].scan, self._count):
+            self.corrections[number] = T_map_local @ local.poses[number]
+            self.revoked.append(number)
+        self._tracker = self._pending = None
 
     def _lose(self, tracker: Tracker, prediction: Prediction, fit: Fit | None, reason: str) -> MappedScan:
         """A scan that is not registered stays at its prediction; after many a local map of its own begins."""
         T_map_lidar, velocity = prediction.T_world_lidar, prediction.velocity
         if tracker.loses(has_points=fit is not None):
             self._tracker = None
-            self._local, self._local_from = LocalMapping(self._config, T_map_lidar), self._count + 1
+            self._local = LocalMapping(self._config, T_map_lidar, self._count + 1)
         lost = MotionState(prediction.stamp, T_map_lidar, FADING * velocity, LOST_MOTION)
         return MappedScan(lost, T_map_lidar, False, Status.LOST, reason, fit, is_connected=False)
 
@@ -136,12 +162,14 @@ class MapLocaliser(Stateful):
         if own.status is Status.LOST:
             return None
         nearby = None
-        if local.T_map_local is not None and local.searches_nearby:
-            T_map_lidar = local.T_map_local @ own.state.T_world_lidar
-            nearby = self._search.around(local.kept, T_map_lidar, keeps_height=not self._is_guess)
-            if nearby.place is not None:
-                return nearby
-        if not self._is_guess and local.searches_anywhere():
+        if local.searches_nearby:
+            if self._guess is not None:
+                local.T_map_local = self._search.guessed(local.kept, local.up, *self._guess)
+            if local.T_map_local is not None:
+                nearby = self._search.around(local.kept, local.T_map_local @ own.state.T_world_lidar)
+                if nearby.place is not None:
+                    return nearby
+        if self._guess is None and local.searches_anywhere():
             return self._search.anywhere(local.kept, local.up)
         return nearby
 
@@ -150,8 +178,7 @@ class MapLocaliser(Stateful):
         local = self._local
         assert local is not None
         T_map_local = place.T_map_lidar @ inverse(own.state.T_world_lidar)
-        followed = tuple(self._local_from + number for number in local.followed[:-1])
-        self._pending = Found(self._count, -1, place.fits, T_map_local, followed, bool(self.found))
+        self._pending = Found(self._count, -1, place.fits), T_map_local
         self._tracker = Tracker(self._config)
         self._tracker.begin_at(scan.stamp, place.quality)
         covariance = own.state.covariance.copy()

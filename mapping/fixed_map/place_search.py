@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
 from lidarslam.mapping.motion.deskew import Sweep
@@ -163,8 +163,19 @@ class PlaceSearch:
                 places.append(place)
         return sorted(places, key=lambda place: -place.quality)
 
-    def around(self, scans: KeptScans, T_map_lidar: FloatArray, keeps_height: bool) -> Search:
-        """Search near a pose (4, 4) of the latest scan, whose height need not be known."""
+    def guessed(self, scans: KeptScans, up: FloatArray, x: float, y: float, yaw: float) -> FloatArray | None:
+        """`T_map_local` (4, 4) for a rough position and heading of the local frame, at the height that fits."""
+        latest = scans.latest
+        if latest is None:
+            return None
+        reach_m, R_level_local = _RANGES * latest.range_m, levelling(up)
+        points = transform_points(latest.T_local_lidar, scans.points_around(reach_m)) @ R_level_local.T
+        view = min(self._map.views(self._map.cell_m(latest.cell_m)), key=lambda view: view.distance_m(x, y))
+        T = make_transform(view.R_level_world.T @ R_level_local, np.zeros(3))
+        return view.pose_at(yaw, np.array([x, y]), points, T, reach_m)
+
+    def around(self, scans: KeptScans, T_map_lidar: FloatArray) -> Search:
+        """Search near a pose (4, 4) of the latest scan."""
         latest = scans.latest
         if latest is None:
             return Search(None, "no scan could be registered to the scans before")

@@ -75,16 +75,26 @@ class BirdsEyeMap:
             correlation = irfft2(spectrum * np.conj(rfft2(image, s=(size, size))), s=(size, size)) / norm
             peaks += [(score, yaw, self._position(shift, size, reach_m)) for score, shift in _peaks(correlation)]
         chosen = _apart(sorted(peaks, key=lambda peak: -peak[0]), _APART * self.cell_m, most)
-        return np.array([self._pose(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
+        return np.array([self.pose_at(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
+
+    def distance_m(self, x: float, y: float) -> float:
+        """Distance of a position, levelled, from the nearest point."""
+        if not len(self.points):
+            return np.inf
+        return float(np.linalg.norm(self.points[:, :2] - [x, y], axis=1).min())
 
     def _position(self, shift: NDArray[np.intp], size: int, reach_m: float) -> FloatArray:
         """Position (2,) of the sensor for a shift (2,) of its image, in cells modulo the size."""
         shift = np.where(shift < max(self.columns.shape), shift, shift - size)
         return np.asarray(self.corner + self.cell_m * shift + reach_m, dtype=np.float64)
 
-    def _pose(
+    def pose_at(
         self, yaw: float, xy: FloatArray, level: FloatArray, T_world_lidar: FloatArray, reach_m: float
     ) -> FloatArray:
+        """Pose (4, 4) of a scan at a position (2,), levelled, turned by a yaw from a pose, at the height that fits.
+
+        Its points (N, 3) are levelled at that pose.
+        """
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         around = self.points[np.einsum("ij,ij->i", self.points[:, :2] - xy, self.points[:, :2] - xy) < reach_m**2]
