@@ -18,6 +18,7 @@ from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
 from lidarslam.commands.exports.grid import export_grid
 from lidarslam.commands.info import info
+from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
 from lidarslam.commands.network.train import train
@@ -109,6 +110,7 @@ for _command in (
     datasets,
     info,
     run,
+    localise,
     merge,
     simulate,
     train,
