@@ -15,6 +15,7 @@ from lidarslam.commands.config import config
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.info import info
+from lidarslam.commands.live import live
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
 from lidarslam.commands.network.train import train
@@ -101,7 +102,7 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, config):
+for _command in (demo, info, run, live, merge, simulate, train, export, evaluate, view, compare, config):
     main.add_command(_command)
 
 

@@ -14,7 +14,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.recording import Recording, RecordingInfo
@@ -23,6 +23,7 @@ from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
 from lidarslam.datasets.ros.bag_topics import choose_topic
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
+from lidarslam.datasets.ros.timed_scan import timed_scan
 from lidarslam.datasets.times.point_time import PointTimeModel, is_return
 from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
 from lidarslam.datasets.times.stamp_order import in_stamp_order
@@ -165,14 +166,7 @@ class BagRecording:
         return wanted
 
     def _scan(self, message: BagMessage, faults: Faults) -> Scan:
-        cloud, model, stamp = self._decode(message), self._point_time, self._stamps.stamp(message)
-        offsets = None
-        if model is not None and cloud.times is not None and cloud.time_field == model.field:
-            offsets = model.offsets(cloud.times, stamp)
-        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings, cloud.intensities, cloud.colours)
-        if model is not None and scan.time_offsets is None and len(scan):
-            faults.note(NO_POINT_TIME, f"{stamp:.9f}")
-        return scan
+        return timed_scan(self._decode(message), self._point_time, self._stamps.stamp(message), faults)
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         return self._bag.decode(message, self._config.time_field)
