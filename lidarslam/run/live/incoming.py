@@ -27,7 +27,9 @@ class Arrived(Received):
 
 
 class IncomingQueue:
-    """Receives from its beginning to its end; where messages come faster than they are taken, the oldest are dropped.
+    """Receives from its beginning to its end; where messages come faster than they are taken, some are dropped.
+
+    Dropped is what leaves the shortest gap: tracking bears half the rate better than a second without scans.
 
     Attributes:
         dropped: number of messages that were dropped.
@@ -51,6 +53,7 @@ class IncomingQueue:
         self._on_arrival = on_arrival
         self._waiting: deque[Arrived] = deque()
         self._longest = longest
+        self._taken_ns = 0  # when the last message that was taken was published
         self._changed = threading.Condition()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="receive", daemon=True)
@@ -77,7 +80,9 @@ class IncomingQueue:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self.is_ended, timeout_s)
             if self._waiting:
-                return self._waiting.popleft()
+                message = self._waiting.popleft()
+                self._taken_ns = message.published_ns
+                return message
             if self._error is not None:
                 raise self._error
             return None
@@ -96,6 +101,12 @@ class IncomingQueue:
         with self._changed:
             self._waiting.append(message)
             if len(self._waiting) > self._longest:
-                self._waiting.popleft()
+                del self._waiting[self._most_dispensable()]
                 self.dropped += 1
             self._changed.notify_all()
+
+    def _most_dispensable(self) -> int:
+        """Index of the message whose absence leaves the shortest gap: the oldest of equal ones, never the newest."""
+        times = [self._taken_ns, *(message.published_ns for message in self._waiting)]
+        gaps = [after - before for before, after in zip(times, times[2:], strict=False)]
+        return min(range(len(gaps)), key=gaps.__getitem__, default=0)
