@@ -13,6 +13,11 @@ _BASES = {
     "learned": "learned", "kiss-icp": "kiss-icp", "constant-velocity": "constant-velocity", "imu": "imu",
     "learned+imu": "learned+imu", "prior": "external",
 }  # fmt: skip
+_ONLY_WITH_MAP = {
+    "constant-velocity": "only predicts",
+    "imu": "measures turns alone",
+    "learned+imu": "the IMU takes part in scan-to-map registration",
+}
 _NAME = re.compile(r"(?P<base>[a-z][a-z-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?")
 _MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
 _GRAMMAR = (
@@ -46,9 +51,10 @@ def parse_method(name: str) -> Method:
     odometry = _BASES[match["base"]]
     if odometry not in get_args(OdometryName):
         raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
-    if odometry in ("constant-velocity", "imu", "learned+imu") and not match["mapping"]:
+    if odometry in _ONLY_WITH_MAP and not match["mapping"]:
         raise ConfigError(
-            f"{name}: only predicts; compare {odometry}+map or {odometry}+loam, which correct it against a map"
+            f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
+            " a map"
         )
     voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)
     pose_graph = str(match["graph"] is not None).lower()

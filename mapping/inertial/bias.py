@@ -11,6 +11,8 @@ from lidarslam.core.state.stateful import Shape, Stateful
 _DENSITY, _FIRST_BIAS, _WALK = 5e-4, 0.02, 1e-4
 # Error of its scale and axes, as a share of the turn; error of its clock, seconds.
 _SCALE, _CLOCK_S = 0.001, 0.001
+# No turn is more precise, radians.
+_LEAST_TURN = np.deg2rad(0.03)
 # No registered attitude is more precise, radians; innovations beyond so many deviations count less.
 _LEAST_ATTITUDE = np.deg2rad(0.05)
 _MOST_SQUARED = 9.0
@@ -34,7 +36,8 @@ class BiasFilter(Stateful):
 
     def turn_covariance(self, turn: FloatArray, interval_s: float, change: FloatArray) -> FloatArray:
         """(3, 3) of the error of a turn (3, 3) within an interval in which the rate changed by (3,), from the right."""
-        return self._noise(turn, interval_s, change) + interval_s**2 * self._covariance[3:, 3:]
+        least = _LEAST_TURN**2 * np.eye(3)
+        return self._noise(turn, interval_s, change) + least + interval_s**2 * self._covariance[3:, 3:]
 
     def turned(self, turn: FloatArray, interval_s: float, change: FloatArray) -> None:
         """Propagate by a turn (3, 3) that the gyroscope measured, without the bias."""

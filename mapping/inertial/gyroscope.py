@@ -35,6 +35,22 @@ class _Turns:
         return np.asarray(vectors, dtype=np.float64)
 
 
+class Integral:
+    """The integral of samples (N, 3), linear between their stamps (N,)."""
+
+    def __init__(self, stamps: FloatArray, samples: FloatArray) -> None:
+        self._begin = stamps[0]  # of clocks that count from 1970 half the digits would be lost
+        self._curve = make_interp_spline(stamps - stamps[0], samples, k=1).antiderivative()
+
+    def between(self, instants: FloatArray) -> FloatArray:
+        """(M - 1, 3) from each of M instants to the next."""
+        return np.diff(self._curve(instants - self._begin), axis=0)
+
+    def rates(self, instants: FloatArray) -> FloatArray:
+        """(M, 3) the samples' values at M instants."""
+        return np.asarray(self._curve(instants - self._begin, 1), dtype=np.float64)
+
+
 class Gyroscope:
     """The angular velocity of the LiDAR, linear between samples.
 
@@ -45,8 +61,7 @@ class Gyroscope:
 
     def __init__(self, samples: ImuSamples, R_lidar_imu: FloatArray) -> None:
         self._stamps = samples.stamps
-        self._angle = make_interp_spline(samples.stamps, samples.angular_velocities @ R_lidar_imu.T, k=1)
-        self._angle = self._angle.antiderivative()
+        self._angle = Integral(samples.stamps, samples.angular_velocities @ R_lidar_imu.T)
         self._longest_s = max(_GAP_INTERVALS * float(np.median(np.diff(samples.stamps))), _LEAST_GAP_S)
 
     def covers(self, first_s: float, last_s: float) -> bool:
@@ -64,10 +79,10 @@ class Gyroscope:
     def rotations(self, instants: FloatArray, bias: FloatArray) -> FloatArray:
         """(N, 3, 3) R_first_t of the LiDAR at N instants, the first of which is the reference."""
         inside = np.clip(instants, self._stamps[0], self._stamps[-1])  # the last rate is held for the rest
-        angles = np.diff(self._angle(inside), axis=0)
+        angles = self._angle.between(inside)
         beyond = np.diff(instants) - np.diff(inside)
         if beyond.any():
-            angles = angles + beyond[:, None] * self._rate(inside[1:])
+            angles = angles + beyond[:, None] * self._angle.rates(inside[1:])
         steps = exp(np.pad(angles - np.diff(instants)[:, None] * bias, ((0, 0), (0, 3)))).reshape(-1, 4, 4)[:, :3, :3]
         rotations: FloatArray = np.empty((len(instants), 3, 3))
         rotations[0] = np.eye(3)
@@ -77,7 +92,7 @@ class Gyroscope:
 
     def change(self, first_s: float, last_s: float) -> FloatArray:
         """(3,) by how much the angular velocity changes between two instants, rad/s."""
-        rates = self._rate(np.clip([first_s, last_s], self._stamps[0], self._stamps[-1]))
+        rates = self._angle.rates(np.clip([first_s, last_s], self._stamps[0], self._stamps[-1]))
         return np.asarray(rates[1] - rates[0], dtype=np.float64)
 
     def mean_rate(self, scan: Scan) -> FloatArray | None:
@@ -107,9 +122,6 @@ class Gyroscope:
         times = np.union1d(np.linspace(begin, end, max(2, int(np.ceil((end - begin) / _STEP_S)) + 1)), [0.0])
         rotations = self.rotations(scan.stamp + times, _NO_BIAS)
         return _Turns(times, rotations[np.searchsorted(times, 0.0)].T @ rotations)
-
-    def _rate(self, instants: FloatArray) -> FloatArray:
-        return np.asarray(self._angle(instants, 1), dtype=np.float64)
 
 
 def _rotated(points: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
@@ -13,7 +12,7 @@ from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.inertial.bias import BiasFilter
 from lidarslam.mapping.inertial.gravity import GravityFilter, Station, Velocity
-from lidarslam.mapping.inertial.gyroscope import Gyroscope
+from lidarslam.mapping.inertial.gyroscope import Gyroscope, Integral
 from lidarslam.mapping.motion.prediction import GravityDirection, MotionState, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
@@ -43,8 +42,7 @@ class Inertial(Stateful):
         self._config = config
         self._lever = T_lidar_imu[:3, 3]
         self.gyroscope = Gyroscope(samples, T_lidar_imu[:3, :3])
-        self._force = make_interp_spline(samples.stamps, samples.accelerations @ T_lidar_imu[:3, :3].T, k=1)
-        self._force = self._force.antiderivative()
+        self._force = Integral(samples.stamps, samples.accelerations @ T_lidar_imu[:3, :3].T)
         self._bias, self._gravity = BiasFilter(), GravityFilter()
         self._last, self._velocity, self._direction = None, np.zeros(3), None
 
@@ -65,10 +63,11 @@ class Inertial(Stateful):
         if prior.T_prev_curr is None:
             rotation = log(make_transform(turn, np.zeros(3)))[:3]
             moved = exp(np.concatenate([rotation, self._velocity * (scan.stamp - last.stamp)]))
-            return Prior(moved, velocity, _without_translation(covariance), gravity)
-        own = prior.motion_covariance(self._config) / self._config.prior_caution**2
+            return Prior(moved, velocity, _without_translation(covariance) / self._config.prior_caution**2, gravity)
+        # The mapper's caution is meant for the odometry, whose errors repeat; the filter follows the gyroscope's.
+        own = prior.motion_covariance(self._config)
         fused, covariance = fuse_turn(prior.T_prev_curr, own, turn, covariance)
-        return Prior(fused, velocity, covariance, gravity)
+        return Prior(fused, velocity, covariance / self._config.prior_caution**2, gravity)
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
         """Take the result of a scan: bias, velocity and gravity follow it."""
@@ -105,7 +104,7 @@ class Inertial(Stateful):
         """The specific force between two stamps."""
         instants = np.linspace(first_s, last_s, _STEPS + 1)
         rotations = self.gyroscope.rotations(instants, self._bias.bias)
-        changes = np.diff(self._force(instants), axis=0)
+        changes = self._force.between(instants)
         turned = np.einsum("nij,nj->ni", 0.5 * (rotations[:-1] + rotations[1:]), changes)
         middles = 0.5 * (instants[:-1] + instants[1:]) - first_s
         return Velocity(last_s - first_s, turned.sum(axis=0), middles @ turned, rotations[_STEPS // 2])
