@@ -13,6 +13,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.packets.libraries import require
 from lidarslam.datasets.packets.packet_recording import PacketRecording
 from lidarslam.datasets.recording import PointField
@@ -103,8 +104,7 @@ class OusterRecording(PacketRecording):
         stamps = np.concatenate([packet.timestamp() for packet in packets]).astype(np.int64) / 1e9
         accelerations = np.concatenate([packet.accel() for packet in packets]).astype(np.float64)
         rates = np.concatenate([packet.gyro() for packet in packets]).astype(np.float64)
-        stamps, kept = np.unique(stamps, return_index=True)
-        return ImuSamples(stamps, rates[kept], accelerations[kept], self._T_sensor_imu)
+        return usable_samples(stamps, rates, accelerations, self._T_sensor_imu)
 
     @property
     def _T_sensor_imu(self) -> FloatArray:

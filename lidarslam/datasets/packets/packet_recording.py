@@ -15,6 +15,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
+from lidarslam.datasets.imu_samples import summarise
 from lidarslam.datasets.recording import PointField, RecordingInfo, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 
@@ -25,6 +26,7 @@ class PacketRecording:
     T_cam_lidar: FloatArray | None = None  # no camera
     point_time: PointTimeModel
     topic: str | None = None
+    imu_name = "the sensor's own"
     topics: tuple[Topic, ...] = ()
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
@@ -82,6 +84,7 @@ class PacketRecording:
             topics=self.topics,
             fields=self._fields(),
             notes=(*self._notes(), *self.warnings),
+            imu=summarise(self.imu_name, self.imu),
         )
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Which topic of a bag is the recording."""
+"""Which topic of a bag is the recording, and whether all of it is there."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,6 +49,15 @@ def _has_packets(topic: Topic) -> bool:
     """Whether a topic holds a sensor's packets that can be decoded."""
     is_lidar = "lidar" in topic.name.rpartition("/")[2]  # packets of the IMU have the same type
     return topic.message_type == VELODYNE_SCAN_TYPE or (topic.message_type in OUSTER_PACKET_TYPES and is_lidar)
+
+
+def one_part(source: Path) -> str | None:
+    """A sentence where a file is one of several of a rosbag2."""
+    folder = source.absolute().parent
+    if source.is_dir() or not (folder / "metadata.yaml").is_file():
+        return None
+    parts = len(list(folder.glob(f"*{source.suffix}")))
+    return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
 
 
 def _listing(topics: Sequence[Topic]) -> str:

@@ -73,8 +73,8 @@ class OusterBag(OusterRecording):
         beside = f"{self._topic.name.rpartition('/')[0]}/{name}"
         topic = next((t for t in self._bag.topics if (t.name, t.message_type) == (beside, message_type)), None)
         for message in self._bag.messages(topic) if topic is not None else ():
-            start = 8 if self._bag.is_ros2 else 4
-            order = ">" if self._bag.is_ros2 and message.raw[1:2] == b"\x00" else "<"
+            start = 8 if self._bag.ros2 else 4
+            order = ">" if self._bag.ros2 and message.raw[1:2] == b"\x00" else "<"
             if len(message.raw) >= start:
                 (length,) = struct.unpack_from(order + "I", message.raw, start - 4)
                 yield message.raw[start : start + length].rstrip(b"\0" if message_type == _STRING_TYPE else b"")

@@ -14,12 +14,13 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.packets.libraries import require
 from lidarslam.datasets.recording import Recording, RecordingInfo, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
 from lidarslam.datasets.ros.bag_message import (
     OUSTER_PACKET_TYPES,
     VELODYNE_SCAN_TYPE,
@@ -28,9 +29,10 @@ from lidarslam.datasets.ros.bag_message import (
     find_stamp_source,
 )
 from lidarslam.datasets.ros.bag_point_time import BagPointTime
-from lidarslam.datasets.ros.bag_topics import choose_topic
+from lidarslam.datasets.ros.bag_topics import choose_topic, one_part
 from lidarslam.datasets.ros.ouster_bag import OusterBag
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
+from lidarslam.datasets.ros.timed_scan import timed_scan
 from lidarslam.datasets.times.stamp_order import in_stamp_order
 
 logger = logging.getLogger(__name__)
@@ -66,7 +68,6 @@ class BagRecording:
     """
 
     T_cam_lidar: FloatArray | None = None  # no camera
-    imu: ImuSamples | None = None
 
     def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
         self._source = source
@@ -89,20 +90,21 @@ class BagRecording:
     def __len__(self) -> int:
         return self._topic.messages
 
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU topic nearest to the clouds', unless another is asked for."""
+        return self._imu.samples()
+
+    @cached_property
+    def _imu(self) -> BagImu:
+        return BagImu(self._bag, CloudTopic(self._topic, self._frame_id, self._stamps), self._config.imu_topic)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """A lost index, headers without stamps, and times of points that could follow from their azimuth."""
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (self._bag.damage, unset, self._part(), self._point_time.azimuth.warning)
+        found = (self._bag.damage, unset, one_part(self._source), self._point_time.azimuth.warning)
         return tuple(warning for warning in found if warning is not None)
-
-    def _part(self) -> str | None:
-        """That the file is one of several of a rosbag2."""
-        folder = self._source.absolute().parent
-        if self._source.is_dir() or not (folder / "metadata.yaml").is_file():
-            return None
-        parts = len(list(folder.glob(f"*{self._source.suffix}")))
-        return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -181,10 +183,7 @@ class BagRecording:
     def _scan(self, message: BagMessage, faults: Faults) -> Scan:
         cloud, stamp = self._decode(message), self._stamps.stamp(message)
         offsets = self._point_time.offsets(cloud, stamp)
-        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings, cloud.intensities, cloud.colours)
-        if self._point_time.model is not None and scan.time_offsets is None and len(scan):
-            faults.note(NO_POINT_TIME, f"{stamp:.9f}")
-        return scan
+        return timed_scan(cloud, offsets, stamp, self._point_time.model is not None, faults)
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         return self._bag.decode(message, self._config.time_field)
@@ -232,4 +231,5 @@ class BagRecording:
                 *unreadable.warnings(),
                 *self._point_time.notes(cloud, first.stamp),
             ),
+            imu=self._imu.summary(),
         )
