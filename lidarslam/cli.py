@@ -12,6 +12,7 @@ import click
 
 from lidarslam.commands.compare import compare
 from lidarslam.commands.config import config
+from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.info import info
@@ -101,7 +102,7 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, config):
+for _command in (demo, datasets, info, run, merge, simulate, train, export, evaluate, view, compare, config):
     main.add_command(_command)
 
 

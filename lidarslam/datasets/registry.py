@@ -25,6 +25,7 @@ class Reader(NamedTuple):
     module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`
     reads: str  # the layout, in words
     recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
+    takes_sequence: bool = False  # whether --sequence chooses among what a source holds
 
 
 def _is_rosbag(source: Path) -> bool:
@@ -54,11 +55,13 @@ READERS: dict[str, Reader] = {
         "lidarslam.datasets.kitti.odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
+        takes_sequence=True,
     ),
     "kitti-360": Reader(
         "lidarslam.datasets.published.kitti_360",
         "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
         _is_kitti_360,
+        takes_sequence=True,
     ),
     "kitti-raw": Reader(
         "lidarslam.datasets.kitti.raw",
@@ -74,6 +77,23 @@ READERS: dict[str, Reader] = {
         "lidarslam.datasets.published.nclt",
         "NCLT: a session with a folder velodyne_sync",
         lambda source: (source / "velodyne_sync").is_dir(),
+    ),
+    "nuscenes": Reader(
+        "lidarslam.datasets.published.nuscenes",
+        "nuScenes: the root with v1.0-* (with --sequence)",
+        lambda source: any(source.glob("v1.0-*/scene.json")),
+        takes_sequence=True,
+    ),
+    "argoverse-2": Reader(
+        "lidarslam.datasets.published.argoverse2",
+        "Argoverse 2: the folder of a log",
+        lambda source: any((source / "sensors" / "lidar").glob("*.feather")),
+    ),
+    "apollo": Reader(
+        "lidarslam.datasets.published.apollo",
+        "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
+        lambda source: any(source.glob("poses/gt_poses.txt")) or any(source.glob("*/poses/gt_poses.txt")),
+        takes_sequence=True,
     ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "scan-folder": Reader(
@@ -105,7 +125,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
         return name
     if (result := result_of_program(source)) is not None:
         raise InputError(result)
-    if (found := _recognise(source)) is not None:
+    if (found := recognise(source)) is not None:
         return found
     if source.is_dir() and all(entry.name.startswith(".") for entry in source.iterdir()):
         raise InputError(f"{source}: the folder is empty; name the one with the recording")
@@ -113,7 +133,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
         raise InputError(
             f"{source}: is a single point cloud; give the folder with the scans, {source.absolute().parent}?"
         )
-    if (other := unrecognised(source, _recognise)) is not None:
+    if (other := unrecognised(source, recognise)) is not None:
         raise InputError(other)
     layouts = "; ".join(reader.reads for reader in READERS.values())
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
@@ -122,10 +142,16 @@ def choose_reader(source: Path, name: str | None = None) -> str:
 def is_recording(source: Path, name: str | None = None) -> bool:
     """Whether a reader was named for an existing source, or one recognises it."""
     source = located(source)
-    return source.exists() and (name is not None or _recognise(source) is not None)
+    return source.exists() and (name is not None or recognise(source) is not None)
 
 
-def _recognise(source: Path) -> str | None:
+def takes_sequence(source: Path, name: str | None = None) -> bool:
+    """Whether the reader that was named, or recognises the source, takes a sequence."""
+    reader = name or recognise(source)
+    return reader is not None and READERS[reader].takes_sequence
+
+
+def recognise(source: Path) -> str | None:
     """The first reader in the table that recognises a path by its names."""
     return next((name for name, reader in READERS.items() if reader.recognises(source)), None)
 

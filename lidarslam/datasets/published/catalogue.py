@@ -22,6 +22,7 @@ class DataSet:
     choose: str = ""  # option that chooses a sequence, where the source does not
 
 
+_SLAM = "GNSS and SLAM"
 _SURVEY = "scans registered to a survey map"
 _GNSS = "GNSS and INS"
 _KITTI = "https://www.cvlibs.net/datasets/kitti"
@@ -55,10 +56,44 @@ CATALOGUE: tuple[DataSet, ...] = (
         "Velodyne HDL-64E",
         "kitti-raw",
         _GNSS,
-        False,
+        True,
         f"{_KITTI}/raw_data.php",
         "..._drive_NNNN_sync or _extract: velodyne_points/data, timestamps*.txt, oxts; calib_*.txt in the folder above",
         "real files",
+    ),
+    DataSet(
+        "kitti_360",
+        "KITTI-360",
+        "Velodyne HDL-64E",
+        "kitti-360",
+        _SLAM,
+        False,
+        f"{_KITTI}-360/",
+        "data_3d_raw/..._sync/velodyne_points, data_poses/..._sync/poses.txt, calibration. The root, or one ..._sync",
+        "written sample",
+        "--sequence 0003",
+    ),
+    DataSet(
+        "mulran",
+        "MulRan",
+        "Ouster OS1-64",
+        "mulran",
+        _SLAM,
+        True,
+        "https://sites.google.com/view/mulran-pr/",
+        "one sequence: Ouster/*.bin, global_pose.csv, xsens_imu.csv",
+        "written sample",
+    ),
+    DataSet(
+        "nclt",
+        "NCLT",
+        "Velodyne HDL-32E",
+        "nclt",
+        _SLAM,
+        True,
+        "https://robots.engin.umich.edu/nclt/",
+        "one session: velodyne_sync/*.bin, ms25.csv; groundtruth_DATE.csv in it or above it",
+        "written sample",
     ),
     DataSet(
         "nuscenes",

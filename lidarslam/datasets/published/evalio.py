@@ -76,7 +76,7 @@ class EvalioRecording:
         with self._reading("its list of files"):
             missing = [file for file in self._sequence.files() if not (self._folder / file).exists()]
         if missing:
-            command = evalio_names.download_command(self._folder)
+            command = evalio_names.how_to_get(self._folder)
             raise InputError(f"{self._folder}: {missing[0]} is missing, the download is not complete; {command}")
 
     @property

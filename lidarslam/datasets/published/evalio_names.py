@@ -11,6 +11,8 @@ MISSING_EXTRA = "evalio is not installed, which this data set needs; pip install
 
 # As evalio 0.6.1 has them.
 DATA_SETS = tuple(one.name for one in CATALOGUE if one.reader == "evalio")
+# Published where no program can download.
+_BY_HAND = ("botanic_garden",)
 _LISTED = 6
 
 
@@ -46,8 +48,10 @@ def sequences() -> dict[str, tuple[str, ...]]:
     return {name: tuple(one.seq_name for one in known[name].sequences()) for name in sorted(known)}
 
 
-def download_command(source: Path) -> str:
+def how_to_get(source: Path) -> str:
     """The command that downloads a sequence to where it is looked for."""
+    if source.absolute().parent.name in _BY_HAND:
+        return f"its page has the files, for {source.absolute()}"
     root = source.absolute().parent.parent
     place = "" if os.environ.get("EVALIO_DATA") and root == data_folder() else f"-D {root} "
     return f"evalio {place}dl {full_name(source)}"
@@ -67,7 +71,7 @@ def absent(source: Path) -> str | None:
     if known and source.name not in known[data_set]:
         return f"{source}: evalio has no {full_name(source)}; there are{_choice(data_set, known)}"
     install = "" if known else "; evalio comes with pip install 'lidarslam[datasets]'"
-    return f"{source}: is not downloaded: {download_command(source)}{install}"
+    return f"{source}: is not downloaded: {how_to_get(source)}{install}"
 
 
 def require_known(source: Path) -> None:
