@@ -68,16 +68,6 @@ READERS: dict[str, Reader] = {
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
         lambda source: (source / "velodyne_points" / "data").is_dir(),
     ),
-    "mulran": Reader(
-        "lidarslam.datasets.published.mulran",
-        "MulRan: a sequence with a folder Ouster",
-        lambda source: (source / "Ouster").is_dir(),
-    ),
-    "nclt": Reader(
-        "lidarslam.datasets.published.nclt",
-        "NCLT: a session with a folder velodyne_sync",
-        lambda source: (source / "velodyne_sync").is_dir(),
-    ),
     "nuscenes": Reader(
         "lidarslam.datasets.published.nuscenes",
         "nuScenes: the root with v1.0-* (with --sequence)",
@@ -94,6 +84,16 @@ READERS: dict[str, Reader] = {
         "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
         lambda source: any(source.glob("poses/gt_poses.txt")) or any(source.glob("*/poses/gt_poses.txt")),
         takes_sequence=True,
+    ),
+    "mulran": Reader(
+        "lidarslam.datasets.published.mulran",
+        "MulRan: a sequence with a folder Ouster",
+        lambda source: (source / "Ouster").is_dir(),
+    ),
+    "nclt": Reader(
+        "lidarslam.datasets.published.nclt",
+        "NCLT: a session with a folder velodyne_sync",
+        lambda source: (source / "velodyne_sync").is_dir(),
     ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "scan-folder": Reader(

@@ -22,7 +22,6 @@ class DataSet:
     choose: str = ""  # option that chooses a sequence, where the source does not
 
 
-_SLAM = "GNSS and SLAM"
 _SURVEY = "scans registered to a survey map"
 _GNSS = "GNSS and INS"
 _KITTI = "https://www.cvlibs.net/datasets/kitti"
@@ -66,10 +65,10 @@ CATALOGUE: tuple[DataSet, ...] = (
         "KITTI-360",
         "Velodyne HDL-64E",
         "kitti-360",
-        _SLAM,
+        "GNSS and scans registered to each other",
         False,
-        f"{_KITTI}-360/",
-        "data_3d_raw/..._sync/velodyne_points, data_poses/..._sync/poses.txt, calibration. The root, or one ..._sync",
+        "https://www.cvlibs.net/datasets/kitti-360/",
+        "the root, or one data_3d_raw/..._sync: velodyne_points; data_poses and calibration in the root",
         "written sample",
         "--sequence 0003",
     ),
@@ -78,10 +77,10 @@ CATALOGUE: tuple[DataSet, ...] = (
         "MulRan",
         "Ouster OS1-64",
         "mulran",
-        _SLAM,
+        _GNSS,
         True,
-        "https://sites.google.com/view/mulran-pr/",
-        "one sequence: Ouster/*.bin, global_pose.csv, xsens_imu.csv",
+        "https://sites.google.com/view/mulran-pr",
+        "one sequence: Ouster/*.bin, data_stamp.csv, global_pose.csv, xsens_imu.csv",
         "written sample",
     ),
     DataSet(
@@ -89,10 +88,10 @@ CATALOGUE: tuple[DataSet, ...] = (
         "NCLT",
         "Velodyne HDL-32E",
         "nclt",
-        _SLAM,
+        "GNSS and scans registered to each other",
         True,
         "https://robots.engin.umich.edu/nclt/",
-        "one session: velodyne_sync/*.bin, ms25.csv; groundtruth_DATE.csv in it or above it",
+        "one session: velodyne_sync/*.bin, groundtruth_DATE.csv, ms25.csv",
         "written sample",
     ),
     DataSet(
