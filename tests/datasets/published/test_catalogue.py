@@ -85,7 +85,7 @@ def test_json_has_all_facts(tmp_path: Path) -> None:
 def test_unknown_names_are_one_line() -> None:
     result = _datasets("kitti")
     assert result.exit_code == 1
-    assert "neither a known data set nor a folder; did you mean kitti_raw or kitti_odometry?" in result.output
+    assert "neither a known data set nor a folder; did you mean kitti_raw or kitti_360 or kitti_odometry?" in result.output
 
 
 def test_the_page_has_the_same_table() -> None:
