@@ -16,6 +16,7 @@ class ReaderConfig(BaseModel):
     name: str | None = Field(None, description="name of the reader; null: the one that recognises the source")
     topic: str | None = Field(None, description="point cloud topic of a bag; null: the only one there is")
     frame_id: str | None = Field(None, description="sensor's frame in a bag's topic; null: that of the first scans")
+    imu_topic: str | None = Field(None, description="IMU topic of a bag; null: the one nearest to the point clouds'")
     sequence: str | None = Field(None, description="sequence of a data set's root, such as 04 of KITTI odometry")
     rate_hz: float = Field(10.0, gt=0.0, description="scans a second, for recordings without stamps")
     time_field: str | None = Field(None, description="point field with the per-point time; null: found by its name")

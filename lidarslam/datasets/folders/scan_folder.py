@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
@@ -16,6 +17,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.formats import table_reader
+from lidarslam.datasets.folders.imu_csv import IMU_FILE, read_imu_csv
 from lidarslam.datasets.folders.layout import find_layout
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
@@ -47,6 +49,7 @@ class ScanFolderRecording(FileRecording):
     """The scans of one folder."""
 
     reader = "scan-folder"
+    imu_name = IMU_FILE
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         self._layout = find_layout(folder, config.rate_hz)
@@ -58,6 +61,11 @@ class ScanFolderRecording(FileRecording):
     def ground_truth(self) -> Trajectory | None:
         """The TUM file ground_truth.tum, groundtruth.tum or the like, in the folder or the one above."""
         return None if self._layout.truth is None else read_tum(self._layout.truth)
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """The table imu.csv in the folder or the one above."""
+        return None if self._layout.imu is None else read_imu_csv(self._layout.imu)
 
     @property
     def warnings(self) -> tuple[str, ...]:

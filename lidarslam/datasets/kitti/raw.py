@@ -11,12 +11,14 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_raw_calibration
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
@@ -47,6 +49,7 @@ class KittiRawRecording(FileRecording):
     """One drive."""
 
     reader = "kitti-raw"
+    imu_name = "oxts"
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
@@ -81,6 +84,15 @@ class KittiRawRecording(FileRecording):
         if not kept.any():
             return None
         return Trajectory(stamps[kept], inverse(T_enu_lidar[kept][0]) @ T_enu_lidar[kept])
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """Angular velocities and accelerations of the GPS/IMU unit, one for each camera image."""
+        oxts = self._oxts
+        if oxts is None:
+            return None
+        T_lidar_imu = self._calibration("calib_imu_to_velo.txt")
+        return usable_samples(self._oxts_stamps(oxts), oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
     def _oxts_stamps(self, oxts: OxtsPoses) -> FloatArray:
         """Stamps (N,) of the unit's poses on the clock of the scans, NaN where there is none.

@@ -20,8 +20,9 @@ from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.recording import Recording, RecordingInfo
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
 from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
-from lidarslam.datasets.ros.bag_topics import choose_topic
+from lidarslam.datasets.ros.bag_topics import choose_topic, one_part
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.times.point_time import PointTimeModel, is_return
 from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
@@ -53,7 +54,6 @@ class BagRecording:
     """
 
     T_cam_lidar: FloatArray | None = None  # no camera
-    imu: ImuSamples | None = None
 
     def __init__(self, source: Path, config: ReaderConfig) -> None:
         self._source = source
@@ -76,19 +76,20 @@ class BagRecording:
     def __len__(self) -> int:
         return self._topic.messages
 
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU topic nearest to the clouds', unless another is asked for."""
+        return self._imu.samples()
+
+    @cached_property
+    def _imu(self) -> BagImu:
+        return BagImu(self._bag, CloudTopic(self._topic, self._frame_id, self._stamps), self._config.imu_topic)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """A lost index, and headers without stamps."""
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        return tuple(warning for warning in (self._bag.damage, unset, self._part()) if warning is not None)
-
-    def _part(self) -> str | None:
-        """That the file is one of several of a rosbag2."""
-        folder = self._source.absolute().parent
-        if self._source.is_dir() or not (folder / "metadata.yaml").is_file():
-            return None
-        parts = len(list(folder.glob(f"*{self._source.suffix}")))
-        return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
+        return tuple(warning for warning in (self._bag.damage, unset, one_part(self._source)) if warning is not None)
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -231,6 +232,7 @@ class BagRecording:
             topics=self._bag.topics,
             fields=cloud.fields,
             notes=(*self.warnings, *faults.warnings(), *unreadable.warnings(), *self._notes(cloud, first.stamp)),
+            imu=self._imu.summary(),
         )
 
     def _notes(self, cloud: DecodedCloud, stamp: float) -> Iterator[str]:
