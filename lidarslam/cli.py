@@ -15,7 +15,10 @@ from lidarslam.commands.config import config
 from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
+from lidarslam.commands.exports.bag import export_bag
+from lidarslam.commands.exports.grid import export_grid
 from lidarslam.commands.info import info
+from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
 from lidarslam.commands.network.train import train
@@ -102,7 +105,23 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (demo, datasets, info, run, merge, simulate, train, export, evaluate, view, compare, config):
+for _command in (
+    demo,
+    datasets,
+    info,
+    run,
+    localise,
+    merge,
+    simulate,
+    train,
+    export,
+    evaluate,
+    view,
+    compare,
+    export_bag,
+    export_grid,
+    config,
+):
     main.add_command(_command)
 
 

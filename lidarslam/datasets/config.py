@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
-TimeReference = Literal["auto", "relative", "absolute", "none"]
+TimeReference = Literal["auto", "relative", "absolute", "azimuth", "none"]
 
 
 class ReaderConfig(BaseModel):
@@ -22,5 +22,6 @@ class ReaderConfig(BaseModel):
     time_field: str | None = Field(None, description="point field with the per-point time; null: found by its name")
     time_unit: TimeUnit = Field("auto", description="unit of the per-point time; auto: inferred from the values")
     time_reference: TimeReference = Field(
-        "auto", description="per-point time: relative to the scan's stamp, an absolute clock reading, or none"
+        "auto",
+        description="per-point time: relative to the scan's stamp, a reading of a clock, from the azimuth, or none",
     )

@@ -40,6 +40,11 @@ def _bag_of_folder(folder: Path) -> Path:
     return folder / f"{folder.resolve().name}.bag"
 
 
+def _is_kitti_360(source: Path) -> bool:
+    is_drive = source.resolve().parent.name == "data_3d_raw" and (source / "velodyne_points").is_dir()
+    return is_drive or (source / "data_3d_raw").is_dir()
+
+
 READERS: dict[str, Reader] = {
     "evalio": Reader(
         "lidarslam.datasets.published.evalio",
@@ -50,6 +55,12 @@ READERS: dict[str, Reader] = {
         "lidarslam.datasets.kitti.odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
+        takes_sequence=True,
+    ),
+    "kitti-360": Reader(
+        "lidarslam.datasets.published.kitti_360",
+        "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
+        _is_kitti_360,
         takes_sequence=True,
     ),
     "kitti-raw": Reader(
@@ -73,6 +84,16 @@ READERS: dict[str, Reader] = {
         "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
         lambda source: any(source.glob("poses/gt_poses.txt")) or any(source.glob("*/poses/gt_poses.txt")),
         takes_sequence=True,
+    ),
+    "mulran": Reader(
+        "lidarslam.datasets.published.mulran",
+        "MulRan: a sequence with a folder Ouster",
+        lambda source: (source / "Ouster").is_dir(),
+    ),
+    "nclt": Reader(
+        "lidarslam.datasets.published.nclt",
+        "NCLT: a session with a folder velodyne_sync",
+        lambda source: (source / "velodyne_sync").is_dir(),
     ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
     "scan-folder": Reader(

@@ -74,7 +74,7 @@ def execute(
             log, graph = ScanLog(), _open_graph(config, directory, unfinished)
             if graph is not None:
                 stack.callback(graph.close)
-            with _viewing(request, recording.name, directory, log, page) as viewer:
+            with viewing(request, recording.name, directory, log, page) as viewer:
                 compiling.wait_for_first_scan(phase)
                 phase("reading the first scans")
                 tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
@@ -114,7 +114,7 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
 
 
 @contextmanager
-def _viewing(
+def viewing(
     request: RunRequest, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
 ) -> Iterator[Viewer]:
     """The viewer of a run; a Rerun recording that cannot be written is a warning."""

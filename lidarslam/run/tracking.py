@@ -21,7 +21,7 @@ from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.localisation import Localiser, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
@@ -77,6 +77,7 @@ def track(
     viewer: Viewer,
     progress: Progress,
     unfinished: Unfinished | None = None,
+    localiser: Localiser | None = None,
 ) -> Tracked:
     """Take the chosen scans of a recording through the pipeline.
 
@@ -86,6 +87,7 @@ def track(
         odometry, log, graph: new, but for a graph that is resumed.
         viewer, progress: called for every scan.
         unfinished: where checkpoints are saved; None: nowhere.
+        localiser: estimates the poses; None: as configured.
 
     Raises:
         NoScanError: no scan could be used.
@@ -94,7 +96,7 @@ def track(
     config, faults = request.config, Faults()
     scans = take_in(recording, chosen, faults)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
-    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, checkpoints)
+    pipeline = Pipeline(odometry, localiser or make_localiser(config), config.global_map, graph, checkpoints)
     if checkpoints is not None:
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")

@@ -57,7 +57,6 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
         from_clock = False
         if named is not None:
             warnings.append("The file names look like stamps, but some are equal.")
-        notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
     whole = (
         folder.resolve().parent.parent if folder.resolve().parent.name == "velodyne_points" else folder.resolve().parent
     )
