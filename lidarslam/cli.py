@@ -18,6 +18,7 @@ from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
 from lidarslam.commands.exports.grid import export_grid
 from lidarslam.commands.info import info
+from lidarslam.commands.live import live
 from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
@@ -110,6 +111,7 @@ for _command in (
     datasets,
     info,
     run,
+    live,
     localise,
     merge,
     simulate,

@@ -25,6 +25,7 @@ from lidarslam.pipeline.localisation import Localiser, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
+from lidarslam.run.inertial import open_inertial
 from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.unfinished import Unfinished
@@ -95,8 +96,12 @@ def track(
     """
     config, faults = request.config, Faults()
     scans = take_in(recording, chosen, faults)
+    inertial = open_inertial(config, recording, chosen)
+    if inertial is not None:
+        scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
-    pipeline = Pipeline(odometry, localiser or make_localiser(config), config.global_map, graph, checkpoints)
+    localiser = localiser or make_localiser(config, inertial)
+    pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints)
     if checkpoints is not None:
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")

@@ -106,7 +106,7 @@ def execute(
             stack.callback(odometry.close)
             directory = stack.enter_context(RunDirectory.create(run.out, run.overwrite))
             log, localiser = ScanLog(), MapLocaliser(run.config.mapping, fixed_map, guess)
-            with viewing(run, recording.name, directory, log, page) as viewer:
+            with viewing(run.rerun, run.config.viewer, recording.name, directory, log, page) as viewer:
                 viewer.show_final_map(cloud.points)
                 compiling.wait_for_first_scan(phase)
                 phase("searching for the place")
