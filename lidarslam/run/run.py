@@ -14,6 +14,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.run.inertial import imu_samples
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest, describe_run, log_choices
@@ -60,6 +61,7 @@ def execute(
     recording = open_recording(request.source, config.reader)
     chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
     log_choices(request, chosen, len(recording))
+    imu_samples(config, recording)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
@@ -156,6 +158,23 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
             "constant-velocity only predicts the motion, and needs scan-to-map registration. Choose --odometry learned,"
             " give a trajectory with --prior, or a mapping with --mapping surfels or --mapping loam"
         )
+    if config.odometry.uses_imu and not config.mapping.enabled:
+        raise ConfigError(
+            f"{method}: the IMU takes part in scan-to-map registration. Choose --odometry learned, or a mapping with"
+            " --mapping surfels or --mapping loam"
+        )
     if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
     return make_odometry(config.odometry, None if prior is None else read_tum(prior))
+
+
+def require_scans_only(config: Config) -> None:
+    """Refuse an odometry that takes more of a recording than its scans, one after the other.
+
+    Raises:
+        ConfigError: it needs a trajectory or an IMU.
+    """
+    if config.odometry.method == "external":
+        raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
+    if config.odometry.uses_imu:
+        raise ConfigError(f"odometry.method={config.odometry.method} needs the IMU of a recording: use lidarslam run")

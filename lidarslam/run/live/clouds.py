@@ -9,7 +9,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.ros.timed_scan import timed_scan
+from lidarslam.datasets.ros.timed_scan import field_offsets, timed_scan
 from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, is_return
 from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
 
@@ -61,7 +61,9 @@ class CloudDecoder:
         stamp = stamp_ns / 10**9
         self._learn(cloud, stamp)
         self._last_ns, self._frame_id = stamp_ns, frame_id
-        return LiveScan(timed_scan(cloud, self._point_time, stamp, self._faults), stamp_ns, frame_id)
+        model = self._point_time
+        offsets = None if model is None else field_offsets(cloud, model, stamp)
+        return LiveScan(timed_scan(cloud, offsets, stamp, model is not None, self._faults), stamp_ns, frame_id)
 
     def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
         """The header's stamp; the time of publication where the first header has none."""
