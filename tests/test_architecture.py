@@ -55,7 +55,15 @@ CONFINED = {
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),
-    "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
+    "evalio": ("lidarslam.datasets.published.evalio*",),
+    "pyarrow": ("lidarslam.datasets.published.argoverse2",),
+    "rosbags": (
+        "lidarslam.datasets.*",
+        "lidarslam.simulation.writers.*",
+        "lidarslam.storage.exports.*",
+        "lidarslam.run.live.*",
+    ),
+    "cyclonedds": ("lidarslam.run.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES, MOST_ENTRIES = 250, 15

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidarslam.config.settings import Config
+from lidarslam.config.settings import Config, ViewerConfig
 from lidarslam.core.errors import ConfigError, OutputError
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.intake import choose_scans
@@ -25,7 +25,7 @@ from lidarslam.run.tracking import Progress, track
 from lidarslam.storage.directory import RERUN, RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.rerun_program import require_window
-from lidarslam.viewer.viewer import Viewer
+from lidarslam.viewer.viewer import RerunMode, Viewer
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def execute(
             log, graph = ScanLog(), _open_graph(config, directory, unfinished)
             if graph is not None:
                 stack.callback(graph.close)
-            with _viewing(request, recording.name, directory, log, page) as viewer:
+            with viewing(request.rerun, config.viewer, recording.name, directory, log, page) as viewer:
                 compiling.wait_for_first_scan(phase)
                 phase("reading the first scans")
                 tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
@@ -116,11 +116,11 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
 
 
 @contextmanager
-def _viewing(
-    request: RunRequest, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
+def viewing(
+    mode: RerunMode, config: ViewerConfig, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
 ) -> Iterator[Viewer]:
     """The viewer of a run; a Rerun recording that cannot be written is a warning."""
-    if request.rerun == "off":
+    if mode == "off":
         yield Viewer()
         return
     from lidarslam.viewer.rerun_recording import IncompleteRecordingError
@@ -129,7 +129,7 @@ def _viewing(
     try:
         with (
             directory.replacing(RERUN) as path,
-            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn", page) as viewer,
+            rerun_viewer(name, config, path, mode == "spawn", page) as viewer,
         ):
             yield viewer
     except IncompleteRecordingError as error:

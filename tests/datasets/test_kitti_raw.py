@@ -11,8 +11,8 @@ from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.oxts import oxts_poses
-from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth
 from lidarslam.datasets.registry import choose_reader, open_recording
+from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
 
 MIDNIGHT = np.datetime64("2011-09-26T13:04:32", "ns")

@@ -11,9 +11,8 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import count
 from lidarslam.datasets.folders.imu_csv import find_imu_file
-from lidarslam.datasets.folders.scan_files import natural_key
+from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key
 from lidarslam.datasets.folders.truth_files import find_truth_file
-from lidarslam.datasets.registry import SCAN_SUFFIXES
 from lidarslam.datasets.times.stamps import mend_stamps, read_stamps, stamps_from_names
 
 _STAMP_FILES = ("timestamps.txt", "times.txt")
@@ -58,7 +57,6 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
         from_clock = False
         if named is not None:
             warnings.append("The file names look like stamps, but some are equal.")
-        notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
     whole = (
         folder.resolve().parent.parent if folder.resolve().parent.name == "velodyne_points" else folder.resolve().parent
     )

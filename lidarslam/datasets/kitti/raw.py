@@ -22,8 +22,9 @@ from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_raw_calibration
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
-from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth, read_sweep_timing
+from lidarslam.datasets.kitti.raw_timing import read_sweep_timing
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows, read_stamps
 
@@ -54,7 +55,7 @@ class KittiRawRecording(FileRecording):
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
         super().__init__(drive, config, files)
-        self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config.rate_hz)
+        self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config)
         self.stamps = self._timing.stamps
 
     @cached_property
@@ -127,7 +128,7 @@ class KittiRawRecording(FileRecording):
         return None if self.ground_truth is None else self._folder / "oxts"
 
     def _point_time_model(self) -> PointTimeModel | None:
-        return None if self._config.time_reference == "none" else PointTimeModel("azimuth", "s", "relative")
+        return None if self._config.time_reference == "none" else AZIMUTH_TIME
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -48,7 +48,8 @@ _README = """\
 """
 
 _IMU = """\
-- **The IMU** is a MEMS unit of 200 Hz on the LiDAR, with noise and walking biases: {where}.
+- **The IMU** is a MEMS unit of 200 Hz on the LiDAR, with noise and walking biases;
+  {where}.
 """
 
 

@@ -43,8 +43,8 @@ _PLY_LAYOUT = (
 _ROSBAG2_LAYOUT = f"a ROS 2 bag (SQLite) {_BAG_MESSAGES}; the folder is the bag"
 _MCAP_LAYOUT = f"a ROS 2 bag (MCAP) {_BAG_MESSAGES}; the folder is the bag, and its .mcap file can be read alone"
 
-_IMU_TABLE = "imu.csv: stamps on the same clock, angular velocities, accelerations, and T_lidar_imu in its first line"
-_IMU_MESSAGES = "sensor_msgs/Imu messages on the topic of the sensor's driver; /tf_static has the frames"
+_IMU_TABLE = "imu.csv has its samples, stamped by the same clock, and T_lidar_imu in its first line"
+_IMU_MESSAGES = "its messages are sensor_msgs/Imu on the topic of the sensor's driver, and /tf_static has T_lidar_imu"
 
 FORMATS: dict[str, Format] = {
     "kitti": Format("kitti", "write_kitti", _KITTI_LAYOUT, ("sequences", "poses"), clock_start_ns=0),
