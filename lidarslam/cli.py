@@ -12,10 +12,12 @@ import click
 
 from lidarslam.commands.compare import compare
 from lidarslam.commands.config import config
+from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
 from lidarslam.commands.exports.grid import export_grid
+from lidarslam.commands.exports.mesh import export_mesh
 from lidarslam.commands.info import info
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
@@ -103,21 +105,9 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (
-    demo,
-    info,
-    run,
-    merge,
-    simulate,
-    train,
-    export,
-    evaluate,
-    view,
-    compare,
-    export_bag,
-    export_grid,
-    config,
-):
+for _command in (demo, datasets, info, run, merge, simulate, train, export, evaluate, view, compare, config):
+    main.add_command(_command)
+for _command in (export_bag, export_grid, export_mesh):
     main.add_command(_command)
 
 

@@ -55,6 +55,8 @@ CONFINED = {
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),
+    "evalio": ("lidarslam.datasets.published.evalio*",),
+    "pyarrow": ("lidarslam.datasets.published.argoverse2",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*", "lidarslam.storage.exports.*"),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}

@@ -24,7 +24,7 @@ from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps, read_stamps
+from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -151,7 +151,7 @@ class KittiOdometryRecording(FileRecording):
     def _warnings(self) -> Iterator[str]:
         last, poses = int(self._numbers[-1]), 0
         if self._times is None:
-            yield f"There is no times.txt; the stamps assume {self._config.rate_hz:g} scans a second."
+            yield assumed_rate("There is no times.txt", self._config)
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
         if self._pose_file is not None and self._truth_path() is None:

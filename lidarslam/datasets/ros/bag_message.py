@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
-from typing import cast
+from typing import Any, cast
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
 
@@ -16,6 +16,8 @@ from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_TYPES, decode_custom_mes
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, decode_point_cloud2
 
 POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
+TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 CLOUD_TYPES = (POINT_CLOUD2_TYPE, *CUSTOM_MESSAGE_TYPES)
 
 _LONGEST_FRAME_ID = 256
@@ -70,14 +72,22 @@ def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCl
     """
     if message.message_type in CUSTOM_MESSAGE_TYPES:
         return decode_custom_message(message.raw, ros2)
+    cloud = cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE, ros2))
+    return decode_point_cloud2(cloud, time_field)
+
+
+def deserialize(raw: bytes, message_type: str, ros2: bool) -> Any:
+    """A message of a type that ROS itself defines, by its fixed definition."""
     store = _typestore(ros2)
-    deserialize = store.deserialize_cdr if ros2 else store.deserialize_ros1
-    return decode_point_cloud2(cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE)), time_field)
+    return (store.deserialize_cdr if ros2 else store.deserialize_ros1)(raw, message_type)
 
 
 @cache
 def _typestore(ros2: bool) -> Typestore:
-    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+    store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+    if TRANSFORMS_TYPE not in store.types:  # ROS 1 has it in another package than rosbags knows
+        store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+    return store
 
 
 @dataclass(frozen=True)

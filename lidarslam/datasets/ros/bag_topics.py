@@ -1,4 +1,4 @@
-"""Which topic of a bag is the recording."""
+"""Which topic of a bag is the recording, and whether all of it is there."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,6 +38,15 @@ def choose_topic(source: Path, topics: Sequence[Topic], wanted: str | None) -> T
         f"{source}: no point cloud topic (sensor_msgs/PointCloud2 or Livox CustomMsg) with messages."
         f"{hint.format(packets[0].name) if packets else ''} Its topics: {_listing(topics)}"
     )
+
+
+def one_part(source: Path) -> str | None:
+    """A sentence where a file is one of several of a rosbag2."""
+    folder = source.absolute().parent
+    if source.is_dir() or not (folder / "metadata.yaml").is_file():
+        return None
+    parts = len(list(folder.glob(f"*{source.suffix}")))
+    return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
 
 
 def _listing(topics: Sequence[Topic]) -> str:
