@@ -13,7 +13,7 @@ from lidarslam.mapping.global_map.global_map import PointCloud
 # The octree's finest level; deeper ones take minutes and gigabytes.
 _DEEPEST = 12
 # Reconstructed surface farther from the points is invented.
-_TRIM_CELLS = 2.0
+_TRIM_CELLS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Mesh:
 def reconstruct(cloud: PointCloud, cell_m: float) -> Mesh:
     """The surface through the points of a map with normals (M. Kazhdan and H. Hoppe, ToG 2013).
 
-    Vertices without a point within two cells are removed.
+    Vertices without a point within the edge of a cell are removed.
 
     Args:
         cloud: the map.

@@ -1,4 +1,4 @@
-"""The mesh of a run's map in a file, by Open3D."""
+"""The mesh of a run's map in a file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.mapping.products.mesh import Mesh, reconstruct
+from lidarslam.storage.exports.glb import write_glb
 from lidarslam.storage.finished_run import load_map, read_summary
 
 SUFFIXES = (".ply", ".obj", ".glb")
@@ -49,7 +50,9 @@ def _write(out: Path, mesh: Mesh) -> None:
     make_directory(out.parent)
     try:
         with replacing(out) as partial, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            if not o3d.io.write_triangle_mesh(str(partial), surface):
+            if out.suffix == ".glb":
+                write_glb(partial, mesh, np.asarray(surface.vertex_normals))
+            elif not o3d.io.write_triangle_mesh(str(partial), surface):
                 raise OutputError(f"{out}: cannot be written; is the disk full?")
     except OSError as error:
         raise cannot_write(out, error) from error
