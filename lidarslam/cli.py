@@ -16,6 +16,7 @@ from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
+from lidarslam.commands.exports.geo import export_geo
 from lidarslam.commands.exports.grid import export_grid
 from lidarslam.commands.exports.mesh import export_mesh
 from lidarslam.commands.info import info
@@ -107,7 +108,7 @@ main.params.append(verbose_option())
 
 for _command in (demo, datasets, info, run, merge, simulate, train, export, evaluate, view, compare, config):
     main.add_command(_command)
-for _command in (export_bag, export_grid, export_mesh):
+for _command in (export_bag, export_grid, export_mesh, export_geo):
     main.add_command(_command)
 
 

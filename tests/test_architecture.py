@@ -57,6 +57,7 @@ CONFINED = {
     "onnxscript": ("lidarslam.odometry.network.export",),
     "evalio": ("lidarslam.datasets.published.evalio*",),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
+    "pyproj": ("lidarslam.storage.exports.projection",),
     "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*", "lidarslam.storage.exports.*"),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}

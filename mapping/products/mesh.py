@@ -50,5 +50,5 @@ def reconstruct(cloud: PointCloud, cell_m: float) -> Mesh:
     return Mesh(
         np.asarray(surface.vertices),
         np.asarray(surface.triangles),
-        None if rgb is None else rgb[nearest[~far]],
+        None if rgb is None else rgb[np.asarray(nearest)[~far]],
     )

@@ -52,7 +52,7 @@ def _write(out: Path, mesh: Mesh) -> None:
         with replacing(out) as partial, o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             if out.suffix == ".glb":
                 write_glb(partial, mesh, np.asarray(surface.vertex_normals))
-            elif not o3d.io.write_triangle_mesh(str(partial), surface):
+            elif not o3d.io.write_triangle_mesh(partial, surface):
                 raise OutputError(f"{out}: cannot be written; is the disk full?")
     except OSError as error:
         raise cannot_write(out, error) from error
