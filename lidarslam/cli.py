@@ -20,6 +20,8 @@ from lidarslam.commands.exports.geo import export_geo
 from lidarslam.commands.exports.grid import export_grid
 from lidarslam.commands.exports.mesh import export_mesh
 from lidarslam.commands.info import info
+from lidarslam.commands.live import live
+from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
 from lidarslam.commands.network.train import train
@@ -106,9 +108,26 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (demo, datasets, info, run, merge, simulate, train, export, evaluate, view, compare, config):
-    main.add_command(_command)
-for _command in (export_bag, export_grid, export_mesh, export_geo):
+for _command in (
+    demo,
+    datasets,
+    info,
+    run,
+    live,
+    localise,
+    merge,
+    simulate,
+    train,
+    export,
+    evaluate,
+    view,
+    compare,
+    export_bag,
+    export_grid,
+    export_mesh,
+    export_geo,
+    config,
+):
     main.add_command(_command)
 
 

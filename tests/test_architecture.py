@@ -58,7 +58,13 @@ CONFINED = {
     "evalio": ("lidarslam.datasets.published.evalio*",),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
     "pyproj": ("lidarslam.storage.exports.projection",),
-    "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*", "lidarslam.storage.exports.*"),
+    "rosbags": (
+        "lidarslam.datasets.*",
+        "lidarslam.simulation.writers.*",
+        "lidarslam.storage.exports.*",
+        "lidarslam.run.live.*",
+    ),
+    "cyclonedds": ("lidarslam.run.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES, MOST_ENTRIES = 250, 15

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,14 @@ class ScanLog(Stateful):
         rows = self._table()
         rows["T_world_lidar"] = T_world_lidar
         self._rows = bytearray(rows.tobytes())
+
+    def mark(self, indices: Sequence[int], status: Status, message: str) -> None:
+        """Replace the status of scans, and its reason."""
+        rows = self._table()
+        rows["status"][list(indices)] = _STATUSES.index(status)
+        self._rows = bytearray(rows.tobytes())
+        for index in indices:
+            self.messages[index] = message
 
     @property
     def statuses(self) -> list[Status]:

@@ -84,7 +84,9 @@ scan_options = _together(
 )
 odometry_options = _together(
     click.option(
-        "--odometry", type=click.Choice(["learned", "kiss-icp", "constant-velocity"]), help="[default: learned]"
+        "--odometry",
+        type=click.Choice(["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu"]),
+        help="Motion from scan to scan; imu and learned+imu use the recording's IMU.  [default: learned]",
     ),
     click.option(
         "--weights",
@@ -184,9 +186,9 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
     odometry, weights, prior = options.pop("odometry", None), options.pop("weights", None), options.get("prior")
     settings = []
     if weights is not None:
-        if odometry not in (None, "learned") or prior is not None:
+        if odometry not in (None, "learned", "learned+imu") or prior is not None:
             raise click.UsageError("--weights belongs to --odometry learned; leave it, or the other odometry, out")
-        odometry = "learned"
+        odometry = odometry or "learned"
         settings.append(setting("odometry.learned.weights", str(weights.resolve())))
     if prior is not None:
         if odometry is not None:

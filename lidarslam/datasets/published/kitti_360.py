@@ -65,7 +65,7 @@ class Kitti360Recording(FileRecording):
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / _POINTS / "data")
         super().__init__(drive, config, files)
-        self._timing = read_sweep_timing(drive / _POINTS, self._numbers, config.rate_hz)
+        self._timing = read_sweep_timing(drive / _POINTS, self._numbers, config)
         self.stamps = self._timing.stamps
         self._sweep_s = 1.0 / (scan_rate(self.stamps) or config.rate_hz)
 

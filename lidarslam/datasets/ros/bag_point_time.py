@@ -12,6 +12,7 @@ from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import BagMessage, StampSource
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
+from lidarslam.datasets.ros.timed_scan import field_offsets
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
 from lidarslam.datasets.times.azimuth_inference import AzimuthTiming, Sweep, infer_azimuth_timing
 from lidarslam.datasets.times.point_time import PointTimeModel, is_return
@@ -42,9 +43,7 @@ class BagPointTime:
         """Seconds (N,) from the stamp; None where this cloud has no times."""
         if self._field is None:
             return self.azimuth.offsets(Sweep(cloud.points, cloud.rings))
-        if cloud.times is None or cloud.time_field != self._field.field:
-            return None
-        return self._field.offsets(cloud.times, stamp)
+        return field_offsets(cloud, self._field, stamp)
 
     def notes(self, cloud: DecodedCloud, stamp: float) -> Iterator[str]:
         """Facts for the user, by the first cloud."""

@@ -14,7 +14,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
 from lidarslam.datasets.recording import Recording, RecordingInfo
@@ -24,6 +24,7 @@ from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_sta
 from lidarslam.datasets.ros.bag_point_time import BagPointTime
 from lidarslam.datasets.ros.bag_topics import choose_topic, one_part
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
+from lidarslam.datasets.ros.timed_scan import timed_scan
 from lidarslam.datasets.times.stamp_order import in_stamp_order
 
 logger = logging.getLogger(__name__)
@@ -172,10 +173,7 @@ class BagRecording:
     def _scan(self, message: BagMessage, faults: Faults) -> Scan:
         cloud, stamp = self._decode(message), self._stamps.stamp(message)
         offsets = self._point_time.offsets(cloud, stamp)
-        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings, cloud.intensities, cloud.colours)
-        if self._point_time.model is not None and scan.time_offsets is None and len(scan):
-            faults.note(NO_POINT_TIME, f"{stamp:.9f}")
-        return scan
+        return timed_scan(cloud, offsets, stamp, self._point_time.model is not None, faults)
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         return self._bag.decode(message, self._config.time_field)

@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
+from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.driver_clouds import DriverCloud, Records, find_driver
 from lidarslam.simulation.writers.imu_messages import (
@@ -29,24 +30,6 @@ _POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
 _CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
 _CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
 
-# livox_ros_driver2's own definitions; their checksums go into the bag, so order and types are as there.
-_CUSTOM_MESSAGE_DEFINITION = """\
-std_msgs/Header header
-uint64 timebase
-uint32 point_num
-uint8 lidar_id
-uint8[3] rsvd
-CustomPoint[] points
-"""
-_CUSTOM_POINT_DEFINITION = """\
-uint32 offset_time
-float32 x
-float32 y
-float32 z
-uint8 reflectivity
-uint8 tag
-uint8 line
-"""
 _LIDAR_ID = 192  # the last byte of the sensor's address
 _CDR_ALIGNMENT = 4
 # The newest version that ROS 2 Humble still reads.
@@ -119,8 +102,8 @@ class MessageSerializer:
     def __init__(self, ros2: bool) -> None:
         self._ros2 = ros2
         self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-        self.store.register(get_types_from_msg(_CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
-        self.store.register(get_types_from_msg(_CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
+        self.store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
+        self.store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
         if not ros2:  # ROS 2's store has it
             self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
 
