@@ -17,8 +17,8 @@ from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.run.interruption import Interruptions
-from lidarslam.run.localise.placed_viewer import PlacedViewer
-from lidarslam.run.localise.request import LocaliseRequest, read_map
+from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
+from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
 from lidarslam.run.request import log_choices
 from lidarslam.run.results import DrawnMap, RunOutcome, write_results
 from lidarslam.run.run import open_odometry, require_apart, viewing

@@ -9,6 +9,9 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from lidarslam.api.exports.gnss import read_gnss
+from lidarslam.api.exports.new_file import require_new
+from lidarslam.api.exports.projection import Utm, utm_at
 from lidarslam.compare.assessment.inputs import read_estimate
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
@@ -17,9 +20,6 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.mapping.global_map.survey_formats import write_laz
 from lidarslam.mapping.products.georeference import Georeference, GnssTrack, align_to_track
-from lidarslam.storage.exports.gnss import read_gnss
-from lidarslam.storage.exports.new_file import require_new
-from lidarslam.storage.exports.projection import Utm, utm_at
 from lidarslam.storage.finished_run import load_map, read_trajectory
 
 MAP, TRAJECTORY, GEOJSON, KML = "map.laz", "trajectory_utm.tum", "trajectory.geojson", "trajectory.kml"

@@ -11,14 +11,14 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.ros.bag_message import read_header
-from lidarslam.run.live.clouds import CloudDecoder
-from lidarslam.run.live.dds import DdsNode, PublishedTopic
-from lidarslam.run.live.incoming import Arrived, IncomingQueue
-from lidarslam.run.live.messages import ODOMETRY_TYPE, TRANSFORMS_TYPE, read_transforms
-from lidarslam.run.live.publishing import PosePublisher, chain
-from lidarslam.run.live.request import LiveRequest
-from lidarslam.run.live.session import LiveSession
-from lidarslam.run.live.statistics import LiveCounts, LiveStatistics
+from lidarslam.run.modes.live.clouds import CloudDecoder
+from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
+from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
+from lidarslam.run.modes.live.messages import ODOMETRY_TYPE, TRANSFORMS_TYPE, read_transforms
+from lidarslam.run.modes.live.publishing import PosePublisher, chain
+from lidarslam.run.modes.live.request import LiveRequest
+from lidarslam.run.modes.live.session import LiveSession
+from lidarslam.run.modes.live.statistics import LiveCounts, LiveStatistics
 
 logger = logging.getLogger(__name__)
 
