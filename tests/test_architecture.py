@@ -59,11 +59,11 @@ CONFINED = {
     "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
     "evalio": ("lidarslam.datasets.published.evalio*",),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
-    "pyproj": ("lidarslam.api.exports.projection",),
+    "pyproj": ("lidarslam.exports.projection",),
     "rosbags": (
         "lidarslam.datasets.*",
         "lidarslam.simulation.writers.*",
-        "lidarslam.api.exports.*",
+        "lidarslam.exports.*",
         "lidarslam.run.modes.live.*",
     ),
     "cyclonedds": ("lidarslam.run.modes.live.dds",),
@@ -261,7 +261,8 @@ def size_breaches(modules: Modules) -> list[str]:
     """Files too long to be read at once, and folders with too many entries to be overlooked."""
     long = [f"{module.name} has {module.lines} lines" for module in modules.values() if module.lines > MOST_LINES]
     linked = {f"lidarslam.{package}" for package in LINKED}
-    entries = Counter(name.rpartition(".")[0] for name in modules if "." in name and name not in linked)
+    counted = (name for name in modules if "." in name and name not in {*linked, "lidarslam.__main__"})
+    entries = Counter(name.rpartition(".")[0] for name in counted)
     packages = [module.name for module in modules.values() if module.is_package]
     counts = {name: entries[name] + 1 for name in packages}  # with its __init__
     return long + [f"{name} has {count} entries" for name, count in counts.items() if count > MOST_ENTRIES]

@@ -10,7 +10,6 @@ from click.testing import CliRunner, Result
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from lidarslam.api.exports.run_scans import read_run_scans
 from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
@@ -19,6 +18,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
+from lidarslam.exports.run_scans import read_run_scans
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 

@@ -10,13 +10,13 @@ import pytest
 from click.testing import CliRunner, Result
 from rosbags.rosbag1 import Writer
 
-from lidarslam.api.exports.ros_messages import POINT_CLOUD2, TF_MESSAGE, RosMessages, nanoseconds
 from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
+from lidarslam.exports.ros_messages import POINT_CLOUD2, TF_MESSAGE, RosMessages, nanoseconds
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 

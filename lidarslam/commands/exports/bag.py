@@ -33,9 +33,9 @@ def export_bag(run: Path, out: Path, clouds: bool, frame: str, overwrite: bool) 
 
     RUN is a run directory. The bag opens in Foxglove and RViz, and plays with ros2 bag.
     """
-    from lidarslam.api.exports.bag import SUFFIXES, export_bag
-    from lidarslam.api.exports.new_file import require_new
-    from lidarslam.api.exports.run_scans import read_run_scans
+    from lidarslam.exports.bag import SUFFIXES, export_bag
+    from lidarslam.exports.new_file import require_new
+    from lidarslam.exports.run_scans import read_run_scans
     from lidarslam.run.progress import show_count
 
     if out.suffix not in SUFFIXES:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.api.exports.glb import write_glb
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
+from lidarslam.exports.glb import write_glb
 from lidarslam.mapping.products.mesh import Mesh, reconstruct
 from lidarslam.storage.finished_run import load_map, read_summary
 

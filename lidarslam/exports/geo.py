@@ -9,15 +9,15 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from lidarslam.api.exports.gnss import read_gnss
-from lidarslam.api.exports.new_file import require_new
-from lidarslam.api.exports.projection import Utm, utm_at
 from lidarslam.compare.assessment.inputs import read_estimate
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
+from lidarslam.exports.gnss import read_gnss
+from lidarslam.exports.new_file import require_new
+from lidarslam.exports.projection import Utm, utm_at
 from lidarslam.mapping.global_map.survey_formats import write_laz
 from lidarslam.mapping.products.georeference import Georeference, GnssTrack, align_to_track
 from lidarslam.storage.finished_run import load_map, read_trajectory
