@@ -130,7 +130,9 @@ CATALOGUE: tuple[DataSet, ...] = (
         "--sequence NAME",
     ),
     # The IMU of Boreas is published without gravity.
-    _of_evalio("boreas", "Boreas", "Velodyne VLS-128", _GNSS, f"{_PYBOREAS}/DATA_REFERENCE.md", imu=False),
+    _of_evalio(
+        "boreas", "Boreas", "Velodyne VLS-128", _GNSS, f"{_PYBOREAS}/DATA_REFERENCE.md", False, "written sample"
+    ),
     _of_evalio("boreas_rt", "Boreas Road Trip", "Velodyne VLS-128", _GNSS, f"{_PYBOREAS}/DATA_RT_REFERENCE.md"),
     _of_evalio(
         "botanic_garden", "BotanicGarden", "Velodyne VLP-16", _SURVEY, "https://github.com/robot-pesg/BotanicGarden"
@@ -144,7 +146,14 @@ CATALOGUE: tuple[DataSet, ...] = (
         "https://projects.asl.ethz.ch/datasets/enwide",
     ),
     _of_evalio("fomo", "FoMo", "RoboSense Ruby Plus", "GNSS, positions alone", "https://fomo.norlab.ulaval.ca/"),
-    _of_evalio("helipr", "HeLiPR", "Ouster OS2-128", _GNSS, "https://sites.google.com/view/heliprdataset/"),
+    _of_evalio(
+        "helipr",
+        "HeLiPR",
+        "Ouster OS2-128",
+        _GNSS,
+        "https://sites.google.com/view/heliprdataset/",
+        tried="written sample",
+    ),
     _of_evalio(
         "hilti_2022",
         "Hilti SLAM Challenge 2022",
