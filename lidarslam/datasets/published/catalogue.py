@@ -144,6 +144,7 @@ CATALOGUE: tuple[DataSet, ...] = (
         "Ouster OS0-128",
         "total station, positions alone",
         "https://projects.asl.ethz.ch/datasets/enwide",
+        tried="written sample",
     ),
     _of_evalio("fomo", "FoMo", "RoboSense Ruby Plus", "GNSS, positions alone", "https://fomo.norlab.ulaval.ca/"),
     _of_evalio(
@@ -162,7 +163,14 @@ CATALOGUE: tuple[DataSet, ...] = (
         "https://hilti-challenge.com/dataset-2022.html",
         tried="written sample",
     ),
-    _of_evalio("multi_campus", "MCD", "Ouster OS1-128, OS1-64", _SURVEY, "https://mcdviral.github.io/"),
+    _of_evalio(
+        "multi_campus",
+        "MCD",
+        "Ouster OS1-128, OS1-64",
+        _SURVEY,
+        "https://mcdviral.github.io/",
+        tried="written sample",
+    ),
     _of_evalio("newer_college_2020", "Newer College 2020", "Ouster OS1-64", _SURVEY, f"{_OXFORD}/stereo-cam/"),
     _of_evalio(
         "newer_college_2021",
