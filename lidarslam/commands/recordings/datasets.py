@@ -15,7 +15,7 @@ from lidarslam.commands.shared.terminal import say
 @click.argument("arguments", nargs=-1, metavar="[NAME | FOLDER]...")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; docs/data_sets.md describes the keys.")
 def datasets(arguments: tuple[str, ...], as_json: bool) -> None:
-    """List published data sets, or say more about one; which are on disk, in folders too."""
+    """List published data sets and those on disk, or describe one."""
     from lidarslam.commands.shared import catalogue_text as text
 
     chosen, folders = text.choose(arguments)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidarslam.config.settings import dump_yaml
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.pose_graph.g2o import format_g2o
@@ -209,7 +210,7 @@ def _entry(part: _Part, run: RunOutcome | None, is_joined: bool) -> MergedRecord
     return MergedRecording(
         name=part.recording.name,
         directory=None if run is None else part.request.out.name,
-        source=str(part.request.source.resolve()),
+        source=str(resolved(part.request.source)),
         scans=part.scans,
         length_m=0.0 if run is None else run.summary.length_m,
         lost_scans=0 if run is None else run.summary.lost_scans,

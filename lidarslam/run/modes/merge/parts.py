@@ -11,6 +11,7 @@ from typing import Any
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
+from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.config import MapFormat
@@ -37,7 +38,7 @@ class MergeRequest:
 
     def describe(self) -> dict[str, Any]:
         """For config.yaml, and for an unfinished merge."""
-        return {"version": version("lidarslam"), "sources": [str(source.resolve()) for source in self.sources]}
+        return {"version": version("lidarslam"), "sources": [str(resolved(source)) for source in self.sources]}
 
 
 def closing_loops(config: Config) -> Config:
