@@ -17,7 +17,7 @@ _LONGEST_SWEEP_S = 0.25
 # Pairs of consecutive scans that are compared, spread over the recording.
 _PAIRS = 40
 
-_USED = "The points have no times but are in the order of firing, so their times follow from the azimuth."
+_USED = "The points are in the order of firing, and their times follow from the azimuth."
 _NOT_USED = (
     "The points have no times, and the seams of the sweeps are closed as in motion compensated ones, or sweeps are"
     " missing between; none are made from the azimuth."
