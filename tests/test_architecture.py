@@ -59,6 +59,7 @@ CONFINED = {
     "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
     "evalio": ("lidarslam.datasets.published.evalio*",),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
+    "pyproj": ("lidarslam.storage.exports.projection",),
     "rosbags": (
         "lidarslam.datasets.*",
         "lidarslam.simulation.writers.*",

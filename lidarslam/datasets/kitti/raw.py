@@ -95,6 +95,11 @@ class KittiRawRecording(FileRecording):
         T_lidar_imu = self._calibration("calib_imu_to_velo.txt")
         return usable_samples(self._oxts_stamps(oxts), oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
+    @property
+    def oxts(self) -> tuple[OxtsPoses, FloatArray] | None:
+        """The GPS/IMU unit's rows and their stamps (N,), NaN where there is none; None without the unit."""
+        return None if self._oxts is None else (self._oxts, self._oxts_stamps(self._oxts))
+
     def _oxts_stamps(self, oxts: OxtsPoses) -> FloatArray:
         """Stamps (N,) of the unit's poses on the clock of the scans, NaN where there is none.
 

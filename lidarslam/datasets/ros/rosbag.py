@@ -82,6 +82,11 @@ class BagRecording:
         """The folder's name, or the file's without its suffix."""
         return self._source.resolve().name if self._source.is_dir() else self._source.stem
 
+    @property
+    def frames(self) -> tuple[BagFile, str]:
+        """The bag, and the frame of its clouds."""
+        return self._bag, self._frame_id
+
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """The TUM file beside the bag, or inside its folder, named like the bag or ground_truth.tum."""
