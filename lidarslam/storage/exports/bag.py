@@ -21,10 +21,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from lidarslam.core.files import cannot_write, make_directory
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.storage.exports import ros_messages as ros
 from lidarslam.storage.exports.run_scans import RunScans
 from lidarslam.storage.finished_run import load_map
@@ -125,16 +124,11 @@ def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str)
     topics.write(
         _TF_TOPIC, stamp, topics.messages.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar))
     )
-    velocity = _velocity(run.motions[number])
+    known = run.known_velocities(number)
+    velocity = np.mean(known, axis=0) if known else np.zeros(6)
     frames = (_MAP_FRAME, lidar_frame)
     message = topics.messages.odometry(stamp, frames, T_map_lidar, run.sigmas[number], velocity)
     topics.write(_ODOMETRY_TOPIC, stamp, message)
-
-
-def _velocity(motion: SweepMotion) -> FloatArray:
-    """The body velocity (6,) at the stamp; zero where it is unknown."""
-    known = [velocity for velocity in (motion.before, motion.after) if velocity is not None]
-    return np.mean(known, axis=0) if known else np.zeros(6)
 
 
 def _scan_message(messages: ros.RosMessages, scan: Scan, lidar_frame: str) -> Any:
