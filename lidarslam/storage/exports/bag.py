@@ -43,7 +43,7 @@ SUFFIXES = (".mcap", ".db3", ".bag", "")
 # The newest version that ROS 2 Humble reads; for a lone .db3 the oldest with types and metadata in the file.
 _VERSION: Literal[8] = 8
 _LONE_SQLITE_VERSION: Literal[9] = 9
-_LONGEST = QosTime(2147483647, 4294967295)
+_LONGEST = QosTime(9223372036, 854775807)  # as ROS 2 writes infinity
 
 
 @dataclass(frozen=True)
