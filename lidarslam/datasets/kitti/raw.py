@@ -136,6 +136,10 @@ class KittiRawRecording(FileRecording):
         return None if self._config.time_reference == "none" else AZIMUTH_TIME
 
     @property
+    def _rate_is_assumed(self) -> bool:
+        return not self._timing.from_clock
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Stamps that were interpolated, and missing scans."""
         first, last = self._numbers[0], self._numbers[-1]
