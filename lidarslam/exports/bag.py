@@ -21,12 +21,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from lidarslam.core.files import cannot_write, make_directory
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.exports import ros_messages as ros
 from lidarslam.exports.run_scans import RunScans
 from lidarslam.mapping.global_map.global_map import PointCloud
-from lidarslam.pipeline.estimates import SweepMotion
 from lidarslam.storage.finished_run import load_map
 
 # REP 105.
@@ -44,7 +43,7 @@ SUFFIXES = (".mcap", ".db3", ".bag", "")
 # The newest version that ROS 2 Humble reads; for a lone .db3 the oldest with types and metadata in the file.
 _VERSION: Literal[8] = 8
 _LONE_SQLITE_VERSION: Literal[9] = 9
-_LONGEST = QosTime(2147483647, 4294967295)
+_LONGEST = QosTime(9223372036, 854775807)  # as ROS 2 writes infinity
 
 
 @dataclass(frozen=True)
@@ -125,16 +124,11 @@ def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str)
     topics.write(
         _TF_TOPIC, stamp, topics.messages.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar))
     )
-    velocity = _velocity(run.motions[number])
+    known = run.known_velocities(number)
+    velocity = np.mean(known, axis=0) if known else np.zeros(6)
     frames = (_MAP_FRAME, lidar_frame)
     message = topics.messages.odometry(stamp, frames, T_map_lidar, run.sigmas[number], velocity)
     topics.write(_ODOMETRY_TOPIC, stamp, message)
-
-
-def _velocity(motion: SweepMotion) -> FloatArray:
-    """The body velocity (6,) at the stamp; zero where it is unknown."""
-    known = [velocity for velocity in (motion.before, motion.after) if velocity is not None]
-    return np.mean(known, axis=0) if known else np.zeros(6)
 
 
 def _scan_message(messages: ros.RosMessages, scan: Scan, lidar_frame: str) -> Any:

@@ -9,7 +9,6 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from lidarslam.compare.assessment.inputs import read_estimate
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.core.geometry import FloatArray
@@ -18,8 +17,9 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.exports.gnss import read_gnss
 from lidarslam.exports.new_file import require_new
 from lidarslam.exports.projection import Utm, utm_at
+from lidarslam.exports.source import read_source
+from lidarslam.mapping.global_map.products.georeference import Georeference, GnssTrack, align_to_track
 from lidarslam.mapping.global_map.survey_formats import write_laz
-from lidarslam.mapping.products.georeference import Georeference, GnssTrack, align_to_track
 from lidarslam.storage.finished_run import load_map, read_trajectory
 
 MAP, TRAJECTORY, GEOJSON, KML = "map.laz", "trajectory_utm.tum", "trajectory.geojson", "trajectory.kml"
@@ -47,15 +47,13 @@ def georeference(run: Path) -> GeoRun:
         InputError: there is no run, its recording has no GNSS, or the track is too short to determine the heading.
         ConfigError: pyproj is not installed.
     """
-    trajectory, estimate = read_trajectory(run), read_estimate(run)
-    if estimate.source is None or not estimate.source.exists():
-        raise InputError(f"{estimate.source or run}: the run's recording, which has the GNSS positions, is not there")
-    track = read_gnss(estimate.source, estimate.config.reader)
+    trajectory, source = read_trajectory(run), read_source(run, "has the GNSS positions")
+    track = read_gnss(source.path, source.reader)
     utm = utm_at(*track.geodetic[0, :2].tolist())
     try:
         placed = align_to_track(trajectory, track, utm.project(track.geodetic), utm.scale)
     except ValueError as error:
-        raise InputError(f"{estimate.source}: {error}") from error
+        raise InputError(f"{source.path}: {error}") from error
     if placed.heading_sigma_deg > _LARGEST_HEADING_SIGMA_DEG:
         raise InputError(
             f"{run}: too short to determine the heading from its GNSS positions: they leave"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.products.mesh import Mesh
+from lidarslam.mapping.global_map.products.mesh import Mesh
 
 _FLOAT, _UINT32, _UINT8 = 5126, 5125, 5121
 _VERTICES, _INDICES = 34962, 34963

@@ -13,7 +13,7 @@ from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import deserialize
 from lidarslam.datasets.ros.rosbag import BagRecording
 from lidarslam.datasets.ros.static_transforms import static_transform
-from lidarslam.mapping.products.georeference import GnssTrack
+from lidarslam.mapping.global_map.products.georeference import GnssTrack
 
 _FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 _NO_FIX = -1

@@ -8,7 +8,7 @@ from PIL import Image
 
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
-from lidarslam.mapping.products.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from lidarslam.mapping.global_map.products.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 _GREY = {OCCUPIED: 0, UNKNOWN: 205, FREE: 254}
 # The shade of the unknown, (255 - 205) / 255 = 0.1961, lies between them.

@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.exports.glb import write_glb
-from lidarslam.mapping.products.mesh import Mesh, reconstruct
+from lidarslam.mapping.global_map.products.mesh import Mesh, reconstruct
 from lidarslam.storage.finished_run import load_map, read_summary
 
 SUFFIXES = (".ply", ".obj", ".glb")

@@ -4,14 +4,11 @@ import csv
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from lidarslam.compare.assessment.inputs import read_estimate
-from lidarslam.config.yaml_text import read_yaml
-from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
@@ -19,12 +16,11 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import choose_scans, take_in
-from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping.motion.deskew import body_velocity
-from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.run.scan_log import SIGMAS
+from lidarslam.exports.source import read_source
+from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.storage import directory as files
+from lidarslam.storage.directory import SIGMAS
 from lidarslam.storage.finished_run import read_statuses, read_trajectory
 
 # Stamps of the trajectory and of the recording are equal but for the text's nine decimals.
@@ -44,16 +40,19 @@ class RunScans:
     lost: FloatArray  # (N,) bool, whether tracking was lost
 
     @cached_property
-    def motions(self) -> list[SweepMotion]:
-        """The motion of each sweep, from the poses before and after it; None across gaps and lost scans."""
+    def velocities(self) -> list[FloatArray | None]:
+        """Body velocities (6,) before each scan and after the last, N + 1; None across gaps and lost scans."""
         steps = np.diff(self.trajectory.stamps)
         usual = np.median(steps) if len(steps) else 0.0
         velocities: list[FloatArray | None] = [None]
         for number, T_prev_curr in enumerate(self.trajectory.relative_motions()):
             follows = steps[number] <= _GAP * usual and not self.lost[number : number + 2].any()
             velocities.append(body_velocity(T_prev_curr, steps[number]) if follows else None)
-        velocities.append(None)
-        return [SweepMotion(*pair) for pair in pairwise(velocities)]
+        return [*velocities, None]
+
+    def known_velocities(self, number: int) -> list[FloatArray]:
+        """Of the two velocities (6,) before and after a scan, those that are known."""
+        return [velocity for velocity in self.velocities[number : number + 2] if velocity is not None]
 
     def deskewed(self) -> Iterator[tuple[int, Scan]]:
         """The index of each scan, and the scan with its points moved to its stamp, without times.
@@ -61,29 +60,18 @@ class RunScans:
         Raises:
             InputError: the recording is not there any more, or cannot be read.
         """
-        recording, chosen = self._recording()
+        source = read_source(self.run, "is needed for deskewed clouds; leave them out with --no-clouds")
+        recording = open_recording(source.path, source.reader)
+        chosen = choose_scans(recording, source.path, source.start, source.stop, source.step)
         stamps = self.trajectory.stamps
         for scan in take_in(recording, chosen, Faults()):
             index = int(np.searchsorted(stamps, scan.stamp - _SAME_S))
             if index == len(stamps) or abs(stamps[index] - scan.stamp) > _SAME_S:
                 continue  # the run was stopped before it, or left it out
-            points = self.motions[index].compensate(scan)
+            points, known = scan.points, self.known_velocities(index)
+            if scan.time_offsets is not None and known:
+                points = deskew(points, scan.time_offsets, known[0], known[-1])
             yield index, Scan(points, scan.stamp, None, scan.rings, 0, scan.intensities, scan.colours)
-
-    def _recording(self) -> tuple[Recording, range]:
-        """The recording, and the indices of its scans that the run took."""
-        estimate = read_estimate(self.run)
-        source = estimate.source
-        if source is None or not source.exists():
-            place = f"{self.run}: the recording is unknown" if source is None else f"{source}: is not there any more"
-            raise InputError(f"{place}, and deskewed clouds need it; leave them out with --no-clouds")
-        recording = open_recording(source, estimate.config.reader)
-        try:
-            about = read_yaml(self.run / files.CONFIG)[files.RUN_SECTION]
-            chosen = int(about["start"]), None if about["stop"] is None else int(about["stop"]), int(about["step"])
-        except (ConfigError, KeyError, TypeError, ValueError):
-            chosen = 0, None, 1
-        return recording, choose_scans(recording, source, *chosen)
 
 
 def read_run_scans(run: Path) -> RunScans:

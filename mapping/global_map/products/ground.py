@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.products.grid_kernels import grow_ground
+from lidarslam.mapping.global_map.products.grid_kernels import grow_ground
 
 CELL_M = 0.5
 # Least |z| of the normal of a point of the ground.

@@ -8,8 +8,8 @@ from scipy.ndimage import binary_dilation, convolve
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.products.grid_kernels import mark_visible
-from lidarslam.mapping.products.ground import CELL_M, along_path, find_ground
+from lidarslam.mapping.global_map.products.grid_kernels import mark_visible
+from lidarslam.mapping.global_map.products.ground import CELL_M, along_path, find_ground
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """The values of nav_msgs/OccupancyGrid."""
