@@ -22,12 +22,13 @@ from lidarslam.mapping.tracking.start_poses import best_starts, positions_around
 
 # Places around a supposed one that are tried: how far, in cells, and turned by how much.
 _NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
-# Radius of the view from above and of the points that are registered, in median ranges; places that are tried.
-_RANGES, _PLACES = 3.0, 24
+# Radius of the view from above and of the points that are registered, in median ranges; places that are
+# tried, and how many of one heading.
+_RANGES, _PLACES, _PEAKS = 3.0, 32, 8
 # Points that are registered first, and the share of the best quality above which all points are.
-_FEW_POINTS, _LIKELY = 500, 0.7
+_FEW_POINTS, _LIKELY = 500, 0.5
 # Of these, that are registered.
-_PROMISING = 12
+_PROMISING = 16
 # A region of the map serves several places, farther than what the scans reach by so many times that; so many are kept.
 _SPARE, _REGIONS = 1.5, 8
 # Other scans that must fit, and what they may be off from where the recording's own motion puts them.
@@ -38,8 +39,9 @@ _ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
 _STILL = 1e-3
 # What scans need, on average: inlier ratio, share of inliers among all points, directional support.
 _LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
-# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it.
-_RIVAL = 1.0 / 1.25
+# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it. At
+# 0.8 a wrong place in a row of equal houses was taken.
+_RIVAL = 0.6
 _SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
 
 
@@ -125,7 +127,7 @@ class PlaceSearch:
         starts: list[FloatArray] = []
         for view in self._map.views(cell_m):
             T = make_transform(view.R_level_world.T @ R_level_lidar, np.zeros(3))
-            starts.extend(view.find(points, T, reach_m, _PLACES))
+            starts.extend(view.find(points, T, reach_m, _PLACES, _PEAKS))
         return self.among(scans, starts)
 
     def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Search:
