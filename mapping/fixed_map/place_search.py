@@ -11,6 +11,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
+from lidarslam.mapping.fixed_map.regions import Regions
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.registration import Registration, register
@@ -155,7 +156,7 @@ class PlaceSearch:
         return _decided(places)
 
     def _places(
-        self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float], regions: "Regions"
+        self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float], regions: Regions
     ) -> list[Place]:
         """The different places that a scan is registered at from poses (4, 4), by descending quality."""
         places: list[Place] = []
@@ -191,7 +192,7 @@ class PlaceSearch:
             starts.append(positions_around(T, up, _NEAR_CELLS * cell_m, 0.5 * _NEAR_CELLS * cell_m))
         return self.among(scans, list(best_starts(latest.keypoints, np.concatenate(starts), region)))
 
-    def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: "Regions") -> Place:
+    def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: Regions) -> Place:
         """A place with the fits of the other scans; none where one is off from where the motion puts it."""
         fits, last, T_map_last = list(place.fits), kept[0], place.T_map_lidar
         for scan in kept[1:]:
@@ -206,7 +207,7 @@ class PlaceSearch:
         return replace(place, fits=tuple(fits))
 
     def _register(
-        self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float], regions: "Regions"
+        self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float], regions: Regions
     ) -> Place | None:
         surfel_map = regions.around(start[:3, 3])
         points = scan.keypoints
@@ -239,28 +240,3 @@ def _is_off(start: FloatArray, found: FloatArray, motion: FloatArray, cell_m: fl
     off, way_m = inverse(start) @ found, float(np.linalg.norm(motion[:3, 3]))
     far = np.linalg.norm(off[:3, 3]) > _MOST_SHIFT_CELLS * cell_m + _MOST_SHIFT_SHARE * way_m
     return bool(far or rotation_angle(off) > _MOST_TURN)
-
-
-class Regions:
-    """Regions of the map as surfels.
-
-    Args:
-        fixed_map: the map.
-        cell_m: edge of the surfel cells.
-        reach_m: how far around a position a region must reach.
-        spare_m: how much farther it reaches, so that it serves other positions too.
-        kept: how many are kept.
-    """
-
-    def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:
-        self._map, self.cell_m, self._reach_m, self._spare_m, self._kept = fixed_map, cell_m, reach_m, spare_m, kept
-        self._drawn: list[tuple[FloatArray, SurfelMap]] = []
-
-    def around(self, position: FloatArray) -> SurfelMap:
-        """A region with all that is within reach of a position (3,)."""
-        for centre, region in self._drawn:
-            if np.linalg.norm(centre - position) < self._spare_m:
-                return region
-        region = self._map.region(position, self._reach_m + self._spare_m, self.cell_m)
-        self._drawn = [*self._drawn, (position.copy(), region)][-self._kept :]
-        return region

@@ -57,6 +57,12 @@ def errors(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.fixture(scope="module")
+def room(room: Any) -> Any:
+    """A room that does not look alike after half a turn."""
+    return type(room)(pillars=(*room.pillars, (5.3, 3.3, 1.5), (-1.0, -4.0, 0.9)))
+
+
+@pytest.fixture(scope="module")
 def room_map(room: Any) -> FixedMap:
     """The map of the room."""
     return draw_map(room)
