@@ -78,7 +78,7 @@ class LiveCounts:
         if self.dropped:
             found.append(
                 f"{count(self.dropped, 'scan')} dropped: registration was slower than the sensor; leave it more of the"
-                " processor, take --odometry constant-velocity, or turn the sensor's resolution down"
+                " processor, or take --odometry constant-velocity"
             )
         return found
 
