@@ -16,7 +16,9 @@ from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
+from lidarslam.commands.exports.geo import export_geo
 from lidarslam.commands.exports.grid import export_grid
+from lidarslam.commands.exports.mesh import export_mesh
 from lidarslam.commands.info import info
 from lidarslam.commands.live import live
 from lidarslam.commands.localise import localise
@@ -122,6 +124,8 @@ for _command in (
     compare,
     export_bag,
     export_grid,
+    export_mesh,
+    export_geo,
     config,
 ):
     main.add_command(_command)

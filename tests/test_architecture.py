@@ -55,8 +55,11 @@ CONFINED = {
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),
+    "ouster": ("lidarslam.datasets.packets.ouster*",),
+    "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
     "evalio": ("lidarslam.datasets.published.evalio*",),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
+    "pyproj": ("lidarslam.storage.exports.projection",),
     "rosbags": (
         "lidarslam.datasets.*",
         "lidarslam.simulation.writers.*",

@@ -109,6 +109,8 @@ def track(
         for warning in recording.warnings:
             log.warn(warning)
     error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
+    if inertial is not None and inertial.disagreement is not None:
+        log.warn(inertial.disagreement)
     if not log.points_read:
         if isinstance(error, KeyboardInterrupt):
             raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)

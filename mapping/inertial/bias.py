@@ -36,8 +36,8 @@ class BiasFilter(Stateful):
 
     def turn_covariance(self, turn: FloatArray, interval_s: float, change: FloatArray) -> FloatArray:
         """(3, 3) of the error of a turn (3, 3) within an interval in which the rate changed by (3,), from the right."""
-        least = _LEAST_TURN**2 * np.eye(3)
-        return self._noise(turn, interval_s, change) + least + interval_s**2 * self._covariance[3:, 3:]
+        noise = self._noise(turn, interval_s, change) + _LEAST_TURN**2 * np.eye(3)
+        return np.asarray(noise + interval_s**2 * self._covariance[3:, 3:], dtype=np.float64)
 
     def turned(self, turn: FloatArray, interval_s: float, change: FloatArray) -> None:
         """Propagate by a turn (3, 3) that the gyroscope measured, without the bias."""

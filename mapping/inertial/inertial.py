@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
@@ -21,6 +21,8 @@ _ANY_TRANSLATION_M = 10.0
 # Smoothing of the velocity between poses: without, errors at the stamps of uncompensated sweeps would swing.
 _SMOOTHING = 0.5
 _STEPS = 40
+# The turns of IMU and LiDAR disagree when they differ by more than this share, and by more than registration does.
+_FEWEST_TURNS, _MOST_DIFFERENT, _REGISTRATION_ERROR = 50, 0.2, np.deg2rad(0.15)
 
 
 class Inertial(Stateful):
@@ -37,6 +39,10 @@ class Inertial(Stateful):
     _last: MotionState | None
     _velocity: Annotated[FloatArray, Shape(3)]  # translation between the last poses, body frame, m/s
     _direction: GravityDirection | None
+    # of the turns that were compared: how many, and the sums of squares of their angles and of the differences
+    _turns: int
+    _angles2: float
+    _differences2: float
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray, config: MappingConfig) -> None:
         self._config = config
@@ -45,6 +51,16 @@ class Inertial(Stateful):
         self._force = Integral(samples.stamps, samples.accelerations @ T_lidar_imu[:3, :3].T)
         self._bias, self._gravity = BiasFilter(), GravityFilter()
         self._last, self._velocity, self._direction = None, np.zeros(3), None
+        self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
+
+    @property
+    def disagreement(self) -> str | None:
+        """A warning where the turns of IMU and LiDAR disagree: its mounting or its clock is wrong; None else."""
+        differences2 = self._differences2 - self._turns * _REGISTRATION_ERROR**2
+        if self._turns < _FEWEST_TURNS or differences2 < _MOST_DIFFERENT**2 * self._angles2:
+            return None
+        percent = 100.0 * np.sqrt(differences2 / self._angles2)
+        return f"the turns that IMU and LiDAR measured differ by {percent:.0f} %: the IMU's mounting or clock is wrong"
 
     @property
     def direction(self) -> GravityDirection | None:
@@ -85,8 +101,11 @@ class Inertial(Stateful):
         interval_s = scan.stamp - last.stamp
         self._bias.turned(turn, interval_s, self.gyroscope.change(last.stamp, scan.stamp))
         self._bias.registered(state.T_world_lidar[:3, :3], state.covariance[:3, :3])
-        motion = log(inverse(last.T_world_lidar) @ state.T_world_lidar) / interval_s
-        self._velocity = (1.0 - _SMOOTHING) * self._velocity + _SMOOTHING * motion[3:]
+        T_last_now = inverse(last.T_world_lidar) @ state.T_world_lidar
+        self._velocity = (1.0 - _SMOOTHING) * self._velocity + _SMOOTHING * log(T_last_now)[3:] / interval_s
+        self._turns += 1
+        self._angles2 += float(rotation_angle(turn)) ** 2
+        self._differences2 += float(rotation_angle(turn.T @ T_last_now[:3, :3])) ** 2
         since = self._integrated(last.stamp, scan.stamp)
         self._direction = self._gravity.registered(self._station(state, since))
 

@@ -17,7 +17,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.simulation.sensors.imu import MEMS_IMU, sample_imu
 
-SCANS = 30
+SCANS = 20
 MODEL = replace(MEMS_IMU, T_lidar_imu=make_transform(exp([0.2, -0.1, 1.4, 0.0, 0.0, 0.0])[:3, :3], [0.05, 0.0, -0.1]))
 FAST = ("--no-report", "--set", "mapping.keypoints=800", "--set", "global_map.voxel_size_m=0.2")
 
@@ -85,7 +85,8 @@ def test_shaken_sweeps_are_straightened(recording: Path, run: Any) -> None:
         errors[method] = rotation_error_deg(out, recording)
         metrics = json.loads((out / "metrics.json").read_text())
         assert metrics["association"]["matched"] == SCANS
-    assert errors["imu"] < 0.15 < 3.0 * errors["imu"] < errors["constant-velocity"]
+    assert 5.0 * errors["imu"] < errors["constant-velocity"]
+    assert errors["imu"] < 0.15
 
 
 def test_an_imu_that_nobody_asks_for_changes_nothing(recording: Path, run: Any, tmp_path: Path) -> None:

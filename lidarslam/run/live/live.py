@@ -20,7 +20,7 @@ from lidarslam.run.live.session import LiveSession, warm_up
 from lidarslam.run.live.statistics import LiveCounts
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.results import RunOutcome, final_map, write_results
-from lidarslam.run.run import open_odometry, viewing
+from lidarslam.run.run import open_odometry, require_scans_only, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.viewer.rerun_program import require_window
@@ -57,8 +57,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     if request.rerun == "spawn":
         require_window("serve a browser with --rerun web, or write a file with --rerun save")
     config, log, faults = request.config, ScanLog(), Faults()
-    if config.odometry.method == "external":
-        raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
+    require_scans_only(config)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
