@@ -20,12 +20,14 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
+from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.pipeline.estimates import Localised, SweepMotion
 from lidarslam.run.modes.live.clouds import CloudDecoder
 from lidarslam.run.modes.live.discovery import find_topic
 from lidarslam.run.modes.live.incoming import IncomingQueue, Received
-from lidarslam.run.modes.live.messages import TRANSFORMS_TYPE, serialize_transform
-from lidarslam.run.modes.live.publishing import PosePublisher, chain
+from lidarslam.run.modes.live.messages import serialize_transform
+from lidarslam.run.modes.live.publishing import PosePublisher
 from lidarslam.run.modes.live.statistics import LiveStatistics, count_missing
 
 LIDARSLAM = [sys.executable, "-m", "lidarslam"]
@@ -317,20 +319,14 @@ def test_covariances_are_those_of_errors_along_the_fixed_axes(rng: np.random.Gen
 
 def test_static_transforms_are_chained_in_both_directions() -> None:
     a, b = exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])), exp(np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0]))
-    known = [("base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", b)]
-    found = chain(known, "base_link", "os_lidar")
+    edges: Edges = {}
+    for parent, child, T in (("/base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", a)):
+        add_edges(edges, serialize_transform(0, parent, child, T), ros2=True)
+    add_edges(edges, b"damaged", ros2=True)
+    found = chain(edges, "base_link", "os_lidar")
     assert found is not None
-    np.testing.assert_allclose(found, a @ b @ inverse(b), atol=1e-12)
-    assert chain(known, "base_link", "camera") is None
-
-
-def test_a_transform_survives_its_message() -> None:
-    from lidarslam.run.modes.live.messages import read_transforms
-
-    T = exp(np.array([0.5, -0.4, 0.3, 1.0, 2.0, 3.0]))
-    ((parent, child, read),) = read_transforms(serialize_transform(0, "base_link", "os", T))
-    assert (parent, child) == ("base_link", "os")
-    np.testing.assert_allclose(read, T, atol=1e-12)
+    np.testing.assert_allclose(found, a @ a @ inverse(b), atol=1e-12)
+    assert chain(edges, "base_link", "camera") is None
 
 
 def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:

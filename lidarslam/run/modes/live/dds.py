@@ -1,8 +1,8 @@
 """Topics of a ROS 2 system over DDS, without ROS; the only file that imports cyclonedds.
 
 ROS 2 maps the topic /points to rt/points, the type sensor_msgs/msg/PointCloud2 to sensor_msgs::msg::dds_::PointCloud2_,
-and serialises messages as XCDR1. Messages stay serialised here: decoding the bytes of a cloud one by one, as the
-library does, takes longer than a sweep.
+and serialises messages as XCDR1. Messages stay serialised here: the library would make a list of three million numbers
+of a cloud, which takes ten times as long as all of our own decoding.
 """
 
 import os

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 
@@ -10,12 +10,13 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.datasets.ros.bag_message import read_header
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
+from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.run.modes.live.clouds import CloudDecoder
 from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
 from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
-from lidarslam.run.modes.live.messages import ODOMETRY_TYPE, TRANSFORMS_TYPE, read_transforms
-from lidarslam.run.modes.live.publishing import PosePublisher, chain
+from lidarslam.run.modes.live.messages import ODOMETRY_TYPE
+from lidarslam.run.modes.live.publishing import PosePublisher
 from lidarslam.run.modes.live.request import LiveRequest
 from lidarslam.run.modes.live.session import LiveSession
 from lidarslam.run.modes.live.statistics import LiveCounts, LiveStatistics
@@ -128,22 +129,17 @@ class Follower:
         Raises:
             InputError: no static transforms connect the two.
         """
-        known: list[tuple[str, str, FloatArray]] = []
-        for transforms in self._static_transforms():
-            known += transforms
-            if (T := chain(known, base, lidar)) is not None:
-                return T
-        frames = ", ".join(sorted({name for parent, child, _ in known for name in (parent, child)})) or "none"
-        raise InputError(
-            f"{TF_STATIC_TOPIC} does not connect --base-frame {base} with {lidar}, the frame of the clouds;"
-            f" its frames: {frames}"
-        )
-
-    def _static_transforms(self) -> Iterator[list[tuple[str, str, FloatArray]]]:
+        edges: Edges = {}
         begin = time.monotonic()
         while self._static is not None and time.monotonic() - begin < _STATIC_WITHIN_S:
             for message in self._static.take(_POLL_S):
-                yield read_transforms(message.raw)
+                add_edges(edges, message.raw, ros2=True)
+            if (T_base_lidar := chain(edges, base, lidar)) is not None:
+                return T_base_lidar
+        raise InputError(
+            f"{TF_STATIC_TOPIC} does not connect --base-frame {base} with {lidar}, the frame of the clouds; its frames:"
+            f" {', '.join(sorted(edges)) or 'none'}"
+        )
 
 
 def _is_done(future: "Future[None]") -> bool:

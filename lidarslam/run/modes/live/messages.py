@@ -1,4 +1,4 @@
-"""ROS 2 messages that are published and read: their definitions, odometry and transforms."""
+"""ROS 2 messages: the definitions of those that are received, and odometry and transforms to be published."""
 
 from functools import cache
 from typing import Any
@@ -8,11 +8,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
-from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.ros import livox
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
 _LIVOX_PACKAGES = ("livox_ros_driver2", "livox_interfaces")  # the drivers of ROS 2
 # Rotation first, as poses have their errors here, to translation first, as ROS has them.
 _ROS_ORDER = (3, 4, 5, 0, 1, 2)
@@ -71,15 +71,6 @@ def serialize_transform(stamp_ns: int, frame_id: str, child_frame_id: str, T_fra
     return bytes(message_types().serialize_cdr(types[TRANSFORMS_TYPE](transforms=[stamped]), TRANSFORMS_TYPE))
 
 
-def read_transforms(raw: bytes) -> list[tuple[str, str, FloatArray]]:
-    """Parent, child and the pose (4, 4) of the child in the parent, of each transform of a tf2_msgs/TFMessage."""
-    message: Any = message_types().deserialize_cdr(raw, TRANSFORMS_TYPE)
-    return [
-        (stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/"), _matrix(stamped.transform))
-        for stamped in message.transforms
-    ]
-
-
 def in_fixed_frame(covariance: FloatArray, T_frame_child: FloatArray) -> FloatArray:
     """The covariance (6, 6) as ROS has it: along and about the axes of the fixed frame, translation first."""
     rotate = np.kron(np.eye(2), T_frame_child[:3, :3])
@@ -90,11 +81,6 @@ def _header(stamp_ns: int, frame_id: str) -> Any:
     types = message_types().types
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)
-
-
-def _matrix(transform: Any) -> FloatArray:
-    t, q = transform.translation, transform.rotation
-    return make_transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
 
 
 def _vector(values: FloatArray) -> Any:

@@ -1,8 +1,6 @@
 """Poses of a live run for the robot: odometry and the transform of its frame."""
 
-from collections.abc import Callable, Sequence
-
-import numpy as np
+from collections.abc import Callable
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
 from lidarslam.core.tracking import Status
@@ -48,21 +46,3 @@ class PosePublisher:
         self._odometry(serialize_odometry(stamp_ns, *self._frames, T, covariance, velocity))
         if self._transforms is not None:
             self._transforms(serialize_transform(stamp_ns, *self._frames, T))
-
-
-def chain(transforms: Sequence[tuple[str, str, FloatArray]], base: str, target: str) -> FloatArray | None:
-    """The pose (4, 4) of one frame in another; None where no transforms connect them.
-
-    Args:
-        transforms: parent, child, and the pose (4, 4) of the child in the parent.
-        base, target: names of the two frames.
-    """
-    steps = [*transforms, *((child, parent, inverse(T)) for parent, child, T in transforms)]
-    known = {base: np.eye(4)}
-    reached = [base]
-    for frame in reached:  # grows while it is walked: breadth first
-        for parent, child, T in steps:
-            if parent == frame and child not in known:
-                known[child] = known[frame] @ T
-                reached.append(child)
-    return known.get(target)

@@ -10,7 +10,7 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import count
 
 # A stamp farther from this machine's clock is the reading of another one.
-_SAME_CLOCK_S = 10.0
+_SAME_CLOCK_S = 60.0
 _RATE_OVER_S = 5.0
 # An interval that is longer than so many usual ones has room for scans that are missing.
 _GAP_INTERVALS = 1.5
@@ -78,7 +78,7 @@ class LiveCounts:
         if self.dropped:
             found.append(
                 f"{count(self.dropped, 'scan')} dropped: registration was slower than the sensor; leave it more of the"
-                " processor, take --odometry constant-velocity, or turn the sensor's resolution down"
+                " processor, or take --odometry constant-velocity"
             )
         return found
 
