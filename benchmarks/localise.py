@@ -150,7 +150,7 @@ def cases(world: str, sensor: str, seed: int) -> Iterator[tuple[str, Simulation,
 
 def starts(count: int, scans: int, available: int) -> list[int]:
     """First scans of recordings, evenly spread."""
-    return np.linspace(0, max(0, available - scans), count).astype(int).tolist()
+    return [int(first) for first in np.linspace(0, max(0, available - scans), count)]
 
 
 def print_row(cells: list[str]) -> None:

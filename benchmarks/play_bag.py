@@ -3,7 +3,7 @@
     python benchmarks/play_bag.py RECORDING --topic /points [--domain 0] [--rate 10] [--restamp] [--pad 65536]
 
 Needs the extra `live`. Publishing begins when somebody subscribes. --restamp stamps each message with the time at which
-it is sent, --pad fills clouds up with points at the origin, as organised clouds have where there is no return.
+it is due, --pad fills clouds up with points at the origin, as organised clouds have where there is no return.
 """
 
 import argparse
@@ -134,7 +134,7 @@ def main() -> None:
         due = begin + number / given.rate
         late += time.time() > due + 0.5 / given.rate
         time.sleep(max(0.0, due - time.time()))
-        message.raw = stamped(padded, time.time_ns()) if given.restamp else padded
+        message.raw = stamped(padded, round(1e9 * due)) if given.restamp else padded
         writer.write(message)
     print(f"sent {len(messages)} clouds in {time.time() - begin:.1f} s, {late} of them late", flush=True)
     time.sleep(given.linger)

@@ -55,15 +55,18 @@ CONFINED = {
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),
+    "ouster": ("lidarslam.datasets.packets.ouster*",),
+    "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
     "evalio": ("lidarslam.datasets.published.evalio*",),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
+    "pyproj": ("lidarslam.api.exports.projection",),
     "rosbags": (
         "lidarslam.datasets.*",
         "lidarslam.simulation.writers.*",
-        "lidarslam.storage.exports.*",
-        "lidarslam.run.live.*",
+        "lidarslam.api.exports.*",
+        "lidarslam.run.modes.live.*",
     ),
-    "cyclonedds": ("lidarslam.run.live.dds",),
+    "cyclonedds": ("lidarslam.run.modes.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES, MOST_ENTRIES = 250, 15

@@ -126,7 +126,8 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
         yield "topic", info.topic
     yield "scans", f"{info.scans:,}"
     yield "start", _instant(info.first_stamp)
-    rate = "" if info.rate_hz is None else f" at {info.rate_hz:.2f} Hz"
+    assumed = "an assumed " if info.rate_is_assumed else ""
+    rate = "" if info.rate_hz is None else f" at {assumed}{info.rate_hz:.2f} Hz"
     yield "duration", f"{info.duration_s:.1f} s{rate}"
     dropped = f" and {info.first.dropped:,} invalid ones left out" if info.first.dropped else ""
     yield "points", f"{len(info.first):,} in the first scan{dropped}"

@@ -17,6 +17,7 @@ logger = logging.getLogger(__name__)
 
 # Of rosbag2; a recorder that was killed leaves such a file without the metadata.yaml beside it.
 _BAG_SUFFIXES = (".db3", ".mcap")
+_PACKET_SUFFIXES = (".pcap", ".pcapng", ".osf")
 
 
 class Reader(NamedTuple):
@@ -96,6 +97,11 @@ READERS: dict[str, Reader] = {
         lambda source: (source / "velodyne_sync").is_dir(),
     ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "packets": Reader(
+        "lidarslam.datasets.packets.capture",
+        ".pcap of a Velodyne, or of an Ouster with its metadata .json beside it; Ouster's .osf",
+        lambda source: source.suffix.lower() in _PACKET_SUFFIXES,
+    ),
     "scan-folder": Reader(
         "lidarslam.datasets.folders.scan_folder",
         "a folder of .bin, .pcd, .ply or .npy scans",

@@ -28,11 +28,6 @@ _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), "images", "name the folder with the LiDAR's scans"),
     ((".mp4", ".avi", ".mkv", ".mov"), "video", "name the recording of the LiDAR"),
     (
-        (".pcap", ".pcapng"),
-        "packets of a sensor",
-        "decode them with the sensor's driver, and record a bag or save each scan as .pcd",
-    ),
-    (
         (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar", ".zst"),
         "packed",
         "unpack it and name the result",

@@ -9,8 +9,9 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 
-# Least edge of a surfel cell in spacings of the map's points: fewer points in a cell and its neighbours make no plane.
-_CELLS_PER_SPACING = 1.7
+# Least edge of a surfel cell in spacings of the map's points. With fewer points in a cell and its neighbours normals are
+# uncertain: at 1.7, roll was found to be degenerate in an office.
+_CELLS_PER_SPACING = 3.5
 _SAMPLES = 2000
 # Edge of a cell of the view from above, in surfel cells, and of the parts of the map that are drawn, in such cells,
 # with their overlap.
@@ -78,7 +79,8 @@ def _vertical(normals: FloatArray) -> FloatArray:
 
 def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bool_]]:
     """Which of the points (M, 2) are in each square of a grid, or within a margin of it; squares without any left out."""
-    low, extent = xy.min(axis=0), np.ptp(xy, axis=0)
+    low = xy.min(axis=0)
+    extent = xy.max(axis=0) - low
     counts = np.maximum(1, np.ceil(extent / edge_m)).astype(int)
     steps = extent / counts
     parts = []

@@ -54,7 +54,9 @@ class KeptScans:
         if self.latest is None:
             return []
         others = [scan for scan in reversed(self._apart) if scan is not self.latest]
-        spread = np.unique(np.linspace(0, len(others) - 1, min(count, len(others))).astype(np.intp)) if others else []
+        if not others:
+            return [self.latest]
+        spread = np.unique(np.linspace(0, len(others) - 1, min(count, len(others))).astype(np.intp))
         return [self.latest, *(others[index] for index in spread)]
 
     def points_around(self, reach_m: float) -> FloatArray:
@@ -67,4 +69,5 @@ class KeptScans:
             if scan is not self.latest and np.linalg.norm(T[:3, 3]) < reach_m:
                 parts.append(transform_points(T, scan.points))
         points = np.concatenate(parts)
-        return points[np.einsum("ij,ij->i", points, points) < reach_m**2]
+        inside = np.einsum("ij,ij->i", points, points) < reach_m**2
+        return np.asarray(points[inside], dtype=np.float64)

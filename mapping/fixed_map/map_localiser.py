@@ -19,9 +19,9 @@ from lidarslam.mapping.fixed_map.local_mapping import LocalMapping
 from lidarslam.mapping.fixed_map.place_search import Place, PlaceSearch, Regions, Search
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
-from lidarslam.mapping.tracking.attempts import Attempt
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.mapping.tracking.tracker import Tracker
 
 logger = logging.getLogger(__name__)
@@ -53,7 +53,9 @@ class MapLocaliser(Stateful):
         guess: rough x, y and heading of the first scan; None: anywhere.
     """
 
-    def __init__(self, config: MappingConfig, fixed_map: FixedMap, guess: tuple[float, float, float] | None = None) -> None:
+    def __init__(
+        self, config: MappingConfig, fixed_map: FixedMap, guess: tuple[float, float, float] | None = None
+    ) -> None:
         self._config = config
         self._map = fixed_map
         self._sampler = Sampler(config)
@@ -129,7 +131,8 @@ class MapLocaliser(Stateful):
     def _revoke(self) -> None:
         """Give up a place that later scans contradict."""
         local, pending = self._local, self._pending
-        assert local is not None and pending is not None
+        assert local is not None
+        assert pending is not None
         T_map_local = np.eye(4) if local.T_map_local is None else local.T_map_local
         for number in range(pending[0].scan, self._count):
             self.corrections[number] = T_map_local @ local.poses[number]
@@ -184,7 +187,7 @@ class MapLocaliser(Stateful):
         covariance = own.state.covariance.copy()
         covariance[:6, :6] = place.registration.covariance[:6, :6]
         state = replace(own.state, T_world_lidar=place.T_map_lidar, covariance=covariance)
-        message = "found in the map; not confirmed yet"
+        message = f"found in the map; {NOT_CONFIRMED}"
         return MappedScan(
             state, place.T_map_lidar, True, Status.DEGRADED, message, place.fits[0],
             place.registration.degeneracy.names, place.registration.iterations, is_connected=False,

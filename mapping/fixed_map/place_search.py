@@ -33,7 +33,7 @@ _SPARE, _REGIONS = 1.5, 8
 # Other scans that must fit, and what they may be off from where the recording's own motion puts them.
 _OTHERS = 5
 _MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
-# Standard deviations of a place that may be anywhere near, and of one that follows from another scan's: radians, metres.
+# Standard deviations of a place that may be anywhere near, and of one that follows from another: radians, metres.
 _ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
 _STILL = 1e-3
 # What scans need, on average: inlier ratio, share of inliers among all points, directional support.
@@ -122,7 +122,7 @@ class PlaceSearch:
         cell_m, reach_m = self._map.cell_m(latest.cell_m), _RANGES * latest.range_m
         points = scans.points_around(reach_m)
         R_level_lidar = levelling(up) @ latest.T_local_lidar[:3, :3]
-        starts = []
+        starts: list[FloatArray] = []
         for view in self._map.views(cell_m):
             T = make_transform(view.R_level_world.T @ R_level_lidar, np.zeros(3))
             starts.extend(view.find(points, T, reach_m, _PLACES))

@@ -10,6 +10,7 @@ from click.testing import CliRunner, Result
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
+from lidarslam.api.exports.run_scans import read_run_scans
 from lidarslam.cli import main
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
@@ -20,7 +21,6 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.storage.exports.run_scans import read_run_scans
 
 SCANS = 6
 FIRST_STAMP = 1_700_000_000.123456789

@@ -77,8 +77,14 @@ class FileRecording:
             point_time=self._point_time_model(),
             fields=self._fields(index),
             notes=(*self._notes(), *self.warnings, *unreadable.warnings()),
+            rate_is_assumed=self._rate_is_assumed,
             imu=summarise(self.imu_name, self.imu),
         )
+
+    @property
+    def _rate_is_assumed(self) -> bool:
+        """Whether the stamps follow from the rate of the settings."""
+        return False
 
     def _read(self, index: int, faults: Faults) -> Scan:
         raise NotImplementedError

@@ -73,9 +73,7 @@ class ScanFolderRecording(FileRecording):
     @property
     def warnings(self) -> tuple[str, ...]:
         """An assumed rate, how the stamps were mended, and times of points that could follow from their azimuth."""
-        assumed = None
-        if not (self._layout.from_clock or (self._point_time is not None and self._point_time.reference == "absolute")):
-            assumed = assumed_rate("The scans have no stamps", self._config)
+        assumed = assumed_rate("The scans have no stamps", self._config) if self._rate_is_assumed else None
         further = (assumed, self._azimuth.warning)
         return (*self._layout.warnings, *(warning for warning in further if warning is not None))
 
@@ -124,6 +122,11 @@ class ScanFolderRecording(FileRecording):
         rate = scan_rate(self.stamps) if self._layout.from_clock else None
         period_s = None if rate is None else 1.0 / rate
         return learn_point_time(self._timed_clouds(), config.time_unit, config.time_reference, period_s)
+
+    @property
+    def _rate_is_assumed(self) -> bool:
+        model = self._point_time
+        return not (self._layout.from_clock or (model is not None and model.reference == "absolute"))
 
     @cached_property
     def _azimuth(self) -> AzimuthTiming:

@@ -139,6 +139,10 @@ class KittiOdometryRecording(FileRecording):
     def _truth_path(self) -> Path | None:
         return self._pose_file if (self._folder / "calib.txt").is_file() else None
 
+    @property
+    def _rate_is_assumed(self) -> bool:
+        return self._times is None
+
     def _notes(self) -> Iterator[str]:
         yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
         yield correction.NOTE

@@ -28,6 +28,7 @@ class OxtsPoses(NamedTuple):
     accuracy_m: FloatArray  # (N,) standard deviation of the position as the unit itself states it
     angular_velocities: FloatArray  # (N, 3) rad/s
     accelerations: FloatArray  # (N, 3) specific force, m/s^2
+    geodetic: FloatArray  # (N, 3) latitude and longitude in degrees, altitude in metres
 
 
 def read_oxts(folder: Path) -> OxtsPoses:
@@ -44,7 +45,8 @@ def read_oxts(folder: Path) -> OxtsPoses:
             raise InputError(f"{path}: expected {expected}, got {len(table)} lines; copy the file again")
     rows = np.concatenate(tables)
     accuracy_m = rows[:, _POSITION_ACCURACY_COLUMN]
-    return OxtsPoses(numbers, oxts_poses(rows), accuracy_m, rows[:, _ANGULAR_VELOCITIES], rows[:, _ACCELERATIONS])
+    velocities, accelerations = rows[:, _ANGULAR_VELOCITIES], rows[:, _ACCELERATIONS]
+    return OxtsPoses(numbers, oxts_poses(rows), accuracy_m, velocities, accelerations, rows[:, :3])
 
 
 def oxts_poses(rows: FloatArray) -> FloatArray:

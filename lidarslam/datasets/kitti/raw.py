@@ -95,6 +95,11 @@ class KittiRawRecording(FileRecording):
         T_lidar_imu = self._calibration("calib_imu_to_velo.txt")
         return usable_samples(self._oxts_stamps(oxts), oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
 
+    @property
+    def oxts(self) -> tuple[OxtsPoses, FloatArray] | None:
+        """The GPS/IMU unit's rows and their stamps (N,), NaN where there is none; None without the unit."""
+        return None if self._oxts is None else (self._oxts, self._oxts_stamps(self._oxts))
+
     def _oxts_stamps(self, oxts: OxtsPoses) -> FloatArray:
         """Stamps (N,) of the unit's poses on the clock of the scans, NaN where there is none.
 
@@ -129,6 +134,10 @@ class KittiRawRecording(FileRecording):
 
     def _point_time_model(self) -> PointTimeModel | None:
         return None if self._config.time_reference == "none" else AZIMUTH_TIME
+
+    @property
+    def _rate_is_assumed(self) -> bool:
+        return not self._timing.from_clock
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -178,7 +178,8 @@ class EvalioRecording:
 def _scan(measurement: Any) -> Scan:
     """The scan of a LidarMeasurement, whose stamp is the start of the sweep."""
     table = np.array(list(map(_POINT, measurement.points)), dtype=np.float64).reshape(-1, 5)
-    offsets = np.array(measurement.to_vec_stamps(), dtype=np.float64)
+    measured = table[:, :3].any(axis=1)  # evalio fills up its grid of rows and columns with zeros
+    table, offsets = table[measured], np.array(measurement.to_vec_stamps(), dtype=np.float64)[measured]
     known = len(offsets) and np.ptp(offsets) > 0.0
     return Scan.from_raw(
         table[:, :3], measurement.stamp.to_nsec() * 1e-9, offsets if known else None, table[:, 4], table[:, 3]

@@ -19,6 +19,11 @@ POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 CLOUD_TYPES = (POINT_CLOUD2_TYPE, *CUSTOM_MESSAGE_TYPES)
+# Packets of a sensor that can be decoded: a sweep in a message, a packet in a message.
+VELODYNE_SCAN_TYPE = "velodyne_msgs/msg/VelodyneScan"
+OUSTER_PACKET_TYPES = tuple(
+    f"{package}/msg/PacketMsg" for package in ("ouster_ros", "ouster_sensor_msgs", "ouster_msgs")
+)
 
 _LONGEST_FRAME_ID = 256
 # Up to the end of a header's frame; a shorter message is none.
@@ -65,13 +70,17 @@ def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
 
 
 def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCloud:
-    """Decode a message of one of the `CLOUD_TYPES`, by fixed definitions.
+    """Decode a message of one of the `CLOUD_TYPES`, or a sweep of packets, by fixed definitions.
 
     Those in the bag are not used: the definition of PointCloud2 has not changed, bags may lack definitions, and a
     damaged definition of some other topic must not matter.
     """
     if message.message_type in CUSTOM_MESSAGE_TYPES:
         return decode_custom_message(message.raw, ros2)
+    if message.message_type == VELODYNE_SCAN_TYPE:
+        from lidarslam.datasets.ros.velodyne_scan import decode_scan_message
+
+        return decode_scan_message(message.raw, ros2)
     cloud = cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE, ros2))
     return decode_point_cloud2(cloud, time_field)
 

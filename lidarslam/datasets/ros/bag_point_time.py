@@ -10,7 +10,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.ros.bag_message import BagMessage, StampSource
+from lidarslam.datasets.ros.bag_message import VELODYNE_SCAN_TYPE, BagMessage, StampSource
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import field_offsets
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
@@ -67,6 +67,8 @@ class BagPointTime:
             return None
         if self._topic.message_type in livox.CUSTOM_MESSAGE_TYPES:
             unit, reference = livox.TIME_UNIT, "absolute"  # as the message type defines
+        elif self._topic.message_type == VELODYNE_SCAN_TYPE:
+            unit, reference = "ns", "absolute"  # as they are decoded
         return learn_point_time(self._timed_clouds(), unit, reference, self._period_s)
 
     @cached_property

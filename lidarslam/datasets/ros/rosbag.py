@@ -17,12 +17,20 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
-from lidarslam.datasets.recording import Recording, RecordingInfo
+from lidarslam.datasets.packets.libraries import require
+from lidarslam.datasets.recording import Recording, RecordingInfo, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
-from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
+from lidarslam.datasets.ros.bag_message import (
+    OUSTER_PACKET_TYPES,
+    VELODYNE_SCAN_TYPE,
+    BagMessage,
+    StampSource,
+    find_stamp_source,
+)
 from lidarslam.datasets.ros.bag_point_time import BagPointTime
 from lidarslam.datasets.ros.bag_topics import choose_topic, one_part
+from lidarslam.datasets.ros.ouster_bag import OusterBag
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import timed_scan
 from lidarslam.datasets.times.stamp_order import in_stamp_order
@@ -42,8 +50,15 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
 
     Raises:
         InputError: the bag cannot be read, or it does not hold the one point cloud topic that is asked for.
+        ConfigError: the topic holds packets, and the library that decodes them is not installed.
     """
-    return BagRecording(source, config)
+    bag = BagFile(source)
+    topic = choose_topic(source, bag.topics, config.topic)
+    if topic.message_type in OUSTER_PACKET_TYPES:
+        return OusterBag(source, config, bag, topic)
+    if topic.message_type == VELODYNE_SCAN_TYPE:
+        require("velodyne_decoder", "packets of a Velodyne")
+    return BagRecording(source, config, bag, topic)
 
 
 class BagRecording:
@@ -54,11 +69,11 @@ class BagRecording:
 
     T_cam_lidar: FloatArray | None = None  # no camera
 
-    def __init__(self, source: Path, config: ReaderConfig) -> None:
+    def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
         self._source = source
         self._config = config
-        self._bag = BagFile(source)
-        self._topic = choose_topic(source, self._bag.topics, config.topic)
+        self._bag = bag
+        self._topic = topic
         folders = [source, source.resolve().parent] if source.is_dir() else [source.parent]
         self._truth_file = find_truth_file(folders, self.name)
 
@@ -66,6 +81,11 @@ class BagRecording:
     def name(self) -> str:
         """The folder's name, or the file's without its suffix."""
         return self._source.resolve().name if self._source.is_dir() else self._source.stem
+
+    @property
+    def frames(self) -> tuple[BagFile, str]:
+        """The bag, and the frame of its clouds."""
+        return self._bag, self._frame_id
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:

@@ -1,5 +1,8 @@
 """evalio's own readers over files written in the layouts of Hilti 2022, Newer College 2021 and Oxford Spires."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -237,11 +240,71 @@ def test_a_bag_cut_short_ends_the_scans(hilti: SimpleNamespace, monkeypatch: pyt
 
 
 def test_without_evalio_the_extra_is_named(evalio_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
     monkeypatch.setitem(sys.modules, "evalio", None)
     (evalio_data / "hilti_2022" / "basement_2").mkdir(parents=True)
     with pytest.raises(InputError, match=r"evalio is not installed.*pip install 'lidarslam\[datasets\]'"):
         open_recording(Path("evalio:hilti_2022/basement_2"))
     with pytest.raises(InputError, match=r"is not downloaded: evalio dl .*pip install 'lidarslam\[datasets\]'"):
         open_recording(Path("evalio:hilti_2022/basement_3"))
+
+
+_OWN_DATA_SET = """
+from enum import auto
+import numpy as np
+from evalio.datasets import Dataset, RawDataIter
+from evalio.types import SE3, SO3, Duration, ImuMeasurement, ImuParams, LidarMeasurement, LidarParams, Point, Stamp
+
+class MyRig(Dataset):
+    loop = auto()
+
+    def data_iter(self):
+        numbers = np.load(self.folder / "points.npy")
+        scans = (
+            LidarMeasurement(
+                Stamp(sec=100 + k, nsec=0),
+                [Point(x=x, y=y, z=z, intensity=7.0, t=Duration.from_nsec(0), row=3, col=i)
+                 for i, (x, y, z) in enumerate(numbers)],
+            )
+            for k in range(2)
+        )
+        samples = (ImuMeasurement(Stamp(sec=100, nsec=k), np.ones(3), np.zeros(3)) for k in range(3))
+        return RawDataIter(scans, samples, 2)
+
+    def imu_T_lidar(self):
+        return SE3.identity()
+
+    def imu_T_gt(self):
+        return SE3.identity()
+
+    def imu_params(self):
+        return ImuParams(gravity=np.zeros(3))
+
+    def lidar_params(self):
+        return LidarParams(num_rows=16, num_columns=100, min_range=0.1, max_range=50.0, rate=1.0)
+
+    def files(self):
+        return ["points.npy"]
+"""
+
+
+def test_a_data_set_of_the_user(evalio_data: Path, tmp_path: Path) -> None:
+    """A class of evalio's in a module that EVALIO_CUSTOM lists; points without times, no truth, no usable IMU."""
+    folder = evalio_data / "my_rig" / "loop"
+    folder.mkdir(parents=True)
+    np.save(folder / "points.npy", np.arange(30.0).reshape(10, 3) + 1.0)
+    (tmp_path / "my_rig_data.py").write_text(_OWN_DATA_SET)
+    code = (
+        "import lidarslam\n"
+        "from lidarslam.datasets.registry import open_recording\n"
+        "from pathlib import Path\n"
+        "recording = open_recording(Path('evalio:my_rig/loop'))\n"
+        "scans = list(recording.scans())\n"
+        "print(len(scans), scans[1].stamp, len(scans[1]), scans[1].time_offsets, set(scans[1].rings.tolist()))\n"
+        "print(recording.ground_truth, recording.imu, recording.describe().rate_hz)\n"
+    )
+    environment = {**os.environ, "EVALIO_CUSTOM": "my_rig_data", "EVALIO_DATA": str(evalio_data)}
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.stdout.splitlines() == ["2 101.0 10 None {3}", "None None 1.0"], done.stderr

@@ -16,7 +16,7 @@ from lidarslam.commands.shared.terminal import say
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; docs/data_sets.md describes the keys.")
 def datasets(arguments: tuple[str, ...], as_json: bool) -> None:
     """List published data sets, or say more about one; which are on disk, in folders too."""
-    from lidarslam.datasets import catalogue_text as text
+    from lidarslam.commands.shared import catalogue_text as text
 
     chosen, folders = text.choose(arguments)
     on_disk = text.find_on_disk(folders)

@@ -20,13 +20,13 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
+from lidarslam.api.exports import ros_messages as ros
+from lidarslam.api.exports.run_scans import RunScans
 from lidarslam.core.files import cannot_write, make_directory
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes, Scan
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.pipeline.estimates import SweepMotion
-from lidarslam.storage.exports import ros_messages as ros
-from lidarslam.storage.exports.run_scans import RunScans
 from lidarslam.storage.finished_run import load_map
 
 # REP 105.

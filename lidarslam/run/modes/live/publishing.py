@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, adjoint, inverse
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import Localised
-from lidarslam.run.live.messages import serialize_odometry, serialize_transform
+from lidarslam.run.modes.live.messages import serialize_odometry, serialize_transform
 
 Publish = Callable[[bytes], None]
 

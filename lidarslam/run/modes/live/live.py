@@ -12,13 +12,13 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.interruption import Interruptions
-from lidarslam.run.live.clouds import CloudDecoder
-from lidarslam.run.live.discovery import find_topic
-from lidarslam.run.live.incoming import IncomingQueue
-from lidarslam.run.live.request import LiveRequest
-from lidarslam.run.live.session import LiveSession, warm_up
-from lidarslam.run.live.statistics import LiveCounts
 from lidarslam.run.loop_closing import begin_graph, close_loops
+from lidarslam.run.modes.live.clouds import CloudDecoder
+from lidarslam.run.modes.live.discovery import find_topic
+from lidarslam.run.modes.live.incoming import IncomingQueue
+from lidarslam.run.modes.live.request import LiveRequest
+from lidarslam.run.modes.live.session import LiveSession, warm_up
+from lidarslam.run.modes.live.statistics import LiveCounts
 from lidarslam.run.results import RunOutcome, final_map, write_results
 from lidarslam.run.run import open_odometry, require_scans_only, viewing
 from lidarslam.run.scan_log import ScanLog
@@ -27,8 +27,8 @@ from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
-    from lidarslam.run.live.dds import DdsNode
-    from lidarslam.run.live.following import Follower
+    from lidarslam.run.modes.live.dds import DdsNode
+    from lidarslam.run.modes.live.following import Follower
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
 
 
 def _follower(request: LiveRequest, node: "DdsNode", session: LiveSession, decoder: CloudDecoder) -> "Follower":
-    from lidarslam.run.live.following import Follower  # loads cyclonedds
+    from lidarslam.run.modes.live.following import Follower  # loads cyclonedds
 
     return Follower(request, node, session, decoder)
 
@@ -115,7 +115,7 @@ def _open_node(domain: int) -> "DdsNode":
         InputError: the library cannot join the domain.
     """
     try:
-        from lidarslam.run.live.dds import open_node
+        from lidarslam.run.modes.live.dds import open_node
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error.name} is not installed, which live needs; pip install 'lidarslam[live]'") from error
     return open_node(domain)

@@ -13,11 +13,12 @@ from lidarslam.core.trajectory_io import format_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
+from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.run.interruption import Interruptions
-from lidarslam.run.localise.placed_viewer import PlacedViewer
-from lidarslam.run.localise.request import LocaliseRequest, read_map
+from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
+from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
 from lidarslam.run.request import log_choices
 from lidarslam.run.results import DrawnMap, RunOutcome, write_results
 from lidarslam.run.run import open_odometry, require_apart, viewing
@@ -155,6 +156,9 @@ def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
             poses[number] = T_map_lidar
     log.correct(poses)
     log.mark([number for number in localiser.placed_afterwards if number in scans], Status.DEGRADED, _AFTERWARDS)
+    for found in localiser.found:
+        waited = range(found.scan, found.confirmed)
+        log.mark([number for number in waited if log.messages[number].endswith(NOT_CONFIRMED)], Status.OK, "")
     log.mark([number for number in localiser.unconfirmed() if number in scans], Status.LOST, _REVOKED)
 
 

@@ -65,12 +65,11 @@ def _only(clouds: list[P]) -> P:
 
 
 def _what_is_seen(wanted: str | None, clouds: Iterable[Published], topics: int, domain: int) -> str:
-    sought = "clouds are" if wanted is None else f"{wanted} is"
     names = ", ".join(topic.name for topic in clouds)
     if names:
         seen = f"clouds are published on {names}"
     elif topics:
-        seen = f"{topics} topics are seen, none of them clouds"
+        seen = f"{topics} topics are published, none of them with clouds"
     else:
-        seen = "no publisher of ROS 2 is seen at all: compare ROS_DOMAIN_ID, and the network interface"
-    return f"{sought} not published in domain {domain} yet, waiting on; {seen}"
+        seen = "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
+    return f"waiting for {wanted or 'clouds'} in domain {domain}; {seen}"

@@ -12,8 +12,8 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
-from lidarslam.run.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
-from lidarslam.run.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.modes.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
+from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry

@@ -22,8 +22,8 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
 from lidarslam.core.errors import InputError
-from lidarslam.run.live.incoming import Received
-from lidarslam.run.live.messages import message_types
+from lidarslam.run.modes.live.incoming import Received
+from lidarslam.run.modes.live.messages import message_types
 
 # A cloud of 3 MB arrives as a burst of datagrams that the default buffer, 1 MB, does not hold; the kernel grants up to
 # net.core.rmem_max.
@@ -77,15 +77,13 @@ class DdsNode:
 
     def subscribe(self, topic: PublishedTopic, is_kept: bool = False) -> "Subscription":
         """Receive a topic; of a kept one, such as /tf_static, what was published before too."""
-        # Definitions of others may name the members differently; the order and the types are ROS's.
-        consistency = Policy.TypeConsistency.AllowTypeCoercion(ignore_member_names=True)
-        qos = _qos(topic.is_reliable, _durability(is_kept), consistency)
+        qos = _qos(topic.is_reliable, is_kept)
         return Subscription(self._participant, DataReader(self._participant, self._topic(topic), qos))
 
     def publisher(self, name: str, message_type: str, is_kept: bool = False) -> "Publisher":
         """Publish a topic, reliably, as ROS does odometry and /tf; a kept one to those too who subscribe later."""
         topic = self._topic(PublishedTopic(name, message_type, True))
-        return Publisher(DataWriter(self._participant, topic, _qos(True, _durability(is_kept))))
+        return Publisher(DataWriter(self._participant, topic, _qos(True, is_kept)))
 
     def _topic(self, topic: PublishedTopic) -> Any:
         return Topic(self._participant, f"rt{topic.name}", _struct(topic.message_type))
@@ -129,22 +127,18 @@ def open_node(domain: int) -> DdsNode:
         return DdsNode(domain)
     except DDSException as error:
         raise InputError(
-            f"DDS domain {domain} cannot be joined ({error}); CYCLONEDDS_URI and the network interface?"
+            f"DDS domain {domain} cannot be joined; CYCLONEDDS_URI has to name a network interface that is there"
         ) from error
 
 
-def _qos(is_reliable: bool, *more: Any) -> Any:
+def _qos(is_reliable: bool, is_kept: bool) -> Any:
     reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
     return Qos(
         reliable if is_reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if is_kept else Policy.Durability.Volatile,
         Policy.History.KeepLast(_DEPTH),
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        *more,
     )
-
-
-def _durability(is_kept: bool) -> Any:
-    return Policy.Durability.TransientLocal if is_kept else Policy.Durability.Volatile
 
 
 def _is_reliable(qos: Any) -> bool:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarslam.api.exports.grid_files import write_grid
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.mapping.products.occupancy_grid import FREE, OCCUPIED, GridOptions, occupancy_grid
-from lidarslam.storage.exports.grid_files import write_grid
 from lidarslam.storage.finished_run import load_map, read_summary, read_trajectory
 
 _FINEST_M = 0.05

@@ -73,12 +73,12 @@ class LiveCounts:
         if self.missing:
             found.append(
                 f"{count(self.missing, 'scan')} missing between the stamps of those received: the network or the"
-                " publisher lost them, see docs/live.md on receive buffers"
+                " publisher lost them; net.core.rmem_max bounds what the network may hold"
             )
         if self.dropped:
             found.append(
-                f"{count(self.dropped, 'scan')} dropped: registration was slower than the sensor; use"
-                " --odometry constant-velocity or a coarser configuration"
+                f"{count(self.dropped, 'scan')} dropped: registration was slower than the sensor; leave it more of the"
+                " processor, take --odometry constant-velocity, or turn the sensor's resolution down"
             )
         return found
 
@@ -125,12 +125,16 @@ class LiveStatistics:
 
 
 def count_missing(stamps: FloatArray) -> int:
-    """How many scans have room in the gaps between stamps (N,), seconds, by their median interval."""
+    """How many scans have room in the gaps between stamps (N,), seconds, by their median interval.
+
+    No more than have room in the whole time: a stamp that is late by an interval is followed by a shorter one.
+    """
     steps = np.diff(np.unique(stamps))
     if not len(steps):
         return 0
     intervals = steps / np.median(steps)
-    return int(np.round(intervals[intervals > _GAP_INTERVALS] - 1.0).sum())
+    in_gaps = np.round(intervals[intervals > _GAP_INTERVALS] - 1.0).sum()
+    return int(min(in_gaps, max(0.0, np.round(intervals.sum()) - len(intervals))))
 
 
 def _rate(arrivals: FloatArray) -> float:

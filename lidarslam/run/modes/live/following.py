@@ -11,19 +11,26 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.ros.bag_message import read_header
-from lidarslam.run.live.clouds import CloudDecoder
-from lidarslam.run.live.dds import DdsNode, PublishedTopic
-from lidarslam.run.live.incoming import Arrived, IncomingQueue
-from lidarslam.run.live.messages import ODOMETRY_TYPE, TRANSFORMS_TYPE, read_transforms
-from lidarslam.run.live.publishing import PosePublisher, chain
-from lidarslam.run.live.request import LiveRequest
-from lidarslam.run.live.session import LiveSession
-from lidarslam.run.live.statistics import LiveCounts, LiveStatistics
+from lidarslam.run.modes.live.clouds import CloudDecoder
+from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
+from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
+from lidarslam.run.modes.live.messages import ODOMETRY_TYPE, TRANSFORMS_TYPE, read_transforms
+from lidarslam.run.modes.live.publishing import PosePublisher, chain
+from lidarslam.run.modes.live.request import LiveRequest
+from lidarslam.run.modes.live.session import LiveSession
+from lidarslam.run.modes.live.statistics import LiveCounts, LiveStatistics
 
 logger = logging.getLogger(__name__)
 
 ODOMETRY_TOPIC, TF_TOPIC, TF_STATIC_TOPIC = "/lidarslam/odometry", "/tf", "/tf_static"
 _POLL_S, _SHOWN_EVERY_S = 0.2, 1.0
+# Reports without a message after which the user is told.
+_SILENT = 5
+_SILENCE = "no scan came for some seconds; waiting on, Ctrl-C ends the run and writes its results"
+_NOTHING = (
+    "the topic is published, but nothing comes; waiting on. Publisher and this program may see each other without being"
+    " able to reach each other (firewall, container, network interface), or the publisher is idle"
+)
 # A static transform is sent again to whoever subscribes; discovery of its publisher takes a while.
 _STATIC_WITHIN_S = 5.0
 
@@ -47,7 +54,7 @@ class Follower:
         if request.base_frame is not None:
             self._static = node.subscribe(PublishedTopic(TF_STATIC_TOPIC, TRANSFORMS_TYPE, True), is_kept=True)
         self._poses: PosePublisher | None = None
-        self._is_silent = False
+        self._received = self._silent = 0  # messages until the last report, and reports without any more
 
     def follow(self, incoming: IncomingQueue, show: Callable[[str], None]) -> tuple[LiveCounts, bool]:
         """Register what comes, until the request or Ctrl-C ends it; what waits then is registered too.
@@ -70,12 +77,12 @@ class Follower:
         return self._statistics.counts(incoming.dropped), is_interrupted
 
     def _report(self, counts: LiveCounts, show: Callable[[str], None]) -> None:
-        """Show the counts; that nothing comes any more is logged, once."""
+        """Show the counts; that nothing comes, or nothing more, is logged, once each time."""
         show(counts.line())
-        is_silent = bool(counts.received) and counts.rate_hz == 0.0
-        if is_silent and not self._is_silent:
-            logger.warning("no scan came for some seconds; waiting on, Ctrl-C ends the run and writes its results")
-        self._is_silent = is_silent
+        self._silent = self._silent + 1 if counts.received == self._received else 0
+        self._received = counts.received
+        if self._silent == _SILENT:
+            logger.warning(_SILENCE if counts.received else _NOTHING)
 
     def on_arrival(self, message: Arrived) -> None:
         """Count a message."""

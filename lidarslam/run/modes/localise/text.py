@@ -4,8 +4,8 @@ import shlex
 from collections.abc import Iterator
 
 from lidarslam.core.plain_text import as_typed, count, scan_span
-from lidarslam.run.localise.localise import LocaliseOutcome
-from lidarslam.run.localise.request import LocaliseRequest
+from lidarslam.run.modes.localise.localise import LocaliseOutcome
+from lidarslam.run.modes.localise.request import LocaliseRequest
 from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
 
 # Stretches of lost scans that are listed; summary.json has them all.
