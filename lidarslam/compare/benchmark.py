@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from lidarslam.compare.methods import Method, parse_method
+from lidarslam.compare.methods.names import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-from lidarslam.compare.method_run import COMMAND, finished_before, run_method
+from lidarslam.compare.methods.run import COMMAND, finished_before, run_method
 from lidarslam.compare.metrics import measure
 from lidarslam.compare.plan import REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
 from lidarslam.compare.request import CompareRequest

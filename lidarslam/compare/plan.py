@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidarslam.compare.method_run import PROCESS
+from lidarslam.compare.methods.run import PROCESS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lidarslam.compare.methods import parse_method, parse_methods
+from lidarslam.compare.methods.names import parse_method, parse_methods
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError
 

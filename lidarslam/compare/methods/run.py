@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarslam.compare.method_ending import judge
-from lidarslam.compare.method_process import encode
+from lidarslam.compare.methods.ending import judge
+from lidarslam.compare.methods.process import encode
 from lidarslam.compare.supervised import Limits, supervise
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
@@ -23,9 +23,9 @@ from lidarslam.viewer.page.run_result import with_run
 PROCESS, LOG = "process.json", "process.log"
 _RECORDED = ("status", "message", "wall_s", "peak_rss_mb")
 
-COMMAND = (sys.executable, "-m", "lidarslam.compare.method_process")
+COMMAND = (sys.executable, "-m", "lidarslam.compare.methods.process")
 # The process starts here, so that no package in the user's folder is found first.
-_ROOT = Path(__file__).resolve().parents[2]
+_ROOT = Path(__file__).resolve().parents[3]
 
 
 def run_method(
