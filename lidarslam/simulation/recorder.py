@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.casting.caster import Caster, Hits
 from lidarslam.simulation.casting.mesh import first_ground_triangle
 from lidarslam.simulation.motion.motions import Motion
+from lidarslam.simulation.sensors.imu import MEMS_IMU, ImuModel, sample_imu
 from lidarslam.simulation.sensors.noise import bloom, intensities, measure, ranges_in_grass, reflectivity
 from lidarslam.simulation.sensors.scan_patterns import Rays
 from lidarslam.simulation.sensors.sensor import Sensor
@@ -61,6 +63,7 @@ class Simulation:
     T_body_lidar: FloatArray  # (4, 4) how the sensor is mounted
     scan_count: int
     seed: int = 0  # of the noise
+    imu_model: ImuModel = MEMS_IMU
 
     @property
     def name(self) -> str:
@@ -80,6 +83,12 @@ class Simulation:
     def ground_truth_at(self, stamps: FloatArray) -> Trajectory:
         """T_world_lidar at increasing stamps (N,), exact."""
         return Trajectory(stamps, self.T_world_lidar_at(stamps))
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """The samples of the IMU on the LiDAR, from the first sweep's start to the last one's end."""
+        last_s = self.scan_count / self.sensor.rate_hz
+        return sample_imu(self.imu_model, self.T_world_lidar_at, 0.0, last_s, self.seed)
 
     def T_world_lidar_at(self, times: FloatArray) -> FloatArray:
         """(N, 4, 4) at times (N,) in seconds, exact."""
