@@ -44,6 +44,10 @@ CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}}
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
     "kiss_icp": ("lidarslam.odometry.methods.kiss*",),
+    "evalio": ("lidarslam.compare.peers.evalio_pipelines", "lidarslam.api.evalio_pipeline"),
+    "kiss_slam": ("lidarslam.compare.peers.kiss_slam",),
+    "rko_lio": ("lidarslam.compare.peers.rko_lio",),
+    "small_gicp": ("lidarslam.compare.peers.small_gicp",),
     "gtsam": ("lidarslam.mapping.pose_graph.optimizer",),
     "rerun": ("lidarslam.viewer.rerun_*",),
     "click": ("lidarslam.cli", "lidarslam.commands.*"),

@@ -191,6 +191,7 @@ def _method(method: str | BenchmarkMethod) -> Method:
     try:
         if isinstance(method, str):
             return parse_method(method)
-        return Method(method.name, (*parse_method(method.method).settings, *method.set))
+        named = parse_method(method.method)
+        return replace(named, name=method.name, settings=(*named.settings, *method.set))
     except ConfigError as error:
         raise ConfigError(f"{error}; the benchmark's methods can be replaced with --methods") from None

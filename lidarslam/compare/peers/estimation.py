@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.compare.peers.interface import Estimator, PeerError, Poses, Sweep
 from lidarslam.compare.peers.registry import Peer
-from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
+from lidarslam.core.geometry import FloatArray, orthonormalize
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
@@ -17,6 +18,8 @@ from lidarslam.core.trajectory import Trajectory
 _MIN_POINTS = 10
 # Poses are extrapolated to stamps so far outside their instants: the most of a sweep's duration.
 _EXTRAPOLATION_S = 0.25
+# Poses farther apart than this, and than so many of their usual steps, are not interpolated.
+_LONGEST_GAP_S, _LONGEST_GAP_STEPS = 1.0, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +28,6 @@ class Estimate:
 
     trajectory: Trajectory  # at the stamps of the scans that its poses cover
     register_ms: dict[float, float]  # stamp -> wall time of the registration of that scan
-    uncovered: int  # number of scans before its first pose or after its last
 
 
 def estimate(
@@ -42,21 +44,58 @@ def estimate(
     Raises:
         PeerError: it cannot run, or has no usable poses.
     """
-    peer.require(imu is not None)
-    imu = imu if peer.needs_imu else None
+    peer.require(lambda: imu is not None)
+    samples = imu if peer.needs_imu else None
     estimator: Estimator | None = None
-    stamps, register_ms, taken, count = [], {}, 0, 0
-    for count, scan in enumerate(scans, start=1):
+    stamps: list[float] = []
+    register_ms: dict[float, float] = {}
+    taken = 0
+    for scan in scans:
         stamps.append(scan.stamp)
         if len(scan) >= _MIN_POINTS:
-            sweep = Sweep.of(count - 1, scan)
-            estimator = estimator or peer.make(sweep, imu)
-            started, taken = _take_imu(estimator, imu, taken, sweep.end)
+            sweep = Sweep.of(scan)
+            estimator = estimator or peer.make(sweep, samples)
             register = estimator.load(sweep)
-            begun = time.perf_counter()
+            started = time.perf_counter()
+            taken = _take_imu(estimator, samples, taken, sweep.end)
             register()
-            register_ms[scan.stamp] = 1e3 * (time.perf_counter() - begun + started)
-        progress(count)
+            register_ms[scan.stamp] = 1e3 * (time.perf_counter() - started)
+        progress(len(stamps))
     if estimator is None:
-        raise PeerError(f"{peer.name}: none of the {count} scans has {_MIN_POINTS} points")
-    return Estimate(*_at_stamps(peer.name, estimator.finish(), np.array(stamps)), register_ms, 0)
+        raise PeerError(f"none of the {len(stamps)} scans has {_MIN_POINTS} points")
+    return Estimate(_at_stamps(estimator.finish(), np.array(stamps)), register_ms)
+
+
+def _take_imu(estimator: Estimator, samples: ImuSamples | None, taken: int, until: float) -> int:
+    """Hand on the samples up to an instant, from number `taken` on; the number of the next one."""
+    if samples is None:
+        return 0
+    end = int(np.searchsorted(samples.stamps, until, side="right"))
+    for number in range(taken, end):
+        estimator.add_imu(samples, number)
+    return max(taken, end)
+
+
+def _at_stamps(poses: Poses, stamps: FloatArray) -> Trajectory:
+    """The trajectory at those stamps that the poses cover.
+
+    Raises:
+        PeerError: there are fewer than two poses, or they are no rigid motions.
+    """
+    instants, T_world_lidar = poses.instants, poses.T_world_lidar
+    if not np.isfinite(T_world_lidar).all():
+        raise PeerError(f"some of its {len(instants)} poses are not finite")
+    T_world_lidar = orthonormalize(T_world_lidar)
+    if len(instants) < 2:
+        raise PeerError(f"has {len(instants)} poses for {len(stamps)} scans, and two or more are needed")
+    covered = stamps[is_covered(instants, stamps)]
+    return Trajectory(covered, Trajectory(instants, T_world_lidar).at(covered, _EXTRAPOLATION_S))
+
+
+def is_covered(instants: FloatArray, stamps: FloatArray) -> NDArray[np.bool_]:
+    """Which stamps (N,) have a pose: none within a gap between instants (M,), or far outside them."""
+    steps = np.diff(instants)
+    left = np.clip(np.searchsorted(instants, stamps, side="right") - 1, 0, len(steps) - 1)
+    outside_s = np.maximum(instants[0] - stamps, stamps - instants[-1])
+    longest_s = max(_LONGEST_GAP_S, _LONGEST_GAP_STEPS * float(np.median(steps)))
+    return np.asarray((steps[left] <= longest_s) & (outside_s <= _EXTRAPOLATION_S))

@@ -7,7 +7,7 @@ cell for each shot; pipelines that look for features along the rings are given t
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,9 @@ class Pipeline:
     name: str  # of the class in `evalio.pipelines`
     parameters: Parameters = field(default_factory=dict)  # changes to its defaults
     compensated: Parameters = field(default_factory=dict)  # further ones for scans that are motion compensated
-    is_elastic: bool = False  # whether it estimates the motion during the sweep, as CT-ICP does
+    # middle: a pose belongs to the middle of its sweep; before: to that of the sweep registered before it; elastic: as
+    # in `elastic_instants`
+    instants: Literal["middle", "before", "elastic"] = "middle"
     by_rings: bool = False  # whether it looks for features along the rings
 
 
@@ -43,11 +45,11 @@ PIPELINES = {
         "CTICP",
         {"ls_num_threads": os.cpu_count() or 1},
         {"motion_compensation": "NONE", "distance": "POINT_TO_PLANE", "point_to_plane_with_distortion": False},
-        is_elastic=True,
+        instants="elastic",
     ),
     "loam-evalio": Pipeline("LOAM", by_rings=True),
     "form": Pipeline("FORM", by_rings=True),
-    "lio-sam": Pipeline("LioSAM", by_rings=True),
+    "lio-sam": Pipeline("LioSAM", instants="before", by_rings=True),
     "dlio": Pipeline("DLIO"),
 }
 
@@ -103,18 +105,24 @@ class EvalioEstimator:
 
     def finish(self) -> Poses:
         """The poses at their instants; CT-ICP on compensated scans is a scan behind, and registers the last again."""
-        sweeps = self._sweeps
-        if self._pipeline.is_elastic and sweeps[0].is_compensated:
-            self.load(sweeps[-1])()
-        poses = np.array([pose for _, pose in self._saved]).reshape(-1, 4, 4)
+        sweeps, how = self._sweeps, self._pipeline.instants
         starts, middles, ends = np.array([(sweep.start, sweep.middle, sweep.end) for sweep in sweeps]).T
-        if self._pipeline.is_elastic:
+        if how == "elastic" and sweeps[0].is_compensated:
+            self.load(sweeps[-1])()
+        poses = np.array([pose for _, pose in self._saved]).reshape(-1, 4, 4) @ inverse(self._T_lidar_imu)
+        if how == "elastic":
             rows, instants = elastic_instants(starts, middles, ends)
-        else:
-            stamps = np.array([stamp for stamp, _ in self._saved])
-            nearest = np.clip(np.searchsorted(0.5 * (starts[1:] + starts[:-1]), stamps), 0, len(starts) - 1)
-            rows, instants = np.arange(len(poses)), middles[nearest]
-        return Poses(instants, poses[rows] @ inverse(self._T_lidar_imu))
+            return Poses(instants, poses[rows])
+        rows = _fresh(poses)
+        stamps = np.array([stamp for stamp, _ in self._saved])[rows]
+        instants = middles[np.searchsorted(0.5 * (starts[1:] + starts[:-1]), stamps)]
+        return Poses(instants, poses[rows]) if how == "middle" else Poses(instants[:-1], poses[rows[1:]])
+
+
+def _fresh(poses: FloatArray) -> NDArray[np.intp]:
+    """The poses that are not the one before once more, as with a sweep that was passed over or came too early."""
+    repeated = (np.diff(poses, axis=0) == 0.0).all(axis=(1, 2))
+    return np.flatnonzero(np.concatenate([[True], ~repeated]))
 
 
 def elastic_instants(starts: FloatArray, middles: FloatArray, ends: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:

@@ -21,22 +21,17 @@ class PeerError(LidarSlamError):
 class Sweep:
     """One scan as a peer takes it, with the instants of its first and last point."""
 
-    number: int  # from 0
     scan: Scan
     start: float  # seconds; the stamp where the points have no times, which counts as motion compensated
     end: float
 
     @classmethod
-    def of(cls, number: int, scan: Scan) -> "Sweep":
+    def of(cls, scan: Scan) -> "Sweep":
         """The sweep of a scan with points."""
         if scan.time_offsets is None:
-            return cls(number, scan, scan.stamp, scan.stamp)
-        return cls(
-            number,
-            scan,
-            scan.stamp + float(scan.time_offsets.min()),
-            scan.stamp + float(scan.time_offsets.max()),
-        )
+            return cls(scan, scan.stamp, scan.stamp)
+        first, last = float(scan.time_offsets.min()), float(scan.time_offsets.max())
+        return cls(scan, scan.stamp + first, scan.stamp + last)
 
     @property
     def middle(self) -> float:

@@ -31,16 +31,16 @@ class Peer:
         """Package and version, such as `evalio 0.6.1`."""
         return f"{self.package} {version(self.package)}"
 
-    def require(self, has_imu: bool) -> None:
+    def require(self, has_imu: Callable[[], bool]) -> None:
         """Refuse where it cannot run.
 
         Raises:
             PeerError: its library is not installed, or it needs an IMU and there is none.
         """
         if not self.is_installed:
-            raise PeerError(f"{self.name} runs with {self.package}, which is not installed: {EXTRA}")
-        if self.needs_imu and not has_imu:
-            raise PeerError(f"{self.name} needs an IMU, and the recording has none")
+            raise PeerError(f"runs with {self.package}, which is not installed: {EXTRA}")
+        if self.needs_imu and not has_imu():
+            raise PeerError("needs an IMU, and the recording has none")
 
 
 def _evalio(name: str) -> Callable[[Sweep, ImuSamples | None], Estimator]:

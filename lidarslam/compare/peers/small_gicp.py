@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from lidarslam.compare.peers.interface import Poses, Sweep
-from lidarslam.core.geometry import inverse
 from lidarslam.core.imu import ImuSamples
 
 _DOWNSAMPLING_M, _VOXEL_M = 0.25, 1.0
@@ -44,7 +43,8 @@ class SmallGicpEstimator:
             before, last = self._poses[-2:]
             pose = last
             if self._map.size():
-                predicted = last @ inverse(before) @ last
+                # The library's poses are not exactly rigid.
+                predicted = last @ np.linalg.inv(before) @ last
                 pose = small_gicp.align(self._map, cloud, predicted, num_threads=self._threads).T_target_source
             self._map.insert(cloud, pose)
             self._poses.append(pose)
