@@ -1,4 +1,4 @@
-"""Peers of `lidarslam compare` on scans in memory, for benchmarks; each run is a process of its own, as it may abort."""
+"""Peers of `lidarslam compare` on scans in memory, for benchmarks; each run is a process of its own."""
 
 import multiprocessing
 from collections.abc import Iterable, Sequence

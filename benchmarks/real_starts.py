@@ -30,8 +30,8 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from peers import NAMES, PeerError, run_peer
 from mapping_accuracy import print_row
+from peers import NAMES, PeerError, run_peer
 
 from lidarslam.cli import main as lidarslam
 from lidarslam.core.trajectory import Trajectory

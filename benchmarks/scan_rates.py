@@ -20,7 +20,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from peers import NAMES, PeerError, run_peer
 from mapping_accuracy import (
     DEFAULT_METHODS,
     METHODS,
@@ -32,6 +31,7 @@ from mapping_accuracy import (
     recordings,
     true_trajectory,
 )
+from peers import NAMES, PeerError, run_peer
 
 from lidarslam.core.geometry import rotation_angle
 from lidarslam.simulation.worlds.registry import WORLDS

@@ -136,7 +136,7 @@ def elastic_instants(starts: FloatArray, middles: FloatArray, ends: FloatArray) 
         starts, middles, ends: (N,) of the registered sweeps.
     """
     if bool((ends <= starts).all()):
-        return np.arange(1, len(starts)), starts[:-1]
+        return np.arange(1, len(starts) + 1), starts
     return np.delete(np.arange(len(starts)), 1), np.concatenate([middles[:1], starts[2:]])
 
 
