@@ -31,9 +31,10 @@ from pathlib import Path
 import numpy as np
 from click.testing import CliRunner
 from mapping_accuracy import print_row
-from peers import NAMES, PeerError, run_peer
+from peers import NAMES, run_peer
 
 from lidarslam.cli import main as lidarslam
+from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.recording import Recording

@@ -31,8 +31,9 @@ from mapping_accuracy import (
     recordings,
     true_trajectory,
 )
-from peers import NAMES, PeerError, run_peer
+from peers import NAMES, run_peer
 
+from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.geometry import rotation_angle
 from lidarslam.simulation.worlds.registry import WORLDS
 
