@@ -2,8 +2,8 @@
 
     python -m lidarslam.api.evalio_pipeline run -p lidarslam -d DATASET -o DIR
 
-This is evalio's command line with the pipeline; `evalio -M lidarslam.api.evalio_pipeline run ...` is the same where no
-rerun-sdk newer than evalio knows stands in its way.
+This is evalio's command line with the pipeline. Where evalio loads beside the installed rerun-sdk,
+`EVALIO_CUSTOM=lidarslam.api.evalio_pipeline evalio run ...` is the same.
 """
 
 import logging
@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from evalio.pipelines import Pipeline
+from evalio.pipelines import Pipeline, register_pipeline
 from evalio.types import SE3, ImuMeasurement, ImuParams, LidarMeasurement, LidarParams, Point
 
 from lidarslam.api.slam import Slam
@@ -109,10 +109,9 @@ class LidarSlam(Pipeline):
 def main() -> None:
     """Run evalio's command line, which goes without Rerun: of rerun-sdk 0.41, evalio 0.6.1 fails to load."""
     sys.modules["rerun"] = None  # type: ignore[assignment]
+    register_pipeline(LidarSlam)  # before the command line, which lists the pipelines when it is loaded
     from evalio.cli import app
-    from evalio.pipelines import register_pipeline
 
-    register_pipeline(LidarSlam)
     app()
 
 

@@ -89,12 +89,12 @@ def test_evalio_runs_it_and_saves_the_imus_poses_at_the_starts_of_the_sweeps(
         starts.append(scan.stamp + first)
         times = scan.time_offsets - first
         np.savez(tmp_path / f"{index}.npz", points=scan.points, times=times, start=scan.stamp + first)
-    arguments = ["-M", "room_dataset", "run", "-d", "room/box", "-p", "lidarslam", "-o", "results"]
+    arguments = ["run", "-d", "room/box", "-p", "lidarslam", "-o", "results"]
     done = subprocess.run(
         [sys.executable, "-m", "lidarslam.api.evalio_pipeline", *arguments],
         cwd=tmp_path,
         env=os.environ
-        | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(REPOSITORY)]), "EVALIO_DATA": str(tmp_path)},
+        | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(REPOSITORY)]), "EVALIO_CUSTOM": "room_dataset"},
         capture_output=True,
         text=True,
         timeout=300,
