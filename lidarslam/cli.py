@@ -12,9 +12,16 @@ import click
 
 from lidarslam.commands.compare import compare
 from lidarslam.commands.config import config
+from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
+from lidarslam.commands.exports.bag import export_bag
+from lidarslam.commands.exports.geo import export_geo
+from lidarslam.commands.exports.grid import export_grid
+from lidarslam.commands.exports.mesh import export_mesh
 from lidarslam.commands.info import info
+from lidarslam.commands.live import live
+from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
 from lidarslam.commands.network.train import train
@@ -101,7 +108,26 @@ def main() -> None:
 main.params.append(verbose_option())
 
 
-for _command in (demo, info, run, merge, simulate, train, export, evaluate, view, compare, config):
+for _command in (
+    demo,
+    datasets,
+    info,
+    run,
+    live,
+    localise,
+    merge,
+    simulate,
+    train,
+    export,
+    evaluate,
+    view,
+    compare,
+    export_bag,
+    export_grid,
+    export_mesh,
+    export_geo,
+    config,
+):
     main.add_command(_command)
 
 

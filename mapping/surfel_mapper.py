@@ -53,16 +53,19 @@ class SurfelMapper(Stateful):
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
-        sampled = self._sampler.sample(scan)
+        return self.process_sampled(self._sampler.sample(scan), prior)
+
+    def process_sampled(self, scan: SampledScan, prior: Prior) -> MappedScan:
+        """Register the next scan, thinned already, and insert it."""
         velocity = np.zeros(6) if prior.velocity is None else prior.velocity
         last = self._last or MotionState(scan.stamp, np.eye(4), velocity, UNKNOWN_VELOCITY)
         first, self._first = self._first, None
         if self._map is None:
-            mapped = self._begin(sampled, prior, last)
-        elif first is not None and (prior.velocity is None or first.is_followed_by(sampled)):
-            mapped = self._track_second(sampled, prior, last, first, self._map)
+            mapped = self._begin(scan, prior, last)
+        elif first is not None and (prior.velocity is None or first.is_followed_by(scan)):
+            mapped = self._track_second(scan, prior, last, first, self._map)
         else:
-            mapped = self._track(sampled, prior, last, self._map)
+            mapped = self._track(scan, prior, last, self._map)
         self._last = mapped.state
         return mapped
 

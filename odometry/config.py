@@ -8,7 +8,7 @@ from typing_extensions import Self
 
 from lidarslam.core.limits import require_range_left
 
-OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "external"]
+OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
 NetworkName = Literal["correlation", "delora"]
 
 
@@ -49,9 +49,25 @@ class OdometryConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    method: OdometryName = Field("learned", description="learned, kiss-icp, constant-velocity or external (--prior)")
+    method: OdometryName = Field(
+        "learned", description="learned, kiss-icp, constant-velocity, imu, learned+imu or external (--prior)"
+    )
     learned: LearnedConfig = LearnedConfig()
     kiss_icp: KissConfig = KissConfig()
+    imu_rotation_deg: tuple[float, float, float] | None = Field(
+        None,
+        description="roll, pitch, yaw of the IMU in the LiDAR frame; null: the recording's, else found by its turns",
+    )
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the network runs."""
+        return self.method in ("learned", "learned+imu")
+
+    @property
+    def uses_imu(self) -> bool:
+        """Whether the recording needs an IMU."""
+        return self.method in ("imu", "learned+imu")
 
 
 class ImageConfig(BaseModel):

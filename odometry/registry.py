@@ -25,7 +25,7 @@ def make_odometry(config: OdometryConfig, prior: Trajectory | None = None) -> Od
         from lidarslam.odometry.methods.external import ExternalOdometry
 
         return ExternalOdometry(prior)
-    if config.method == "learned":
+    if config.is_learned:
         return _make_learned(config.learned)
     if config.method == "kiss-icp":
         from lidarslam.odometry.methods.kiss import KissOdometry

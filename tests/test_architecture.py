@@ -44,7 +44,6 @@ CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}}
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
     "kiss_icp": ("lidarslam.odometry.methods.kiss*",),
-    "evalio": ("lidarslam.compare.peers.evalio_pipelines", "lidarslam.api.evalio_pipeline"),
     "kiss_slam": ("lidarslam.compare.peers.kiss_slam",),
     "rko_lio": ("lidarslam.compare.peers.rko_lio",),
     "small_gicp": ("lidarslam.compare.peers.small_gicp",),
@@ -59,7 +58,22 @@ CONFINED = {
     "numba": ("lidarslam.core.compiled",),
     "onnx": ("lidarslam.odometry.network.export",),
     "onnxscript": ("lidarslam.odometry.network.export",),
-    "rosbags": ("lidarslam.datasets.*", "lidarslam.simulation.writers.*"),
+    "ouster": ("lidarslam.datasets.packets.ouster*",),
+    "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
+    "evalio": (
+        "lidarslam.api.evalio_pipeline",
+        "lidarslam.compare.peers.evalio_pipelines",
+        "lidarslam.datasets.published.evalio*",
+    ),
+    "pyarrow": ("lidarslam.datasets.published.argoverse2",),
+    "pyproj": ("lidarslam.storage.exports.projection",),
+    "rosbags": (
+        "lidarslam.datasets.*",
+        "lidarslam.simulation.writers.*",
+        "lidarslam.storage.exports.*",
+        "lidarslam.run.live.*",
+    ),
+    "cyclonedds": ("lidarslam.run.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES, MOST_ENTRIES = 250, 15

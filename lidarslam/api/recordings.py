@@ -67,7 +67,7 @@ def open(
     """Open a recording: anything that `lidarslam run` takes.
 
     Args:
-        source: a bag, a KITTI folder, or a folder of scans.
+        source: a bag, a folder of scans, a data set's folder, or evalio:DATASET/SEQUENCE.
         topic: point cloud topic of a bag that has several.
         sequence: sequence of a KITTI odometry root, such as "04".
         reader: name of the reader; None: the one that recognises the source.

@@ -19,7 +19,7 @@ from lidarslam.api.arrays import check_stamp, check_sweep, make_scan
 from lidarslam.api.registered_scan import RegisteredScan
 from lidarslam.api.saving import Built, python_names, save_run
 from lidarslam.config.settings import Config, make_config
-from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
+from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
@@ -31,7 +31,7 @@ from lidarslam.pipeline.estimates import Estimated, Localised
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.stages import Stages
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.run import open_odometry
+from lidarslam.run.run import open_odometry, require_scans_only
 from lidarslam.run.scan_log import ScanLog
 
 logger = logging.getLogger(__name__)
@@ -58,8 +58,7 @@ class Slam:
 
     def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
         self._config = make_config(config)
-        if self._config.odometry.method == "external":
-            raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
+        require_scans_only(self._config)
         with CompileAhead(parts_of(self._config)) as compiling, python_names():
             self._odometry = open_odometry(self._config, None)
             compiling.wait_for_all(logger.info)

@@ -6,6 +6,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from lidarslam.commands.shared.gates import gate_options
 from lidarslam.commands.shared.names import ShippedFile
 from lidarslam.commands.shared.options import (
     FILE,
@@ -18,7 +19,7 @@ from lidarslam.commands.shared.options import (
     reader_options,
     scan_options,
 )
-from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, say
+from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, say
 
 
 @click.command(
@@ -27,6 +28,7 @@ from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, say
     lidarslam compare KITTI --sequence 04 -o compared/04 --methods learned,learned+map,kiss-icp
     lidarslam compare office.mcap --methods learned+map,learned+loam
     lidarslam compare office.mcap --methods kiss-icp,prior --prior wheel_odometry.tum
+    lidarslam compare office.mcap --max learned+map:ate=0.1 --max lost=0
     lidarslam compare --benchmark kitti --data KITTI""",
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
@@ -49,6 +51,7 @@ from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, say
 @click.option("--memory-limit-mb", type=POSITIVE, help="Memory limit of a method.")
 @click.option("--timeout-s", type=POSITIVE, help="Time limit of a method.")
 @scan_options
+@gate_options(with_method=True)
 @click.option("--reuse", is_flag=True, help="Keep finished runs in DIR with the same settings.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier comparison in DIR.")
 @reader_options
@@ -60,7 +63,8 @@ def compare(
     """Compare several methods on one or more recordings in one report.
 
     Each method runs in a process of its own, one after another. A method that crashes or gets lost is a row of the
-    table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes the report so far.
+    table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes the report so far;
+    else 4 if a bound of --max or --min is not met.
     """
     from lidarslam.compare.command import run_compare
     from lidarslam.storage.default_places import source_name
@@ -78,5 +82,9 @@ def compare(
     if out is None:
         name = source_name(sources[0], options["sequence"]) if benchmark is None else benchmark.stem
         out = default_out("compared", name)
-    if not run_compare(say, note, sources=sources, benchmark=benchmark, out=out, **options):
+    gates = (*options.pop("maxima"), *options.pop("minima"))
+    ending = run_compare(say, note, sources=sources, benchmark=benchmark, out=out, gates=gates, **options)
+    if not ending.has_results:
         ctx.exit(EXIT_MENDABLE)
+    if not ending.gates_passed:
+        ctx.exit(EXIT_GATE)

@@ -5,8 +5,9 @@ from typing import Any
 
 import click
 
+from lidarslam.commands.shared.gates import gate_options
 from lidarslam.commands.shared.options import PATH, POSITIVE, CommandWithExample, latest_run
-from lidarslam.commands.shared.terminal import say
+from lidarslam.commands.shared.terminal import EXIT_GATE, say
 
 _SECONDS = click.FloatRange(min=0.0)
 
@@ -15,6 +16,7 @@ _SECONDS = click.FloatRange(min=0.0)
     cls=CommandWithExample,
     epilog="""lidarslam evaluate
     lidarslam evaluate runs/04
+    lidarslam evaluate runs/04 --max ate=0.1 --max lost=0
     lidarslam evaluate runs/site --reference-map survey.laz --errors errors.ply
     lidarslam evaluate kitti_00.txt --reference poses/00.txt""",
 )
@@ -69,16 +71,23 @@ _SECONDS = click.FloatRange(min=0.0)
 )
 @click.option("--evo", type=PATH, metavar="DIR", help="Save ATE and RPE for evo_res: RUN_ape.zip, RUN_rpe.zip.")
 @click.option("--report/--no-report", default=True, help="Draw the run's page with the errors.  [default: report]")
+@gate_options(with_method=False)
 @click.option("-o", "--out", type=PATH, metavar="FILE", help="File of the metrics.  [default: metrics.json of the run]")
-def evaluate(run: Path | None, **options: Any) -> None:
+@click.pass_context
+def evaluate(ctx: click.Context, /, run: Path | None, **options: Any) -> None:
     """Evaluate a trajectory and its map.
 
     RUN is a run directory, or a trajectory in TUM or KITTI text.  [default: the latest run in runs]
+
+    Exit status 4 if a bound of --max or --min is not met; everything is written then too.
     """
     from lidarslam.compare.assessment.evaluate import EvaluateRequest, evaluate
     from lidarslam.compare.assessment.map_evaluation import MapOptions
     from lidarslam.compare.assessment.text import format_evaluation
+    from lidarslam.evaluation.comparison.gates import format_gates, judge
+    from lidarslam.storage.finished_run import read_summary
 
+    gates = (*options.pop("maxima"), *options.pop("minima"))
     given = {name: value for name, value in options.items() if value is not None}
     if given.get("reference") and given["no_reference"]:
         raise click.UsageError("--reference and --no-reference exclude each other; choose one")
@@ -87,4 +96,12 @@ def evaluate(run: Path | None, **options: Any) -> None:
     request = EvaluateRequest(
         run or latest_run(), needs_reference=not given.pop("no_reference"), map_options=map_options, **given
     )
-    say(format_evaluation(evaluate(request)))
+    evaluation = evaluate(request)
+    say(format_evaluation(evaluation))
+    if gates:
+        directory = evaluation.estimate.run
+        summary = {} if directory is None else read_summary(directory)
+        judged = judge(gates, {"metrics": evaluation.to_json(), "summary": summary})
+        say(f"\n{format_gates(judged)}")
+        if not all(gate.passed for gate in judged):
+            ctx.exit(EXIT_GATE)

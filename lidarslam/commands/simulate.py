@@ -49,6 +49,7 @@ _FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 @click.option("--scans", type=click.IntRange(min=1), help="Number of scans.  [default: 300, or all of the trajectory]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
 @click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
+@click.option("--imu/--no-imu", default=False, show_default=True, help="Record an IMU of 200 Hz on the LiDAR too.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Simulate a recording, with the exact trajectory and the exact map."""

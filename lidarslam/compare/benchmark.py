@@ -13,6 +13,7 @@ from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.datasets.published.evalio_names import located
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 from lidarslam.evaluation.comparison.quantities import find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
@@ -180,7 +181,7 @@ def _located(entry: RecordingEntry, benchmark: Benchmark, data: Path | None, out
         reference = str(root / entry.reference)
     return replace(
         entry,
-        source=simulated if entry.source is None else root / entry.source,
+        source=simulated if entry.source is None else root / located(entry.source),
         prior=None if entry.prior is None else root / entry.prior,
         reference=reference,
         reference_map=reference_map or (simulated / REFERENCE_MAP if entry.source is None else None),

@@ -2,24 +2,34 @@
 
 import shlex
 import sys
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lidarslam.compare.benchmark import fill_request, load_benchmark, make_recordings, require_data
-from lidarslam.compare.comparison import Narrator, compare
+from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
 from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import reader_settings
 from lidarslam.core.errors import ConfigError
+from lidarslam.evaluation.comparison.gates import Gate, format_gates, judge_comparison, require_methods
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.progress import show_count
+from lidarslam.storage.finished_run import read_summary
 
 DEFAULT_METHODS = "learned+map,kiss-icp"
 
 Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a comparison ended."""
+
+    has_results: bool  # whether all methods had their turn and any came to a result
+    gates_passed: bool  # whether every bound was met
 
 
 def run_compare(
@@ -46,8 +56,9 @@ def run_compare(
     sequence: str | None,
     config_file: Path | None,
     settings: tuple[str, ...],
-) -> bool:
-    """Compare, and print the tables; whether all methods ran and any came to a result.
+    gates: Sequence[Gate] = (),
+) -> Ending:
+    """Compare, and print the tables and the gates.
 
     `say` prints the result and `tell` the progress; for the options see `lidarslam compare --help`.
     """
@@ -73,9 +84,21 @@ def run_compare(
             described = load_benchmark(benchmark)
             request = fill_request(request, described, data)
             require_data(request, described, data)
+        require_methods(gates, [method.name for method in request.methods])
+        if benchmark is not None:
             make_recordings(request, show_count)
         outcome = compare(request, Narrator(show_count, tell))
     say(format_comparison(outcome.comparison, out))
     if outcome.is_empty:
         tell("no method came to a result; the table says why")
-    return not outcome.interrupted and not outcome.is_empty
+    passed = not gates or _passes(gates, outcome, out, say)
+    return Ending(not outcome.interrupted and not outcome.is_empty, passed)
+
+
+def _passes(gates: Sequence[Gate], outcome: CompareOutcome, out: Path, say: Say) -> bool:
+    """Whether the gates hold, which is printed."""
+    sequences = outcome.comparison.sequences
+    runs = [result.run for sequence in sequences for result in sequence.methods if result.run]
+    judged = judge_comparison(gates, sequences, {run: read_summary(out / run) for run in runs})
+    say(f"\n{format_gates(judged)}")
+    return all(gate.passed for gate in judged)

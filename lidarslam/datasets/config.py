@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
-TimeReference = Literal["auto", "relative", "absolute", "none"]
+TimeReference = Literal["auto", "relative", "absolute", "azimuth", "none"]
 
 
 class ReaderConfig(BaseModel):
@@ -16,10 +16,12 @@ class ReaderConfig(BaseModel):
     name: str | None = Field(None, description="name of the reader; null: the one that recognises the source")
     topic: str | None = Field(None, description="point cloud topic of a bag; null: the only one there is")
     frame_id: str | None = Field(None, description="sensor's frame in a bag's topic; null: that of the first scans")
-    sequence: str | None = Field(None, description="sequence of a KITTI odometry root, such as 04")
+    imu_topic: str | None = Field(None, description="IMU topic of a bag; null: the one nearest to the point clouds'")
+    sequence: str | None = Field(None, description="sequence of a data set's root, such as 04 of KITTI odometry")
     rate_hz: float = Field(10.0, gt=0.0, description="scans a second, for recordings without stamps")
     time_field: str | None = Field(None, description="point field with the per-point time; null: found by its name")
     time_unit: TimeUnit = Field("auto", description="unit of the per-point time; auto: inferred from the values")
     time_reference: TimeReference = Field(
-        "auto", description="per-point time: relative to the scan's stamp, an absolute clock reading, or none"
+        "auto",
+        description="per-point time: relative to the scan's stamp, a reading of a clock, from the azimuth, or none",
     )

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.core.plain_text import one_line
+from lidarslam.core.plain_text import count, one_line
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.recording import RecordingInfo, SeveralTopicsError, Topic
+from lidarslam.datasets.recording import ImuSummary, RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.registry import choose_reader, open_recording
 
 # Between these a stamp is a date; else it counts from some start.
@@ -57,7 +57,7 @@ def describe_as_json(source: Path, config: ReaderConfig) -> str:
 def _content(source: Path, reader: str) -> dict[str, Any]:
     """All keys, with what is known before the recording is opened."""
     names = ("topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan", "point_time")
-    unknown = dict.fromkeys((*names, "ground_truth"))
+    unknown = dict.fromkeys((*names, "ground_truth", "imu"))
     return {
         "source": str(source),
         "reader": reader,
@@ -87,9 +87,14 @@ def _known(info: RecordingInfo) -> dict[str, Any]:
         "point_time": _known_point_time(info),
         "ground_truth": None if info.ground_truth is None else str(info.ground_truth),
         "fields": [{"name": field.name, "type": field.type_name} for field in info.fields],
-        "notes": list(info.notes),
+        "imu": None if info.imu is None else _known_imu(info.imu),
+        "notes": [*info.notes, *(info.imu.notes if info.imu else ())],
         "topics": _topics(info.topics),
     }
+
+
+def _known_imu(imu: ImuSummary) -> dict[str, Any]:
+    return {key: value for key, value in asdict(imu).items() if key != "notes"}
 
 
 def _topics(topics: Sequence[Topic]) -> list[dict[str, Any]]:
@@ -121,7 +126,8 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
         yield "topic", info.topic
     yield "scans", f"{info.scans:,}"
     yield "start", _instant(info.first_stamp)
-    rate = "" if info.rate_hz is None else f" at {info.rate_hz:.2f} Hz"
+    assumed = "an assumed " if info.rate_is_assumed else ""
+    rate = "" if info.rate_hz is None else f" at {assumed}{info.rate_hz:.2f} Hz"
     yield "duration", f"{info.duration_s:.1f} s{rate}"
     dropped = f" and {info.first.dropped:,} invalid ones left out" if info.first.dropped else ""
     yield "points", f"{len(info.first):,} in the first scan{dropped}"
@@ -132,7 +138,9 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
     yield "rings", "no" if info.first.rings is None else "yes"
     yield "point time", _point_time(info)
     yield "ground truth", str(info.ground_truth) if info.ground_truth else "none"
-    for note in info.notes:
+    if info.imu is not None:
+        yield "imu", _imu(info.imu)
+    for note in (*info.notes, *(info.imu.notes if info.imu else ())):
         yield "note", note
 
 
@@ -155,6 +163,12 @@ def _point_time(info: RecordingInfo) -> str:
         return "none (scans are taken as motion compensated or at one instant)"
     span = f"{1e3 * offsets.min():+.1f} to {1e3 * offsets.max():+.1f} ms around the stamp"
     return f"{model.field} in {model.unit}, {model.reference}; {span}"
+
+
+def _imu(imu: ImuSummary) -> str:
+    rate = "" if imu.rate_hz is None else f" at {imu.rate_hz:.0f} Hz"
+    extrinsic = "extrinsic known" if imu.has_extrinsic else "extrinsic unknown"
+    return f"{imu.name}, {count(imu.samples, 'sample')}{rate}, {extrinsic}"
 
 
 def _topic_lines(topics: Sequence[Topic], chosen: str | None) -> Iterator[str]:

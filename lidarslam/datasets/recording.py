@@ -39,6 +39,17 @@ class PointField:
     type_name: str
 
 
+@dataclass(frozen=True)
+class ImuSummary:
+    """The IMU of a recording."""
+
+    name: str  # topic of a bag, else the file or folder
+    samples: int
+    rate_hz: float | None  # median; None of fewer than two samples
+    has_extrinsic: bool  # whether T_lidar_imu is known
+    notes: tuple[str, ...] = ()  # of its samples
+
+
 @dataclass(frozen=True, eq=False)
 class RecordingInfo:
     """Description of a recording, as `lidarslam info` prints it."""
@@ -53,6 +64,8 @@ class RecordingInfo:
     topics: tuple[Topic, ...] = ()  # of a bag, all of them; `topic` is the one that is read
     fields: tuple[PointField, ...] = ()  # of the points as stored
     notes: tuple[str, ...] = ()  # further facts for the user, one sentence each
+    rate_is_assumed: bool = False  # the scans have no stamps, so that stamps and duration follow from `reader.rate_hz`
+    imu: ImuSummary | None = None
 
     @property
     def first_stamp(self) -> float:

@@ -8,6 +8,8 @@ from typing import NamedTuple, cast
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
+from lidarslam.datasets.published.evalio_names import is_of_evalio, located
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.unrecognised import absent, result_of_program, unrecognised
 
@@ -15,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 # Of rosbag2; a recorder that was killed leaves such a file without the metadata.yaml beside it.
 _BAG_SUFFIXES = (".db3", ".mcap")
-SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
+_PACKET_SUFFIXES = (".pcap", ".pcapng", ".osf")
 
 
 class Reader(NamedTuple):
@@ -24,6 +26,7 @@ class Reader(NamedTuple):
     module: str  # has `open_recording(source: Path, config: ReaderConfig) -> Recording`
     reads: str  # the layout, in words
     recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
+    takes_sequence: bool = False  # whether --sequence chooses among what a source holds
 
 
 def _is_rosbag(source: Path) -> bool:
@@ -38,18 +41,67 @@ def _bag_of_folder(folder: Path) -> Path:
     return folder / f"{folder.resolve().name}.bag"
 
 
+def _is_kitti_360(source: Path) -> bool:
+    is_drive = source.resolve().parent.name == "data_3d_raw" and (source / "velodyne_points").is_dir()
+    return is_drive or (source / "data_3d_raw").is_dir()
+
+
 READERS: dict[str, Reader] = {
+    "evalio": Reader(
+        "lidarslam.datasets.published.evalio",
+        "data sets of evalio: evalio:DATASET/SEQUENCE, or that folder of its data (lidarslam datasets)",
+        is_of_evalio,
+    ),
     "kitti-odometry": Reader(
         "lidarslam.datasets.kitti.odometry",
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
+        takes_sequence=True,
+    ),
+    "kitti-360": Reader(
+        "lidarslam.datasets.published.kitti_360",
+        "KITTI-360: the root (with --sequence) or one data_3d_raw/..._sync folder",
+        _is_kitti_360,
+        takes_sequence=True,
     ),
     "kitti-raw": Reader(
         "lidarslam.datasets.kitti.raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
         lambda source: (source / "velodyne_points" / "data").is_dir(),
     ),
+    "nuscenes": Reader(
+        "lidarslam.datasets.published.nuscenes",
+        "nuScenes: the root with v1.0-* (with --sequence)",
+        lambda source: any(source.glob("v1.0-*/scene.json")),
+        takes_sequence=True,
+    ),
+    "argoverse-2": Reader(
+        "lidarslam.datasets.published.argoverse2",
+        "Argoverse 2: the folder of a log",
+        lambda source: any((source / "sensors" / "lidar").glob("*.feather")),
+    ),
+    "apollo": Reader(
+        "lidarslam.datasets.published.apollo",
+        "Apollo: a folder with pcds and poses, or one above several (with --sequence)",
+        lambda source: any(source.glob("poses/gt_poses.txt")) or any(source.glob("*/poses/gt_poses.txt")),
+        takes_sequence=True,
+    ),
+    "mulran": Reader(
+        "lidarslam.datasets.published.mulran",
+        "MulRan: a sequence with a folder Ouster",
+        lambda source: (source / "Ouster").is_dir(),
+    ),
+    "nclt": Reader(
+        "lidarslam.datasets.published.nclt",
+        "NCLT: a session with a folder velodyne_sync",
+        lambda source: (source / "velodyne_sync").is_dir(),
+    ),
     "rosbag": Reader("lidarslam.datasets.ros.rosbag", "rosbag1 .bag; rosbag2 folder, .db3 or .mcap", _is_rosbag),
+    "packets": Reader(
+        "lidarslam.datasets.packets.capture",
+        ".pcap of a Velodyne, or of an Ouster with its metadata .json beside it; Ouster's .osf",
+        lambda source: source.suffix.lower() in _PACKET_SUFFIXES,
+    ),
     "scan-folder": Reader(
         "lidarslam.datasets.folders.scan_folder",
         "a folder of .bin, .pcd, .ply or .npy scans",
@@ -64,6 +116,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
     Raises:
         InputError: no such source, no such reader, or no reader recognises the source.
     """
+    source = located(source)
     try:
         exists = source.exists()
         if exists and source.is_dir():
@@ -78,7 +131,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
         return name
     if (result := result_of_program(source)) is not None:
         raise InputError(result)
-    if (found := _recognise(source)) is not None:
+    if (found := recognise(source)) is not None:
         return found
     if source.is_dir() and all(entry.name.startswith(".") for entry in source.iterdir()):
         raise InputError(f"{source}: the folder is empty; name the one with the recording")
@@ -86,7 +139,7 @@ def choose_reader(source: Path, name: str | None = None) -> str:
         raise InputError(
             f"{source}: is a single point cloud; give the folder with the scans, {source.absolute().parent}?"
         )
-    if (other := unrecognised(source, _recognise)) is not None:
+    if (other := unrecognised(source, recognise)) is not None:
         raise InputError(other)
     layouts = "; ".join(reader.reads for reader in READERS.values())
     raise InputError(f"{source}: not a recording that any reader recognises. Readable are: {layouts}")
@@ -94,10 +147,17 @@ def choose_reader(source: Path, name: str | None = None) -> str:
 
 def is_recording(source: Path, name: str | None = None) -> bool:
     """Whether a reader was named for an existing source, or one recognises it."""
-    return source.exists() and (name is not None or _recognise(source) is not None)
+    source = located(source)
+    return source.exists() and (name is not None or recognise(source) is not None)
 
 
-def _recognise(source: Path) -> str | None:
+def takes_sequence(source: Path, name: str | None = None) -> bool:
+    """Whether the reader that was named, or recognises the source, takes a sequence."""
+    reader = name or recognise(source)
+    return reader is not None and READERS[reader].takes_sequence
+
+
+def recognise(source: Path) -> str | None:
     """The first reader in the table that recognises a path by its names."""
     return next((name for name, reader in READERS.items() if reader.recognises(source)), None)
 
@@ -108,7 +168,7 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     Raises:
         InputError: the source cannot be read by the chosen reader.
     """
-    config = config or ReaderConfig()
+    config, source = config or ReaderConfig(), located(source)
     name = choose_reader(source, config.name)
     why = "because the names fit" if config.name is None else "as it was named"
     logger.info("reader: %s, %s: %s", name, why, READERS[name].reads)

@@ -9,6 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from lidarslam.core.plain_text import count
+from lidarslam.datasets.published import evalio_names
 
 ReaderOf = Callable[[Path], str | None]
 """The name of the reader that recognises a path; None where none does."""
@@ -26,11 +27,6 @@ _CONVERT = "convert each scan to .ply, .pcd or .npy"
 _KINDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     ((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"), "images", "name the folder with the LiDAR's scans"),
     ((".mp4", ".avi", ".mkv", ".mov"), "video", "name the recording of the LiDAR"),
-    (
-        (".pcap", ".pcapng"),
-        "packets of a sensor",
-        "decode them with the sensor's driver, and record a bag or save each scan as .pcd",
-    ),
     (
         (".zip", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".7z", ".rar", ".zst"),
         "packed",
@@ -52,6 +48,8 @@ def absent(source: Path) -> str:
     """Why a path does not exist, with the names that are like it."""
     if _URL.match(str(source)):
         return f"{source}: is an address; download the recording and name the file"
+    if (missing_data_set := evalio_names.absent(source)) is not None:
+        return missing_data_set
     parent = source.parent
     while not parent.is_dir() and parent != parent.parent:
         parent = parent.parent

@@ -10,6 +10,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
+from lidarslam.mapping.motion.prediction import GravityDirection
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.odometry.interface import Motion
 
@@ -81,6 +82,7 @@ class Localised:
     degenerate: tuple[str, ...]  # axes along which the scan does not constrain the motion
     stage_ms: dict[str, float]  # wall time of the stages, see `STAGES`
     is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
+    gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -106,4 +108,5 @@ def graph_scan(estimated: Estimated, localised: Localised, points: FloatArray) -
         motion_covariance=estimated.motion.covariance if measured else None,
         lost=is_lost or not localised.is_connected,
         belongs_in_map=localised.belongs_in_map,
+        gravity=localised.gravity,
     )

@@ -10,6 +10,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
@@ -79,14 +80,21 @@ class OdometryAlone(Stateful):
 
 
 class ScanToMap(Stateful):
-    """Registers each scan to the map, with the odometry as initial guess."""
+    """Registers each scan to the map, with the odometry as initial guess.
+
+    Args:
+        mapper: registers.
+        inertial: an IMU's part in the prior.
+    """
 
     _mapper: Mapper
+    _inertial: Inertial | None
     _T_odom_lidar: Annotated[FloatArray, Shape(4, 4)]
     _T_world_last: Annotated[FloatArray, Shape(4, 4)]
 
-    def __init__(self, mapper: Mapper) -> None:
+    def __init__(self, mapper: Mapper, inertial: Inertial | None = None) -> None:
         self._mapper = mapper
+        self._inertial = inertial
         self._T_odom_lidar = np.eye(4)
         self._T_world_last = np.eye(4)
 
@@ -97,7 +105,11 @@ class ScanToMap(Stateful):
         odometry = SweepMotion(estimated.velocity, following.velocity if following else None)
         motion = estimated.motion
         prior = Prior(motion.T_prev_curr if measured else None, odometry.mean(estimated.scan), motion.covariance)
+        if self._inertial is not None:
+            prior = self._inertial.prior(estimated.scan, prior)
         mapped = self._mapper.process(estimated.scan, prior)
+        if self._inertial is not None:
+            self._inertial.update(estimated.scan, mapped)
         expected = inverse(self._T_world_last) @ mapped.T_world_predicted
         self._T_odom_lidar = self._T_odom_lidar @ (motion.T_prev_curr if measured else expected)
         self._T_world_last = mapped.state.T_world_lidar
@@ -115,6 +127,7 @@ class ScanToMap(Stateful):
             degenerate=mapped.degenerate,
             stage_ms={"refine": 1e3 * (time.perf_counter() - started)},
             is_connected=mapped.is_connected,
+            gravity=None if self._inertial is None else self._inertial.direction,
         )
 
 
@@ -131,12 +144,12 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
     return fit.status, f"only {100.0 * fit.inlier_ratio:.0f} % of the points fit the previous scan"
 
 
-def make_localiser(config: Config) -> Localiser:
-    """The configured scan-to-map registration, or the odometry alone."""
+def make_localiser(config: Config, inertial: Inertial | None = None) -> Localiser:
+    """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone."""
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())
     if config.mapping.method == "loam":
         from lidarslam.mapping.loam.mapper import LoamMapper  # loads Open3D
 
-        return ScanToMap(LoamMapper(config.mapping))
-    return ScanToMap(SurfelMapper(config.mapping))
+        return ScanToMap(LoamMapper(config.mapping), inertial)
+    return ScanToMap(SurfelMapper(config.mapping), inertial)

@@ -19,7 +19,7 @@ _STEP = make_transform(np.eye(3), np.array([0.3, 0.0, 0.0]))
 
 
 @cache
-def _scans() -> tuple[Scan, ...]:
+def made_up_scans() -> tuple[Scan, ...]:
     """Three scans of a box by a spinning sensor that moves along x."""
     azimuths, rings = np.meshgrid(np.linspace(-np.pi, np.pi, _COLUMNS, endpoint=False), np.arange(_RINGS))
     elevations = np.deg2rad(2.0 * rings - 15.0)
@@ -40,7 +40,7 @@ def _images() -> None:
     from lidarslam.odometry.images.bird_eye import bird_eye
     from lidarslam.odometry.images.sweep_images import Imager
 
-    shown = Imager(ImageConfig()).images(_scans()[0]).network
+    shown = Imager(ImageConfig()).images(made_up_scans()[0]).network
     bird_eye(shown.points, shown.normals, 0.0)
 
 
@@ -50,7 +50,7 @@ def _alignment() -> None:
     from lidarslam.odometry.images.sweep_images import SweepImages
 
     shape = (_RINGS, _COLUMNS)
-    points = np.ascontiguousarray(_scans()[0].points.T, dtype=np.float32).reshape(3, *shape)
+    points = np.ascontiguousarray(made_up_scans()[0].points.T, dtype=np.float32).reshape(3, *shape)
     normals = -points / np.linalg.norm(points, axis=0)
     images = SweepImages(points, normals, np.zeros(shape, dtype=np.float32), -0.25, 0.25)
     align(InitialEstimate(np.eye(4)), SweepPair(images, images, _SWEEP_S, None))
@@ -63,9 +63,9 @@ def _surfels() -> None:
     from lidarslam.mapping.surfels.grid import SurfelGrid
 
     mapper = SurfelMapper(MappingConfig())
-    for scan in _scans():
+    for scan in made_up_scans():
         mapper.process(scan, Prior(_STEP, None))
-    grid, points = SurfelGrid(0.5), _scans()[0].points
+    grid, points = SurfelGrid(0.5), made_up_scans()[0].points
     grid.insert(points, np.zeros(len(points)), np.zeros_like(points))
     grid.drop_beyond(np.zeros(3), 5.0)
 
@@ -76,7 +76,7 @@ def _loam() -> None:
     from lidarslam.mapping.motion.prediction import Prior
 
     mapper = LoamMapper(MappingConfig(method="loam"))
-    for scan in _scans():
+    for scan in made_up_scans():
         mapper.process(scan, Prior(_STEP, None))
 
 
@@ -86,7 +86,7 @@ def _map() -> None:
     from lidarslam.mapping.motion.deskew import move
 
     global_map = GlobalMap(0.2)
-    for number, scan in enumerate(_scans()):
+    for number, scan in enumerate(made_up_scans()):
         kept = one_per_cell(scan.points, 0.2)
         points = move(scan.points[kept], np.linspace(0.0, _SWEEP_S, len(kept)), np.zeros(6))
         global_map.add(points, np.linalg.matrix_power(_STEP, number))
@@ -97,7 +97,7 @@ def _checks() -> None:
     from lidarslam.mapping.global_map.moved_points import Views, seen_through
     from lidarslam.mapping.slides.scan_surfels import Surfels, shift_profile
 
-    points, views = _scans()[0].points, Views(every=1)
+    points, views = made_up_scans()[0].points, Views(every=1)
     views.add(points, 0)
     seen_through(points, views.placed(np.eye(4)[None]), 0.2)
     surfels = Surfels.of(points)

@@ -34,7 +34,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
     """
     config = request.config
     tree = config.model_dump(mode="json", exclude=_WITHOUT_EFFECT)
-    if config.odometry.method == "learned":
+    if config.odometry.is_learned:
         from lidarslam.odometry.network.shipped import default_weights
 
         tree["odometry"]["learned"]["weights"] = _digest(config.odometry.learned.weights or default_weights())

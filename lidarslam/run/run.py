@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidarslam.config.settings import Config
+from lidarslam.config.settings import Config, ViewerConfig
 from lidarslam.core.errors import ConfigError, OutputError
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.intake import choose_scans
@@ -14,6 +14,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.run.inertial import imu_samples
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
 from lidarslam.run.request import RunRequest, describe_run, log_choices
@@ -24,7 +25,7 @@ from lidarslam.run.tracking import Progress, track
 from lidarslam.storage.directory import RERUN, RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.rerun_program import require_window
-from lidarslam.viewer.viewer import Viewer
+from lidarslam.viewer.viewer import RerunMode, Viewer
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def execute(
     recording = open_recording(request.source, config.reader)
     chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
     log_choices(request, chosen, len(recording))
+    imu_samples(config, recording)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
@@ -74,7 +76,7 @@ def execute(
             log, graph = ScanLog(), _open_graph(config, directory, unfinished)
             if graph is not None:
                 stack.callback(graph.close)
-            with _viewing(request, recording.name, directory, log, page) as viewer:
+            with viewing(request.rerun, config.viewer, recording.name, directory, log, page) as viewer:
                 compiling.wait_for_first_scan(phase)
                 phase("reading the first scans")
                 tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
@@ -114,11 +116,11 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
 
 
 @contextmanager
-def _viewing(
-    request: RunRequest, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
+def viewing(
+    mode: RerunMode, config: ViewerConfig, name: str, directory: RunDirectory, log: ScanLog, page: WebPage | None
 ) -> Iterator[Viewer]:
     """The viewer of a run; a Rerun recording that cannot be written is a warning."""
-    if request.rerun == "off":
+    if mode == "off":
         yield Viewer()
         return
     from lidarslam.viewer.rerun_recording import IncompleteRecordingError
@@ -127,7 +129,7 @@ def _viewing(
     try:
         with (
             directory.replacing(RERUN) as path,
-            rerun_viewer(name, request.config.viewer, path, request.rerun == "spawn", page) as viewer,
+            rerun_viewer(name, config, path, mode == "spawn", page) as viewer,
         ):
             yield viewer
     except IncompleteRecordingError as error:
@@ -156,6 +158,23 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
             "constant-velocity only predicts the motion, and needs scan-to-map registration. Choose --odometry learned,"
             " give a trajectory with --prior, or a mapping with --mapping surfels or --mapping loam"
         )
+    if config.odometry.uses_imu and not config.mapping.enabled:
+        raise ConfigError(
+            f"{method}: the IMU takes part in scan-to-map registration. Choose --odometry learned, or a mapping with"
+            " --mapping surfels or --mapping loam"
+        )
     if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
     return make_odometry(config.odometry, None if prior is None else read_tum(prior))
+
+
+def require_scans_only(config: Config) -> None:
+    """Refuse an odometry that takes more of a recording than its scans, one after the other.
+
+    Raises:
+        ConfigError: it needs a trajectory or an IMU.
+    """
+    if config.odometry.method == "external":
+        raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
+    if config.odometry.uses_imu:
+        raise ConfigError(f"odometry.method={config.odometry.method} needs the IMU of a recording: use lidarslam run")

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import STAGES, ScanResult
 
+# Standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
+SIGMAS = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
 COLUMNS = (
     "index",
     "stamp",
@@ -22,12 +25,13 @@ COLUMNS = (
     "residual_m",
     "inlier_ratio",
     "degenerate_directions",
+    *SIGMAS,
     *(f"ms_{stage}" for stage in STAGES),
     "message",
 )
 
 _STATUSES = tuple(Status)
-# The numbers of a scan, 361 bytes; NaN where there is none.
+# The numbers of a scan, 409 bytes; NaN where there is none.
 _ROW = np.dtype(
     [
         ("stamp", "f8"),
@@ -37,6 +41,7 @@ _ROW = np.dtype(
         ("points_used", "i8"),
         ("residual_m", "f8"),
         ("inlier_ratio", "f8"),
+        ("sigmas", "f8", len(SIGMAS)),
         ("total_ms", "f8"),
         ("stage_ms", "f8", len(STAGES)),
         ("T_world_lidar", "f8", (4, 4)),
@@ -69,6 +74,7 @@ class ScanLog(Stateful):
             result.points_used,
             np.nan if result.residual_m is None else result.residual_m,
             np.nan if result.inlier_ratio is None else result.inlier_ratio,
+            np.full(len(SIGMAS), np.nan) if result.covariance is None else np.sqrt(np.diag(result.covariance)),
             total_ms,
             [result.stage_ms.get(stage, 0.0) for stage in STAGES],
             result.T_world_lidar,
@@ -90,6 +96,14 @@ class ScanLog(Stateful):
         rows = self._table()
         rows["T_world_lidar"] = T_world_lidar
         self._rows = bytearray(rows.tobytes())
+
+    def mark(self, indices: Sequence[int], status: Status, message: str) -> None:
+        """Replace the status of scans, and its reason."""
+        rows = self._table()
+        rows["status"][list(indices)] = _STATUSES.index(status)
+        self._rows = bytearray(rows.tobytes())
+        for index in indices:
+            self.messages[index] = message
 
     @property
     def statuses(self) -> list[Status]:
@@ -140,9 +154,10 @@ class ScanLog(Stateful):
         for index, (row, degenerate, message) in enumerate(rows):
             counts = (row["points"], row["points_dropped"], row["points_used"])
             fit = ("" if np.isnan(row[name]) else f"{row[name]:.4f}" for name in ("residual_m", "inlier_ratio"))
+            sigmas = ("" if np.isnan(sigma) else f"{sigma:.3g}" for sigma in row["sigmas"])
             ms = (f"{ms:.2f}" for ms in row["stage_ms"])
             status = _STATUSES[row["status"]].value
-            writer.writerow([index, f"{row['stamp']:.9f}", status, *counts, *fit, degenerate, *ms, message])
+            writer.writerow([index, f"{row['stamp']:.9f}", status, *counts, *fit, degenerate, *sigmas, *ms, message])
         return out.getvalue()
 
     def state(self) -> State:

@@ -21,10 +21,11 @@ from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.localisation import Localiser, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
+from lidarslam.run.inertial import open_inertial
 from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.unfinished import Unfinished
@@ -77,6 +78,7 @@ def track(
     viewer: Viewer,
     progress: Progress,
     unfinished: Unfinished | None = None,
+    localiser: Localiser | None = None,
 ) -> Tracked:
     """Take the chosen scans of a recording through the pipeline.
 
@@ -86,6 +88,7 @@ def track(
         odometry, log, graph: new, but for a graph that is resumed.
         viewer, progress: called for every scan.
         unfinished: where checkpoints are saved; None: nowhere.
+        localiser: estimates the poses; None: as configured.
 
     Raises:
         NoScanError: no scan could be used.
@@ -93,8 +96,12 @@ def track(
     """
     config, faults = request.config, Faults()
     scans = take_in(recording, chosen, faults)
+    inertial = open_inertial(config, recording, chosen)
+    if inertial is not None:
+        scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
-    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph, checkpoints)
+    localiser = localiser or make_localiser(config, inertial)
+    pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints)
     if checkpoints is not None:
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")
@@ -102,6 +109,8 @@ def track(
         for warning in recording.warnings:
             log.warn(warning)
     error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
+    if inertial is not None and inertial.disagreement is not None:
+        log.warn(inertial.disagreement)
     if not log.points_read:
         if isinstance(error, KeyboardInterrupt):
             raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)

@@ -6,6 +6,8 @@ from itertools import count
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio
+from lidarslam.datasets.registry import takes_sequence
 from lidarslam.storage.directory import TRAJECTORY_TUM
 from lidarslam.storage.unfinished import About
 
@@ -25,11 +27,14 @@ def new_place(folder: Path, name: str) -> Path:
 def source_name(source: Path, sequence: str | None = None) -> str:
     """What the results of a recording are named after: its file or folder, without suffix and time.
 
-    Of a KITTI odometry root, followed by the sequence.
+    Of a folder with several sequences, followed by the one that is read; of evalio's, with that of the data set.
     """
     source = source.resolve()
+    if is_of_evalio(source):
+        return full_name(source).replace("/", "_")
     name = _TIMED.sub("", source.name if source.is_dir() else source.stem) or "recording"
-    return f"{name}_{sequence}" if sequence is not None and (source / "sequences").is_dir() else name
+    chooses = sequence not in (None, source.name) and takes_sequence(source)
+    return f"{name}_{sequence}".replace("/", "_") if chooses else name
 
 
 def latest_run() -> Path | None:

@@ -41,6 +41,30 @@ class FinishedRun:
     map_points: FloatArray  # (M, 3) in the world, none when the map is missing
     loops: NDArray[np.intp]  # (L, 2) pairs of scans between which loops were closed
     map_attributes: PointAttributes = field(default_factory=PointAttributes)  # of the points of the map
+    frame_of: Path | None = None  # the run, or file, in whose map this one was localised
+    path: Path | None = None  # where it lies, resolved
+
+
+def shown_map(path: Path) -> PointCloud:
+    """The map of a run as it is drawn; that which it was localised in, if it has none and that is still there.
+
+    Raises:
+        InputError: as `load_map`.
+    """
+    cloud = load_map(path)
+    other = localised_in(path)
+    return load_map(other) if not len(cloud) and other is not None and other.exists() else cloud
+
+
+def localised_in(path: Path) -> Path | None:
+    """The map that a run was localised in; None for any other run, and for a file.
+
+    Raises:
+        InputError: its summary is damaged.
+    """
+    about = read_summary(path).get("localisation") if path.is_dir() else None
+    place = about.get("map") if isinstance(about, dict) else None
+    return Path(place) if isinstance(place, str) else None
 
 
 def is_run(path: Path) -> bool:
@@ -57,8 +81,9 @@ def load_run(path: Path) -> FinishedRun:
     trajectory = read_trajectory(path)
     statuses, loops = read_statuses(path, len(trajectory)), _loops(path, len(trajectory))
     lost = np.array([status is Status.LOST for status in statuses], dtype=np.bool_)
-    cloud = load_map(path)
-    return FinishedRun(path.resolve().name, trajectory, lost, cloud.points, loops, cloud.attributes)
+    cloud, other = shown_map(path), localised_in(path)
+    name, frame_of = path.resolve().name, None if other is None else other.resolve()
+    return FinishedRun(name, trajectory, lost, cloud.points, loops, cloud.attributes, frame_of, path.resolve())
 
 
 def read_trajectory(path: Path) -> Trajectory:

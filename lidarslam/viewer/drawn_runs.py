@@ -6,7 +6,7 @@ from pathlib import Path
 from lidarslam.core.errors import InputError
 from lidarslam.storage.comparison_folder import run_directories
 from lidarslam.storage.directory import MAP_PLY, TRAJECTORY_TUM
-from lidarslam.storage.finished_run import load_map, read_statuses, read_trajectory
+from lidarslam.storage.finished_run import read_statuses, read_trajectory, shown_map
 from lidarslam.viewer.picture import DrawnRun
 
 
@@ -20,7 +20,7 @@ def load_drawn_runs(paths: Sequence[Path]) -> list[DrawnRun]:
 
 
 def _load(path: Path) -> DrawnRun:
-    name, cloud = path.resolve().name, load_map(path)
+    name, cloud = path.resolve().name, shown_map(path)
     has_trajectory = (path / TRAJECTORY_TUM).is_file()
     if path.is_file() or ((path / MAP_PLY).is_file() and not has_trajectory):
         if not len(cloud):

@@ -13,7 +13,7 @@ from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.alignment import align
-from lidarslam.evaluation.trajectory.association import associate
+from lidarslam.evaluation.trajectory.association import Association, associate
 from lidarslam.evaluation.trajectory.metrics import absolute_errors
 from lidarslam.storage.finished_run import FinishedRun
 from lidarslam.viewer.rerun_output import Show
@@ -79,24 +79,40 @@ def _in_one_world(runs: Sequence[FinishedRun], reference: Trajectory | None) -> 
     for number, run in enumerate(runs):
         name = run.name if names.count(run.name) == 1 else f"{run.name} ({number + 1})"
         shown = _Shown(run, name, _COLOURS[number % len(_COLOURS)], np.empty(0), np.empty(0))
-        yield shown if reference is None else _aligned(shown, reference)
+        base = next((other for other in runs if other.path is not None and other.path == run.frame_of), None)
+        if reference is None:
+            yield shown
+        elif base is not None:  # it goes with the run in whose map it was localised
+            found = _association(base, reference)
+            yield shown if found is None else _moved(shown, align(found.estimate, found.reference))
+        else:
+            yield _aligned(shown, reference)
+
+
+def _association(run: FinishedRun, reference: Trajectory) -> Association | None:
+    """The common instants; None where there are none, as for a run of another recording."""
+    try:
+        return associate(run.trajectory, reference)
+    except InputError:
+        return None
+
+
+def _moved(shown: _Shown, T_reference_world: FloatArray) -> _Shown:
+    run = shown.run
+    trajectory = run.trajectory.transformed(T_reference_world)
+    points = transform_points(T_reference_world, run.map_points)
+    return replace(shown, run=replace(run, trajectory=trajectory, map_points=points))
 
 
 def _aligned(shown: _Shown, reference: Trajectory) -> _Shown:
-    """With its errors; unchanged where it shares no instants with the reference, as a run of another recording."""
-    run = shown.run
-    try:
-        association = associate(run.trajectory, reference)
-    except InputError:
+    """With its errors; unchanged where it shares no instants with the reference."""
+    association = _association(shown.run, reference)
+    if association is None:
         return shown
     T_reference_world = align(association.estimate, association.reference)
-    moved = replace(
-        run,
-        trajectory=run.trajectory.transformed(T_reference_world),
-        map_points=transform_points(T_reference_world, run.map_points),
-    )
     errors_m, _ = absolute_errors(association, T_reference_world)
-    return replace(shown, run=moved, error_stamps=association.estimate.stamps, errors_m=errors_m)
+    moved = _moved(shown, T_reference_world)
+    return replace(moved, error_stamps=association.estimate.stamps, errors_m=errors_m)
 
 
 def _log_run(recording: rr.RecordingStream, shown: _Shown, several: bool, config: ViewerConfig) -> None:

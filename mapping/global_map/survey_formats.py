@@ -14,8 +14,8 @@ _LAZ_NORMALS = ("NormalX", "NormalY", "NormalZ")
 _POINTS_AT_A_TIME = 1_000_000
 
 
-def write_laz(path: Path, cloud: PointCloud) -> None:
-    """Write a compressed LAS 1.4 file; normals and rings are extra dimensions.
+def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None) -> None:
+    """Write a compressed LAS 1.4 file; normals and rings are extra dimensions, `wkt` is its coordinate system.
 
     Intensities and colours have 16 bits there: intensities up to 1 are scaled to 65535, others rounded.
     """
@@ -25,6 +25,9 @@ def write_laz(path: Path, cloud: PointCloud) -> None:
     header = laspy.LasHeader(version="1.4", point_format=6 if known.rgb is None else 7)
     header.scales = np.full(3, _LAZ_STEP_M)
     header.offsets = np.round(0.5 * (cloud.points.min(axis=0) + cloud.points.max(axis=0)))
+    if wkt is not None:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+        header.global_encoding.wkt = True
     header.add_extra_dims([laspy.ExtraBytesParams(name, "float32") for name in _LAZ_NORMALS])
     if known.ring is not None:
         header.add_extra_dim(laspy.ExtraBytesParams("ring", "int32"))

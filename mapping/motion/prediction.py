@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, skew
 from lidarslam.core.state.stateful import Shape
 from lidarslam.mapping.config import MappingConfig
 
@@ -32,14 +32,29 @@ _PROVEN_AFTER = 10
 
 
 @dataclass(frozen=True, eq=False)
+class GravityDirection:
+    """A measurement of gravity's direction: unit vectors upwards."""
+
+    lidar: Annotated[FloatArray, Shape(3)]  # (3,) as measured, in the LiDAR frame
+    world: Annotated[FloatArray, Shape(3)]  # (3,) as expected, in the world
+    covariance: Annotated[FloatArray, Shape(3, 3)]  # (3, 3) of their difference, in the LiDAR frame
+
+    def turned(self, R_prev_curr: FloatArray) -> "GravityDirection":
+        """The direction in the LiDAR frame after a turn (3, 3)."""
+        covariance = R_prev_curr.T @ self.covariance @ R_prev_curr
+        return GravityDirection(R_prev_curr.T @ self.lidar, self.world, covariance)
+
+
+@dataclass(frozen=True, eq=False)
 class Prior:
-    """Odometry's measurements of a scan; None where it has none."""
+    """Measurements of a scan's motion by odometry and IMU; None where there is none."""
 
     T_prev_curr: FloatArray | None = None  # (4, 4) motion since the previous scan
     velocity: FloatArray | None = None  # (6,) during the sweep, in the LiDAR frame, rotation first
     # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None for the configured standard
     # deviations
     covariance: FloatArray | None = None
+    gravity: GravityDirection | None = None  # at the scan's stamp
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
         """(6, 6) of the motion: the odometry's own, inflated for errors correlated in time, or the configured one."""
@@ -160,6 +175,11 @@ def predict(
         H[:, 18:] = np.eye(6)
         noise = covariance * (_VELOCITY_INFLATION / interval_s) ** 2
         joint, _ = joint.updated(H, prior.velocity - joint.next_velocity, noise)
+    if prior.gravity is not None:
+        expected = joint.T_world_next[:3, :3].T @ prior.gravity.world
+        H = np.zeros((3, 24))
+        H[:, 12:15] = skew(expected)
+        joint, _ = joint.updated(H, prior.gravity.lidar - expected, prior.gravity.covariance)
     marginal = joint.covariance[12:, 12:]
     marginal[:6, :6] += np.diag(LEAST_SIGMA**2)
     return Prediction(stamp, joint.T_world_next, joint.next_velocity, marginal, contradicted)
@@ -188,7 +208,7 @@ class _Joint:
         return cls(last.T_world_lidar, last.T_world_lidar @ T_last_next, last.velocity, P)
 
     def updated(self, H: FloatArray, innovation: FloatArray, noise: FloatArray) -> tuple["_Joint", float]:
-        """Kalman update by a measurement with Jacobian H (6, 24), and the normalised squared innovation."""
+        """Kalman update by a measurement with Jacobian H (M, 24), and the normalised squared innovation."""
         PH = self.covariance @ H.T
         S = H @ PH + noise
         gain = np.linalg.solve(S, PH.T).T

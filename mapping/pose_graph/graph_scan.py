@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.mapping.motion.prediction import GravityDirection
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,3 +18,4 @@ class GraphScan:
     motion_covariance: FloatArray | None  # (6, 6) of that; None when the odometry has none
     lost: bool  # whether tracking was lost, so that the motion from the scan before is unknown
     belongs_in_map: bool  # whether its points are added to the submap
+    gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not

@@ -24,6 +24,7 @@ from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.loops.revisits import as_registered
+from lidarslam.mapping.pose_graph.attitude import Attitude, measured_attitude
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, drift_covariance, first_connected, trajectory_edges
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
@@ -56,6 +57,7 @@ class SlamGraph(Stateful):
     _keyframes: list[Keyframe]
     _poses: list[FloatArray]  # of keyframes, as estimated now
     _edges: list[RelativePose]
+    _attitudes: list[Attitude]  # of the first recording, whose world they are in
     _closures: list[LoopClosure]
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
     _motion: MotionSinceKeyframe
@@ -76,7 +78,8 @@ class SlamGraph(Stateful):
         self._store = SubmapStore(directory, file)
         self._submap = None
         self.scan_poses, self.keyframe_ms, self._first_scans = [], [], [0]
-        self._keyframes, self._poses, self._edges, self._closures, self._unrefined = [], [], [], [], []
+        self._keyframes, self._poses, self._edges, self._closures = [], [], [], []
+        self._unrefined, self._attitudes = [], []
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
     def _after_restore(self) -> None:
@@ -118,6 +121,7 @@ class SlamGraph(Stateful):
             self._close_submap()
             self._begin_keyframe(scan)
             self.keyframe_ms.append(1e3 * (time.perf_counter() - started))
+        self._attitudes += measured_attitude(scan, self._keyframes, self.scan_poses, self._first_scans)
 
     def finish(self) -> Corrected | None:
         """Optimise everything; None when there is no keyframe."""
@@ -141,7 +145,7 @@ class SlamGraph(Stateful):
     def _corrected(self, closures: Sequence[LoopClosure]) -> Corrected:
         """All poses, optimised with these loop closures, of which rejected ones are only listed."""
         accepted = [closure for closure in closures if closure.accepted]
-        optimised = optimise(np.array(self._poses), self._edges, accepted)
+        optimised = optimise(np.array(self._poses), self._edges, accepted, self._attitudes)
         kept = iter(optimised.inliers.tolist())
         inliers = tuple(closure.accepted and next(kept) for closure in closures)
         loops = [closure for closure, inlier in zip(closures, inliers, strict=True) if inlier]
@@ -204,7 +208,7 @@ class SlamGraph(Stateful):
         self._closures += found
         self._refine_closures(until=index - _REACH)
         if any(closure.accepted and self._contradicts_poses(closure) for closure in found):
-            self._poses = list(relax(np.array(self._poses), self._edges, self._accepted()))
+            self._poses = list(relax(np.array(self._poses), self._edges, self._accepted(), self._attitudes))
 
     def _contradicts_poses(self, closure: LoopClosure) -> bool:
         """Whether a closure is farther from the present poses than its own deviation: only then it moves them."""

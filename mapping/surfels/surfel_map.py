@@ -22,6 +22,10 @@ _FORGET_AFTER = 0.1
 _TIDIED_AFTER = 500
 # Surfaces within this cosine of the z axis are floors or ceilings.
 _LEVEL_COSINE = 0.7
+# Spread of the elevations of points that were seen from many places.
+_ANY_HEIGHT_RAD = 0.2
+# A direction that few walls are parallel to.
+_UNEVEN = np.array([0.46, 0.29, 0.84])
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,20 @@ class SurfelMap(Stateful):
         self._radius_m = radius_m
         self._grids = [SurfelGrid(cell_m * level) for level in LEVELS]
         self._centre = None
+
+    @classmethod
+    def of_cloud(cls, points: FloatArray, normals: FloatArray, cell_m: float, radius_m: float) -> "SurfelMap":
+        """The surfels of points (N, 3) of the world whose normals (N, 3) face the side that was seen."""
+        surfel_map = cls(cell_m, radius_m)
+        # No plane of a merged map is that of a single ring.
+        elevations = np.where(np.arange(len(points)) % 2, _ANY_HEIGHT_RAD, -_ANY_HEIGHT_RAD)
+        # The two sides of a thin wall after one another: the second is known by its view then.
+        faces_up = normals @ _UNEVEN > 0.0
+        for side in (faces_up, ~faces_up):
+            chosen = points[side], elevations[side], normals[side]
+            for grid in surfel_map._grids:
+                grid.insert(*chosen)
+        return surfel_map
 
     def _after_restore(self) -> None:
         if len(self._grids) != len(LEVELS):

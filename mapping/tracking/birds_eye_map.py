@@ -43,7 +43,7 @@ class BirdsEyeMap:
     @classmethod
     def of(cls, points: FloatArray, up: FloatArray, cell_m: float) -> "BirdsEyeMap":
         """Draw points (N, 3) of the world, with the vertical `up` (3,)."""
-        R_level_world = _levelling(up)
+        R_level_world = levelling(up)
         level = points @ R_level_world.T
         middle = np.median(level[:, :2], axis=0) if len(level) else np.zeros(2)
         near = (np.abs(level[:, :2] - middle) < _MOST_CELLS * cell_m).all(axis=1)
@@ -75,16 +75,26 @@ class BirdsEyeMap:
             correlation = irfft2(spectrum * np.conj(rfft2(image, s=(size, size))), s=(size, size)) / norm
             peaks += [(score, yaw, self._position(shift, size, reach_m)) for score, shift in _peaks(correlation)]
         chosen = _apart(sorted(peaks, key=lambda peak: -peak[0]), _APART * self.cell_m, most)
-        return np.array([self._pose(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
+        return np.array([self.pose_at(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
+
+    def distance_m(self, x: float, y: float) -> float:
+        """Distance of a position, levelled, from the nearest point."""
+        if not len(self.points):
+            return np.inf
+        return float(np.linalg.norm(self.points[:, :2] - [x, y], axis=1).min())
 
     def _position(self, shift: NDArray[np.intp], size: int, reach_m: float) -> FloatArray:
         """Position (2,) of the sensor for a shift (2,) of its image, in cells modulo the size."""
         shift = np.where(shift < max(self.columns.shape), shift, shift - size)
         return np.asarray(self.corner + self.cell_m * shift + reach_m, dtype=np.float64)
 
-    def _pose(
+    def pose_at(
         self, yaw: float, xy: FloatArray, level: FloatArray, T_world_lidar: FloatArray, reach_m: float
     ) -> FloatArray:
+        """Pose (4, 4) of a scan at a position (2,), levelled, turned by a yaw from a pose, at the height that fits.
+
+        Its points (N, 3) are levelled at that pose.
+        """
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         around = self.points[np.einsum("ij,ij->i", self.points[:, :2] - xy, self.points[:, :2] - xy) < reach_m**2]
@@ -93,7 +103,7 @@ class BirdsEyeMap:
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
 
 
-def _levelling(up: FloatArray) -> FloatArray:
+def levelling(up: FloatArray) -> FloatArray:
     """The smallest rotation (3, 3) that takes a unit vector (3,) near z to z."""
     K = skew(np.array([up[1], -up[0], 0.0]))
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + up[2]), dtype=np.float64)

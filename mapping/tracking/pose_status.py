@@ -7,6 +7,9 @@ from lidarslam.mapping.config import TrackingConfig
 from lidarslam.mapping.tracking.attempts import Attempt
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
+# At the end of the messages of scans that are degraded for no other reason.
+NOT_CONFIRMED = "not confirmed yet"
+
 
 def judge(
     attempt: Attempt, state: TrackingState, unexpected: bool, adrift: bool, config: TrackingConfig
@@ -27,11 +30,11 @@ def judge(
     angle_deg, distance_m = np.rad2deg(np.linalg.norm(correction[:3])), np.linalg.norm(correction[3:])
     where = f"{angle_deg:.0f} deg and {distance_m:.2f} m from the prediction"
     if attempt.relocalised:
-        message = f"relocalised in the map, {where}; not confirmed yet"
+        message = f"relocalised in the map, {where}; {NOT_CONFIRMED}"
     elif attempt.has_jumped:
         message = where
     elif state.is_unconfirmed:
-        message = "relocalised a moment ago; not confirmed yet"
+        message = f"relocalised a moment ago; {NOT_CONFIRMED}"
     elif attempt.ambiguous:
         message = "the scene is repetitive: another motion since the last scan fits nearly as well"
     elif unexpected:

@@ -31,7 +31,7 @@ def turned_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float)
 def best_starts(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> FloatArray:
     """The few of the poses (K, 4, 4) at which compensated points (N, 3) of the LiDAR frame are nearest to the map."""
     few = points[:: max(1, len(points) // _SCORED_POINTS)]
-    scores = [_score(few, start, surfel_map) for start in starts]
+    scores = [start_score(few, start, surfel_map) for start in starts]
     return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
 
 
@@ -63,12 +63,12 @@ def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap
 def best_velocity(sweep: Sweep, velocities: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> FloatArray:
     """The one of the velocities (K, 6) whose compensated sweep is nearest to the map."""
     few = sweep.take(np.arange(0, len(sweep), max(1, len(sweep) // _SCORED_POINTS)))
-    scores = [_score(few.compensated(velocity), T_world_lidar, surfel_map) for velocity in velocities]
+    scores = [start_score(few.compensated(velocity), T_world_lidar, surfel_map) for velocity in velocities]
     return np.asarray(velocities[int(np.argmax(scores))], dtype=np.float64)
 
 
-def _score(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> float:
-    """Sum of the inlier weights of points (N, 3) at a pose."""
+def start_score(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> float:
+    """Sum of the inlier weights of compensated points (N, 3) of the LiDAR frame at a pose (4, 4)."""
     _, distances = _distances(points, T_world_lidar, surfel_map)
     return float((1.0 / (1.0 + distances**2)).sum())
 

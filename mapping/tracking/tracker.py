@@ -54,6 +54,17 @@ class Tracker(Stateful):
         self._odometry_noise = OdometryNoise()
         self._prediction_error_m = _UNKNOWN_ERROR_M
 
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether the sensor was relocalised, and the next scans have not confirmed it yet."""
+        return self._state.is_unconfirmed
+
+    def begin_at(self, stamp: float, quality: float) -> None:
+        """Begin with a scan whose pose was found and whose velocity is known; the next scans must confirm it."""
+        self._state.registered(Status.OK, relocalised=True, quality=quality, stamp=stamp)
+        self._state.velocity_known = True
+        self._prediction_error_m = 0.0
+
     def predict(
         self, scan: SampledScan, prior: Prior, last: MotionState, process_noise: ProcessNoise | None = None
     ) -> Prediction:
@@ -117,13 +128,17 @@ class Tracker(Stateful):
 
     def lose(self, surfel_map: SurfelMap, has_points: bool) -> bool:
         """Update with a scan that was not registered; true where the map is archived and a new one must begin."""
-        self._prediction_error_m = _UNKNOWN_ERROR_M
-        self._state.lost(has_points)
-        if not (has_points and self._state.gives_up):
+        if not self.loses(has_points):
             return False
         self._archive.add(surfel_map)
         self._state.map_restarted()
         return True
+
+    def loses(self, has_points: bool) -> bool:
+        """Update with a scan that was not registered; true after so many that the map is to be given up."""
+        self._prediction_error_m = _UNKNOWN_ERROR_M
+        self._state.lost(has_points)
+        return has_points and self._state.gives_up
 
     def snapshot(self) -> "Tracker":
         """A copy to `rewind` to."""

@@ -155,6 +155,11 @@ class BagKit:
             self.store.register(get_types_from_msg(_LIVOX_POINT, f"{package}/msg/CustomPoint"))
             self.store.register(get_types_from_msg(_LIVOX_MESSAGE, f"{package}/msg/CustomMsg"))
 
+        if not self.ros2:  # which rosbags has for ROS 2 alone
+            self.store.register(
+                get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+            )
+
     def new(self, type_name: str, /, **values: Any) -> Any:
         """A message of a type given as package/Name."""
         return self.store.types[type_name.replace("/", "/msg/")](**values)

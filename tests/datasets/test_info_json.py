@@ -11,12 +11,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.datasets import info_text
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.info_text import describe_as_json
-from lidarslam.datasets.recording import PointField, RecordingInfo, SeveralTopicsError, Topic
+from lidarslam.datasets.recording import ImuSummary, PointField, RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.times.point_time import PointTimeModel
 
 KEYS = {
     "source", "reader", "topic", "scans", "first_stamp_s", "last_stamp_s", "duration_s", "rate_hz", "first_scan",
-    "fields", "point_time", "ground_truth", "notes", "topics", "topic_choices",
+    "fields", "point_time", "ground_truth", "imu", "notes", "topics", "topic_choices",
 }  # fmt: skip
 CLOUDS = Topic("/points", "sensor_msgs/msg/PointCloud2", 3)
 
@@ -55,6 +55,7 @@ def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (CLOUDS, Topic("/imu\x7f\x1b", "sensor_msgs/msg/Imu", 40)),
         (PointField("x", "float32"), PointField("t", "uint32")),
         ("A note.",),
+        ImuSummary("/imu", 40, 200.0, False, ("Another.",)),
     )
     assert described(bag, monkeypatch, info) == {
         "source": str(bag),
@@ -75,7 +76,8 @@ def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "fields": [{"name": "x", "type": "float32"}, {"name": "t", "type": "uint32"}],
         "point_time": {"field": "t", "unit": "ns", "reference": "relative", "first_s": -0.05, "last_s": 0.05},
         "ground_truth": str(bag.with_suffix(".tum")),
-        "notes": ["A note."],
+        "imu": {"name": "/imu", "samples": 40, "rate_hz": 200.0, "has_extrinsic": False},
+        "notes": ["A note.", "Another."],
         "topics": [
             {"name": "/points", "type": "sensor_msgs/msg/PointCloud2", "messages": 3},
             {"name": "/imu\x7f\x1b", "type": "sensor_msgs/msg/Imu", "messages": 40},
@@ -89,7 +91,7 @@ def test_what_is_not_there_is_null(bag: Path, monkeypatch: pytest.MonkeyPatch) -
     content = described(bag, monkeypatch, info)
     assert set(content) == KEYS
     assert [key for key in KEYS if content[key] is None] == [
-        key for key in KEYS if key in ("topic", "rate_hz", "point_time", "ground_truth")
+        key for key in KEYS if key in ("topic", "rate_hz", "point_time", "ground_truth", "imu")
     ]
     none = dict.fromkeys(("has_intensities", "has_colours", "has_rings"), False)
     assert content["first_scan"] == {"points": 1, "dropped_points": 0, **none}

@@ -11,8 +11,8 @@ from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.oxts import oxts_poses
-from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth
 from lidarslam.datasets.registry import choose_reader, open_recording
+from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
 
 MIDNIGHT = np.datetime64("2011-09-26T13:04:32", "ns")
@@ -60,6 +60,9 @@ def _oxts_line(time: float) -> str:
     yaw, pitch, roll = Rotation.from_matrix(T[:3, :3]).as_euler("ZYX")
     values = np.zeros(30)
     values[:6] = np.rad2deg(latitude), np.rad2deg(longitude), T[2, 3], roll, pitch, yaw
+    values[11:14] = Rotation.from_matrix(T[:3, :3]).inv().apply([0.0, 0.0, 9.81])
+    values[12] += SPEED * TURN
+    values[17:20] = T[:3, :3].T @ [0.0, 0.0, TURN]
     values[23] = 0.25
     return " ".join(repr(float(value)) for value in values)
 
@@ -110,6 +113,20 @@ def test_reads_scans_at_the_mid_stamps(tmp_path, rng, uncorrected):
     stored = np.fromfile(drive / "velodyne_points" / "data" / "0000000003.bin", np.float32).reshape(-1, 4)
     np.testing.assert_array_equal(scans[3].points, stored[:, :3])
     assert recording.describe().notes[-1].endswith("0.25 m (median).")
+
+
+def test_the_unit_is_an_imu(tmp_path, rng):
+    recording = open_recording(_write_drive(tmp_path, rng))
+    imu = recording.imu
+    np.testing.assert_allclose(imu.stamps, FIRST_STAMP + _oxts_times(8), rtol=0.0, atol=3e-7)
+    np.testing.assert_allclose(imu.T_lidar_imu, T_LIDAR_IMU, atol=1e-9)
+    for k in range(8):
+        np.testing.assert_allclose(imu.angular_velocities[k], _T_enu_imu(0.0)[:3, :3].T @ [0.0, 0.0, TURN], atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(imu.accelerations, axis=1), np.hypot(9.81, SPEED * TURN), rtol=0.01)
+    summary = recording.describe().imu
+    assert (summary.name, summary.samples, round(summary.rate_hz), summary.has_extrinsic) == ("oxts", 8, 10, True)
+    (tmp_path / "2011_09_26" / "calib_imu_to_velo.txt").unlink()
+    assert open_recording(tmp_path / "2011_09_26" / recording.name).imu.T_lidar_imu is None
 
 
 def test_rows_of_missing_scans_are_skipped(tmp_path, rng):

@@ -284,7 +284,7 @@ def test_bag_without_clouds(bag_kit):
 def test_bag_of_raw_packets(bag_kit):
     def add_packets(writer):
         digest = {"rihs01" if bag_kit.ros2 else "md5sum": "0"}
-        connection = writer.add_connection("/packets", "velodyne_msgs/msg/VelodyneScan", msgdef="uint8 a", **digest)
+        connection = writer.add_connection("/packets", "pandar_msgs/msg/PandarScan", msgdef="uint8 a", **digest)
         writer.write(connection, STAMP_NS, b"\0\1\0\0\0")
 
     with pytest.raises(InputError, match="/packets holds raw packets"):

@@ -13,6 +13,7 @@ from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.datasets.info_text import describe_source
 from lidarslam.datasets.registry import choose_reader, open_recording
 from lidarslam.datasets.times.stamps import read_stamps, stamps_from_names
 
@@ -320,7 +321,17 @@ def test_without_stamps_the_rate_gives_them(tmp_path, rng):
     _write_numbered(tmp_path, rng, ["000000.bin", "000001.bin", "000002.bin"])
     recording = open_recording(tmp_path, ReaderConfig(rate_hz=20.0))
     np.testing.assert_allclose([scan.stamp for scan in recording.scans()], [0.0, 0.05, 0.1])
-    assert any("20 scans a second" in note for note in recording.describe().notes)
+    assert any("20 scans a second are assumed, as set." in warning for warning in recording.warnings)
+    assert "at an assumed 20.00 Hz" in describe_source(tmp_path, ReaderConfig(rate_hz=20.0))
+
+
+def test_an_assumed_rate_is_a_warning_that_says_how_to_give_it(tmp_path, rng):
+    _write_numbered(tmp_path, rng, ["000000.bin", "000001.bin"])
+    warnings = open_recording(tmp_path).warnings
+    assert any("10 scans a second are assumed" in said and "--set reader.rate_hz=5" in said for said in warnings)
+    (tmp_path / "times.txt").write_text("0.0\n0.5\n")
+    assert open_recording(tmp_path).warnings == ()
+    assert "at 2.00 Hz" in describe_source(tmp_path, ReaderConfig())
 
 
 @pytest.mark.parametrize("name", ["timestamps.txt", "times.txt"])

@@ -84,7 +84,6 @@ def test_a_bag_beside_it_is_not_what_a_folder_belongs_to(tmp_path: Path) -> None
     ("name", "words"),
     [
         ("0.png", "images; name the folder with the LiDAR's scans"),
-        ("drive.pcap", "packets of a sensor; decode them with the sensor's driver"),
         ("drive.zip", "packed; unpack it"),
         ("drive.laz", "survey formats, which are not read as scans; convert each scan to .ply, .pcd or .npy"),
         ("0.csv", "points as text, which are not read as scans; convert"),

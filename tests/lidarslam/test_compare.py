@@ -312,6 +312,17 @@ def test_the_command_prints_the_table(recording: Path, tmp_path: Path) -> None:
     assert "lidarslam: room prior: ok in " in result.stderr
 
 
+def test_a_bound_that_is_not_met_has_a_status_of_its_own(recording: Path, tmp_path: Path) -> None:
+    command = ["compare", recording, "--out", tmp_path / "out", "--methods", "prior,prior+map", "--reuse"]
+    command += ["--prior", recording / "ground_truth.tum"]
+    passed = lidarslam(*command, "--max", "prior:ate=0.001", "--max", "lost=0", "--min", "memory_mb=1")
+    assert passed.exit_code == 0
+    assert "all 5 passed" in passed.stdout
+    failed = lidarslam(*command, "--max", "ate=0.1", "--max", "prior+map:kitti=1")
+    assert failed.exit_code == 4
+    assert "room prior+map  kitti  could not be computed  <= 1    FAIL" in failed.stdout
+
+
 def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, tmp_path: Path) -> None:
     prior = tmp_path / "short.tum"
     prior.write_text("0.1 0 0 0 0 0 0 1\n0.2 0 0 0 0 0 0 1\n")
@@ -334,6 +345,8 @@ def test_a_lost_method_is_a_finding_and_none_at_all_a_failure(recording: Path, t
         (["--benchmark", "{recording}/timestamps.txt", "--stop", "3"], 2, "--stop belongs to one SOURCE"),
         (["--benchmark", "{recording}/timestamps.txt"], 1, "timestamps.txt: "),
         (["{recording}", "--methods", "loam"], 1, "no method is called 'loam'"),
+        (["{recording}", "--max", "aet=0.1"], 2, "no figure is called 'aet'; there are: ate, "),
+        (["{recording}", "--min", "loam:ate=0.1"], 1, "no method is called 'loam'; there are: learned+map, kiss-icp"),
         (["{recording}", "--reuse", "--overwrite"], 1, "choose one"),
         (["{recording}", "--set", "global_map.size=1"], 1, "there is no global_map.size"),
         (["{recording}", "--start", "0", "--timeout-s", "0"], 2, "not in the range"),

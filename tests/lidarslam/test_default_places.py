@@ -194,3 +194,15 @@ def test_config_is_short_everywhere() -> None:
     configs = [option for option in options if "--config" in option.opts]
     assert len(configs) >= 7
     assert all("-c" in option.opts for option in configs)
+
+
+def test_results_are_named_after_sequence_and_data_set() -> None:
+    Path("disk/nuscenes/v1.0-mini").mkdir(parents=True)
+    Path("disk/nuscenes/v1.0-mini/scene.json").touch()
+    Path("disk/area/MathildaAVE/poses").mkdir(parents=True)
+    Path("disk/area/MathildaAVE/poses/gt_poses.txt").touch()
+    assert source_name(Path("disk/nuscenes"), "scene-0061") == "nuscenes_scene-0061"
+    assert source_name(Path("disk/area"), "MathildaAVE") == "area_MathildaAVE"
+    assert source_name(Path("disk/area/MathildaAVE"), "MathildaAVE") == "MathildaAVE"
+    assert source_name(Path("disk/site.bag"), "04") == "site"
+    assert source_name(Path("evalio_data/hilti_2022/basement_2")) == "hilti_2022_basement_2"

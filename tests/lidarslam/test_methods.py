@@ -52,7 +52,10 @@ def test_prior_is_the_external_odometry() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("loam", r"no method is called 'loam'; there are: learned, kiss-icp, constant-velocity, prior;"),
+        (
+            "loam",
+            r"no method is called 'loam'; there are: learned, kiss-icp, kiss-icp-no-deskew, constant-velocity, imu, .*prior;",
+        ),
         ("external", "no method is called 'external'"),
         ("kiss-icp+mapping", r"no method is called 'kiss-icp\+mapping'"),
         ("kiss-icp+graph+map", "no method is called"),
@@ -64,6 +67,9 @@ def test_prior_is_the_external_odometry() -> None:
         ("kiss-icp@fine", "expected a voxel size in metres, as in kiss-icp@0.5, got 'fine'"),
         ("kiss-icp@-1", "expected a voxel size"),
         ("kiss-icp@nan", "expected a voxel size"),
+        ("imu", r"measures turns alone; compare imu\+map or imu\+loam"),
+        ("learned+imu", r"takes part in scan-to-map registration; compare learned\+imu\+map"),
+        ("kiss-icp+imu+map", "no method is called"),
         ("constant-velocity", r"only predicts; compare constant-velocity\+map or constant-velocity\+loam"),
     ],
 )

@@ -24,6 +24,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.folders.ply import read_ply
+from lidarslam.simulation.sensors.imu import MEMS_IMU, sample_imu
 from lidarslam.storage.finished_run import load_run
 
 ROOT = Path(__file__).parents[2]
@@ -159,6 +160,10 @@ METHODS = {
         "--odometry", "constant-velocity", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",
         "--set", "pose_graph.loops.min_way_m=0.5",
     ],
+    "imu": [
+        "--odometry", "imu", "--pose-graph", "--set", "pose_graph.keyframes.distance_m=0.2",
+        "--set", "pose_graph.loops.min_way_m=0.5",
+    ],
     "kiss-icp": ["--odometry", "kiss-icp", "--no-mapping", "--set", "odometry.kiss_icp.threads=1", "--stop", "12"],
 }  # fmt: skip
 FAST = [
@@ -202,6 +207,10 @@ def source(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
         np.save(folder / f"{index:06d}.npy", table)
     np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
     write_tum(folder / "ground_truth.tum", Trajectory(stamps, there_and_back(stamps)))
+    model = replace(MEMS_IMU, T_lidar_imu=np.eye(4))
+    imu = sample_imu(model, there_and_back, 0.0, 0.1 * SCANS + 0.2, seed=1)
+    rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])
+    np.savetxt(folder / "imu.csv", rows, delimiter=",", header="T_lidar_imu: 1 0 0 0 0 1 0 0 0 0 1 0")
     return folder
 
 

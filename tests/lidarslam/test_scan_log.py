@@ -38,7 +38,7 @@ def result(stamp: float, status: Status = Status.OK, **values: Any) -> ScanResul
 @pytest.fixture
 def log() -> ScanLog:
     log = ScanLog()
-    log.add(result(1.0), total_ms=10.0)
+    log.add(result(1.0, covariance=np.diag([1e-6, 4e-6, 9e-6, 1e-4, 4e-4, 1.0])), total_ms=10.0)
     log.add(result(2.5, Status.LOST, message="no points, none", degenerate=("x", "yaw"), residual_m=None), 20.0)
     log.warn("twice")
     log.warn("twice")
@@ -47,8 +47,8 @@ def log() -> ScanLog:
 
 def test_the_table_has_a_row_a_scan(log: ScanLog) -> None:
     assert log.format_csv().splitlines()[1:] == [
-        "0,1.000000000,ok,100,1,90,0.0123,,,1.23,0.00,0.00,0.00,0.00,2.00,",
-        '1,2.500000000,lost,100,1,90,,,x yaw,1.23,0.00,0.00,0.00,0.00,2.00,"no points, none"',
+        "0,1.000000000,ok,100,1,90,0.0123,,,0.001,0.002,0.003,0.01,0.02,1,1.23,0.00,0.00,0.00,0.00,2.00,",
+        '1,2.500000000,lost,100,1,90,,,x yaw,,,,,,,1.23,0.00,0.00,0.00,0.00,2.00,"no points, none"',
     ]
 
 

@@ -10,6 +10,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.trajectory import chain
 from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.attitude import Attitude
 from lidarslam.mapping.pose_graph.edges import first_connected
 from lidarslam.mapping.pose_graph.optimizer import _LEAST, bounded, optimise, relax
 
@@ -269,3 +270,29 @@ def test_a_real_graph_ends_where_gtsam_ends_with_it(real_data: Path) -> None:
     for key, pose in enumerate(optimised.poses):
         ours.insert(key, gtsam.Pose3(pose))
     assert factors.error(ours) == pytest.approx(factors.error(found), rel=1e-6)
+
+
+def test_gravity_holds_roll_and_pitch_where_the_edges_drift() -> None:
+    """On a long flat drive: edges that pitch up a little each end far above the ground, attitudes keep them on it."""
+    truth = chain(np.eye(4), exp(np.tile([0.0, 0.0, 0.002, 1.0, 0.0, 0.0], (300, 1))))
+    up = np.array([0.0, 0.0, 1.0])
+    bend = exp(np.array([0.0, np.deg2rad(-0.02), 0.0, 0.0, 0.0, 0.0]))
+    covariance = np.diag([np.deg2rad(0.05)] * 3 + [0.01] * 3) ** 2
+    edges = [
+        RelativePose(key, key + 1, one.T_first_second @ bend, covariance) for key, one in enumerate(chained(truth))
+    ]
+    attitudes = [Attitude(key, truth[key, :3, :3].T @ up, up, np.deg2rad(0.3)) for key in range(0, len(truth), 2)]
+    alone = optimise(drifted(edges, len(truth)), edges, []).poses
+    held = optimise(drifted(edges, len(truth)), edges, [], attitudes).poses
+    tilts = [np.rad2deg(np.arccos(np.clip(poses[:, 2, 2], -1.0, 1.0))).max() for poses in (alone, held)]
+    assert tilts[0] > 5.0
+    assert tilts[1] < 0.3
+    heights = [float(np.abs(poses[:, 2, 3] - truth[:, 2, 3]).max()) for poses in (alone, held)]
+    assert heights[0] > 10.0
+    assert heights[1] < 0.05 * heights[0]
+
+
+def test_an_attitude_leaves_the_heading_alone() -> None:
+    truth = np.stack([np.eye(4), exp([0.0, 0.0, 2.0, 1.0, 0.0, 0.0])])
+    edges, up = chained(truth), np.array([0.0, 0.0, 1.0])
+    assert_near(optimise(truth, edges, [], [Attitude(1, up, up, 1e-3)]).poses, truth, 1e-6)

@@ -369,7 +369,7 @@ def test_what_joined_two_recordings_and_is_not_inlier_in_the_end_leaves_no_trace
 ) -> None:
     graph, joined = two
 
-    def reject_all(poses: FloatArray, edges: list[RelativePose], loops: list[RelativePose]) -> Optimised:
+    def reject_all(poses: FloatArray, edges: list[RelativePose], loops: list[RelativePose], _: object) -> Optimised:
         return replace(optimise(poses, edges, loops), inliers=np.zeros(len(loops), dtype=np.bool_))
 
     monkeypatch.setattr(slam_graph, "optimise", reject_all)

@@ -53,6 +53,30 @@ def request(out, **changes):
     return RecordRequest(out, **{**values, **changes})
 
 
+@pytest.mark.parametrize("name", ["ply", "mcap"])
+def test_a_recording_with_an_imu(name, tmp_path):
+    outs = [tmp_path / "with", tmp_path / "without"]
+    for out in outs:
+        record(request(out, format=name, imu=out.name == "with"), silently)
+    imu, scans = open_recording(outs[0]).imu, list(open_recording(outs[0]).scans())
+    assert len(imu) == SCANS * 20 + 1
+    assert imu.stamps[0] == scans[0].stamp
+    assert imu.stamps[-1] == pytest.approx(scans[-1].stamp + 0.1, abs=1e-6)
+    assert np.median(np.linalg.norm(imu.accelerations, axis=1)) == pytest.approx(9.81, abs=0.3)  # it starts at rest
+    assert open_recording(outs[1]).imu is None
+    for scan, same in zip(scans, open_recording(outs[1]).scans(), strict=True):
+        np.testing.assert_array_equal(scan.points, same.points)
+    readmes = [(out / "README.md").read_text() for out in outs]
+    assert ["The IMU" in readme and "--imu" in readme for readme in readmes] == [True, False]
+    record(request(outs[0], format=name, overwrite=True), silently)
+    assert open_recording(outs[0]).imu is None
+
+
+def test_kitti_has_no_place_for_an_imu(tmp_path):
+    with pytest.raises(InputError, match="kitti has no place for an IMU"):
+        record(request(tmp_path / "x", format="kitti", imu=True), silently)
+
+
 def silently(number, total):
     pass
 

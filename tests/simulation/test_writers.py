@@ -1,6 +1,7 @@
 """Every format, read back with the program's own readers."""
 
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import inverse, transform_points
+from lidarslam.core.geometry import exp, inverse, transform_points
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
@@ -46,6 +48,42 @@ def rig(drive):
 
 def make_rig(drive, driver="velodyne"):
     return Rig(driver, SWEEP_S, drive)
+
+
+def some_imu():
+    """Samples from 0 to 0.5 s that can be recognised."""
+    stamps = np.arange(101) / 200
+    turns, forces = np.random.default_rng(3).normal([[[0.0] * 3], [[1.0, 2.0, 9.5]]], 0.3, (2, 101, 3))
+    return ImuSamples(stamps, turns, forces, exp([0.1, 0.2, 3.0, 0.05, -0.02, 0.1]))
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("name", ["ply", *BAGS])
+def test_an_imu_is_recorded_too(name, driver, tmp_path, sweeps, drive):
+    imu = some_imu()
+    recording = write(name, tmp_path / "room", sweeps, replace(make_rig(drive, driver), imu=imu))
+    for scan, simulated in zip(recording.scans(), sweeps, strict=True):
+        assert_same(scan, simulated.scan)
+    found = recording.imu
+    np.testing.assert_array_equal(found.stamps, [clock_ns(stamp) / 10**9 for stamp in imu.stamps])
+    np.testing.assert_allclose(found.angular_velocities, imu.angular_velocities, rtol=1e-8)
+    np.testing.assert_allclose(found.accelerations, imu.accelerations, rtol=1e-8)
+    np.testing.assert_allclose(found.T_lidar_imu, imu.T_lidar_imu, atol=1e-11)
+    assert found.notes == ()
+    summary = recording.describe().imu
+    assert (summary.samples, round(summary.rate_hz), summary.has_extrinsic) == (101, 200, True)
+    assert summary.name == {"ply": "imu.csv"}.get(name, DRIVERS[driver].imu_topic)
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_topics_of_both(name, tmp_path, sweeps, drive):
+    find_format(name).writer()(tmp_path / "room", iter(sweeps), replace(make_rig(drive), imu=some_imu()))
+    with (Rosbag1Reader if name == "rosbag1" else Rosbag2Reader)(find_format(name).source_in(tmp_path / "room")) as bag:
+        assert {c.topic: c.msgcount for c in bag.connections} == {
+            "/velodyne_points": 4,
+            "/imu/data": 101,
+            "/tf_static": 1,
+        }
 
 
 def write(name, folder, sweeps, rig):
@@ -274,7 +312,7 @@ def test_one_scan_is_held_at_a_time(name, tmp_path, sweeps, rig):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
-    find_format(name).writer()(tmp_path / "room", iter(sweeps[:2]), rig)
+    find_format(name).writer()(tmp_path / "room", iter(sweeps[:2]), replace(rig, imu=some_imu()))
     patterns = find_format(name).files
     for entry in (tmp_path / "room").iterdir():
         assert any(entry.match(pattern) for pattern in patterns)

@@ -31,12 +31,15 @@ class CommandWithExample(click.Command):
 
 
 class _Path(click.Path):
-    """A path that is not empty, which would mean the current folder."""
+    """A path that is not empty, which would mean the current folder; for evalio:DATASET/SEQUENCE, its folder."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from lidarslam.datasets.published.evalio_names import located
+
         if value == "":
             self.fail("the path is empty; name a file or a folder", param, ctx)
-        return super().convert(value, param, ctx)
+        path = super().convert(value, param, ctx)
+        return located(path) if isinstance(path, Path) else path
 
 
 PATH = _Path(path_type=Path)
@@ -72,7 +75,7 @@ config_options = _together(
 reader_options = _together(
     click.option("--reader", type=_READER, help="Reader of the source.  [default: recognised]"),
     click.option("--topic", metavar="TOPIC", help="Point cloud topic of a bag with several."),
-    click.option("--sequence", metavar="NN", help="Sequence of a KITTI odometry root, such as 04."),
+    click.option("--sequence", metavar="NAME", help="Sequence of a data set's root, such as 04 of KITTI odometry."),
 )
 scan_options = _together(
     click.option("--start", type=click.IntRange(min=0), default=0, show_default=True, help="First scan."),
@@ -81,7 +84,9 @@ scan_options = _together(
 )
 odometry_options = _together(
     click.option(
-        "--odometry", type=click.Choice(["learned", "kiss-icp", "constant-velocity"]), help="[default: learned]"
+        "--odometry",
+        type=click.Choice(["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu"]),
+        help="Motion from scan to scan; imu and learned+imu use the recording's IMU.  [default: learned]",
     ),
     click.option(
         "--weights",
@@ -181,9 +186,9 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
     odometry, weights, prior = options.pop("odometry", None), options.pop("weights", None), options.get("prior")
     settings = []
     if weights is not None:
-        if odometry not in (None, "learned") or prior is not None:
+        if odometry not in (None, "learned", "learned+imu") or prior is not None:
             raise click.UsageError("--weights belongs to --odometry learned; leave it, or the other odometry, out")
-        odometry = "learned"
+        odometry = odometry or "learned"
         settings.append(setting("odometry.learned.weights", str(weights.resolve())))
     if prior is not None:
         if odometry is not None:
@@ -205,10 +210,10 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
 
 
 def _note_unused(source: Path, reader: str | None, topic: str | None, sequence: str | None) -> None:
-    from lidarslam.datasets.registry import choose_reader
+    from lidarslam.datasets.registry import choose_reader, takes_sequence
 
     chosen = choose_reader(source, reader)
     if topic is not None and chosen != "rosbag":
         note(f"--topic {topic} is ignored: {source} is not a bag ({chosen})")
-    if sequence is not None and chosen != "kitti-odometry":
-        note(f"--sequence {sequence} is ignored: {source} is not a KITTI odometry root ({chosen})")
+    if sequence is not None and not takes_sequence(source, chosen):
+        note(f"--sequence {sequence} is ignored: {source} is one recording ({chosen})")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 EXIT_MENDABLE = 1
 EXIT_LOST = 3
+EXIT_GATE = 4
 
 
 def say(text: str) -> None:

@@ -15,12 +15,19 @@ _BASES = {
     "kiss-icp": "kiss-icp",
     "kiss-icp-no-deskew": "kiss-icp",
     "constant-velocity": "constant-velocity",
+    "imu": "imu",
+    "learned+imu": "learned+imu",
     "prior": "external",
 }
 _NO_DESKEW = "kiss-icp-no-deskew"
 # A peer's run: its poses as they are.
 _PEER = ("odometry.method=external", "mapping.method=off", "pose_graph.enabled=false")
-_NAME = re.compile(r"(?P<base>[a-z][a-z-]*)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?")
+_ONLY_WITH_MAP = {
+    "constant-velocity": "only predicts",
+    "imu": "measures turns alone",
+    "learned+imu": "the IMU takes part in scan-to-map registration",
+}
+_NAME = re.compile(r"(?P<base>[a-z][a-z-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?")
 _MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
 _GRAMMAR = (
     f"{', '.join(_BASES)}; each with +map or +loam, with +graph, or with both as in learned+map+graph;"
@@ -57,9 +64,9 @@ def parse_method(name: str) -> Method:
     odometry = _BASES[match["base"]]
     if odometry not in get_args(OdometryName):
         raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
-    if odometry == "constant-velocity" and not match["mapping"]:
+    if odometry in _ONLY_WITH_MAP and not match["mapping"]:
         raise ConfigError(
-            f"{name}: only predicts; compare constant-velocity+map or constant-velocity+loam, which correct it against"
+            f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
             " a map"
         )
     voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)

@@ -10,6 +10,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, scan_indices
+from lidarslam.datasets.imu_samples import summarise
 from lidarslam.datasets.recording import PointField, RecordingInfo
 from lidarslam.datasets.times.point_time import PointTimeModel
 
@@ -18,6 +19,7 @@ class FileRecording:
     """A folder of scans; implements `Recording`. A reader adds `_read`, stamps, and a truth if there may be one."""
 
     reader: str
+    imu_name: str = "imu"
     stamps: FloatArray
     """(N,) seconds."""
 
@@ -43,7 +45,7 @@ class FileRecording:
 
     @property
     def imu(self) -> ImuSamples | None:
-        """No IMU."""
+        """The samples of the IMU beside the LiDAR."""
         return None
 
     @property
@@ -75,7 +77,14 @@ class FileRecording:
             point_time=self._point_time_model(),
             fields=self._fields(index),
             notes=(*self._notes(), *self.warnings, *unreadable.warnings()),
+            rate_is_assumed=self._rate_is_assumed,
+            imu=summarise(self.imu_name, self.imu),
         )
+
+    @property
+    def _rate_is_assumed(self) -> bool:
+        """Whether the stamps follow from the rate of the settings."""
+        return False
 
     def _read(self, index: int, faults: Faults) -> Scan:
         raise NotImplementedError

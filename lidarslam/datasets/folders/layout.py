@@ -10,9 +10,9 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import count
-from lidarslam.datasets.folders.scan_files import natural_key
+from lidarslam.datasets.folders.imu_csv import find_imu_file
+from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key
 from lidarslam.datasets.folders.truth_files import find_truth_file
-from lidarslam.datasets.registry import SCAN_SUFFIXES
 from lidarslam.datasets.times.stamps import mend_stamps, read_stamps, stamps_from_names
 
 _STAMP_FILES = ("timestamps.txt", "times.txt")
@@ -26,6 +26,7 @@ class FolderLayout:
     stamps: FloatArray  # (N,) seconds, strictly increasing
     from_clock: bool  # whether the stamps were found; else they are made from the rate
     truth: Path | None  # a TUM file, or None
+    imu: Path | None  # a table of samples, or None
     notes: tuple[str, ...]  # facts for the user
     warnings: tuple[str, ...]  # faults and repairs
 
@@ -56,13 +57,14 @@ def find_layout(folder: Path, rate_hz: float) -> FolderLayout:
         from_clock = False
         if named is not None:
             warnings.append("The file names look like stamps, but some are equal.")
-        notes.append(f"There are no stamps; they assume {rate_hz:g} scans a second.")
     whole = (
         folder.resolve().parent.parent if folder.resolve().parent.name == "velodyne_points" else folder.resolve().parent
     )
     if folder.resolve().name == "velodyne" or whole != folder.resolve().parent:
         warnings.append(f"The folder is part of a KITTI recording; name {whole} for its times, poses and calibration.")
-    return FolderLayout(tuple(files), stamps, from_clock, find_truth_file(places), tuple(notes), tuple(warnings))
+    return FolderLayout(
+        tuple(files), stamps, from_clock, find_truth_file(places), find_imu_file(places), tuple(notes), tuple(warnings)
+    )
 
 
 def _find_scans(folder: Path) -> tuple[list[Path], list[str], list[str]]:

@@ -14,6 +14,7 @@ _LARGEST_BYTES = 1 << 31
 # A larger number is no scan's, such as a time.
 _MOST_SCANS = 10**9
 
+SCAN_SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 
 

@@ -1,6 +1,7 @@
 """A folder of scan files: `.bin`, `.pcd`, `.ply` or `.npy`, one sweep each."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
@@ -16,10 +18,13 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import NO_POINT_TIME, Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.formats import table_reader
+from lidarslam.datasets.folders.imu_csv import IMU_FILE, read_imu_csv
 from lidarslam.datasets.folders.layout import find_layout
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
 from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
+from lidarslam.datasets.times.azimuth_inference import AzimuthTiming, Sweep, infer_azimuth_timing, pair_starts
 from lidarslam.datasets.times.point_time import (
     CLOCK_LIMIT_S,
     UNITS_PER_SECOND,
@@ -29,7 +34,7 @@ from lidarslam.datasets.times.point_time import (
     is_return,
 )
 from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
-from lidarslam.datasets.times.stamps import scan_rate
+from lidarslam.datasets.times.stamps import assumed_rate, scan_rate
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -47,6 +52,7 @@ class ScanFolderRecording(FileRecording):
     """The scans of one folder."""
 
     reader = "scan-folder"
+    imu_name = IMU_FILE
 
     def __init__(self, folder: Path, config: ReaderConfig) -> None:
         self._layout = find_layout(folder, config.rate_hz)
@@ -59,10 +65,17 @@ class ScanFolderRecording(FileRecording):
         """The TUM file ground_truth.tum, groundtruth.tum or the like, in the folder or the one above."""
         return None if self._layout.truth is None else read_tum(self._layout.truth)
 
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """The table imu.csv in the folder or the one above."""
+        return None if self._layout.imu is None else read_imu_csv(self._layout.imu)
+
     @property
     def warnings(self) -> tuple[str, ...]:
-        """How the stamps were mended."""
-        return self._layout.warnings
+        """An assumed rate, how the stamps were mended, and times of points that could follow from their azimuth."""
+        assumed = assumed_rate("The scans have no stamps", self._config) if self._rate_is_assumed else None
+        further = (assumed, self._azimuth.warning)
+        return (*self._layout.warnings, *(warning for warning in further if warning is not None))
 
     def _table(self, index: int) -> tuple[NDArray[np.void], FloatArray]:
         path = self._files[index]
@@ -76,10 +89,11 @@ class ScanFolderRecording(FileRecording):
         table, points = self._table(index)
         stamp, offsets = self._stamp_and_offsets(index, table, points)
         names = scalar_fields(table)
-        ring_field = find_ring_field(names)
-        rings = None if ring_field is None else table[ring_field]
+        rings = _rings(table)
+        if offsets is None:
+            offsets = self._azimuth.offsets(Sweep(points, rings))
         scan = Scan.from_raw(points, stamp, offsets, rings, read_intensities(table, names), read_colours(table, names))
-        if self._point_time is not None and scan.time_offsets is None and len(scan):
+        if self._point_time_model() is not None and scan.time_offsets is None and len(scan):
             faults.note(NO_POINT_TIME, str(self._files[index]))
         return scan
 
@@ -109,6 +123,27 @@ class ScanFolderRecording(FileRecording):
         period_s = None if rate is None else 1.0 / rate
         return learn_point_time(self._timed_clouds(), config.time_unit, config.time_reference, period_s)
 
+    @property
+    def _rate_is_assumed(self) -> bool:
+        model = self._point_time
+        return not (self._layout.from_clock or (model is not None and model.reference == "absolute"))
+
+    @cached_property
+    def _azimuth(self) -> AzimuthTiming:
+        """Decided once, as well."""
+        if self._point_time is not None:
+            return AzimuthTiming()
+        rate = scan_rate(self.stamps)
+        runs = (self._sweeps(index) for index in pair_starts(len(self)))
+        return infer_azimuth_timing(runs, None if rate is None else 1.0 / rate, self._config.time_reference)
+
+    def _sweeps(self, first: int) -> Iterator[Sweep]:
+        """Two consecutive scans, as far as they can be read."""
+        for index in (first, first + 1):
+            with suppress(InputError):  # counted when it is its turn
+                table, points = self._table(index)
+                yield Sweep(points, _rings(table))
+
     def _timed_clouds(self) -> Iterator[TimedCloud]:
         for index, stamp in enumerate(self.stamps):
             try:
@@ -130,11 +165,19 @@ class ScanFolderRecording(FileRecording):
         return self._layout.truth
 
     def _point_time_model(self) -> PointTimeModel | None:
-        return self._point_time
+        return self._point_time if self._azimuth.period_s is None else AZIMUTH_TIME
 
     def _fields(self, index: int) -> tuple[PointField, ...]:
         table, _ = self._table(index)
         return tuple(PointField(name, str(table.dtype[name].base)) for name in table.dtype.names or ())
 
     def _notes(self) -> Iterator[str]:
-        return iter(self._layout.notes)
+        yield from self._layout.notes
+        if self._azimuth.note is not None:
+            yield self._azimuth.note
+
+
+def _rings(table: NDArray[np.void]) -> NDArray[np.generic] | None:
+    """The numbers (N,) of the points' lasers, as stored."""
+    field = find_ring_field(scalar_fields(table))
+    return None if field is None else table[field]

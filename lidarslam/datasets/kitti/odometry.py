@@ -24,7 +24,7 @@ from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps, read_stamps
+from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -139,6 +139,10 @@ class KittiOdometryRecording(FileRecording):
     def _truth_path(self) -> Path | None:
         return self._pose_file if (self._folder / "calib.txt").is_file() else None
 
+    @property
+    def _rate_is_assumed(self) -> bool:
+        return self._times is None
+
     def _notes(self) -> Iterator[str]:
         yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
         yield correction.NOTE
@@ -151,7 +155,7 @@ class KittiOdometryRecording(FileRecording):
     def _warnings(self) -> Iterator[str]:
         last, poses = int(self._numbers[-1]), 0
         if self._times is None:
-            yield f"There is no times.txt; the stamps assume {self._config.rate_hz:g} scans a second."
+            yield assumed_rate("There is no times.txt", self._config)
         if len(self) <= last - self._numbers[0]:
             yield f"Of the scans {self._numbers[0]} to {last} only {len(self)} are there."
         if self._pose_file is not None and self._truth_path() is None:

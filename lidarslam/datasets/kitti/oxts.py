@@ -16,6 +16,8 @@ _POLE_DEG = 90.0
 _EARTH_RADIUS_M = 6378137.0  # WGS 84, equator, as KITTI's own development kit has it
 _COLUMNS = 30
 _POSITION_ACCURACY_COLUMN = 23
+# Of the unit's own axes; the columns behind them are of the level ones.
+_ACCELERATIONS, _ANGULAR_VELOCITIES = slice(11, 14), slice(17, 20)
 
 
 class OxtsPoses(NamedTuple):
@@ -24,6 +26,9 @@ class OxtsPoses(NamedTuple):
     numbers: NDArray[np.intp]  # (N,) the row of the stamp file each pose belongs to
     T_enu_imu: FloatArray  # (N, 4, 4) in an east-north-up frame; imu is x forward, y left, z up
     accuracy_m: FloatArray  # (N,) standard deviation of the position as the unit itself states it
+    angular_velocities: FloatArray  # (N, 3) rad/s
+    accelerations: FloatArray  # (N, 3) specific force, m/s^2
+    geodetic: FloatArray  # (N, 3) latitude and longitude in degrees, altitude in metres
 
 
 def read_oxts(folder: Path) -> OxtsPoses:
@@ -39,7 +44,9 @@ def read_oxts(folder: Path) -> OxtsPoses:
             expected = f"one line of {_COLUMNS} numbers that begins with a latitude"
             raise InputError(f"{path}: expected {expected}, got {len(table)} lines; copy the file again")
     rows = np.concatenate(tables)
-    return OxtsPoses(numbers, oxts_poses(rows), rows[:, _POSITION_ACCURACY_COLUMN])
+    accuracy_m = rows[:, _POSITION_ACCURACY_COLUMN]
+    velocities, accelerations = rows[:, _ANGULAR_VELOCITIES], rows[:, _ACCELERATIONS]
+    return OxtsPoses(numbers, oxts_poses(rows), accuracy_m, velocities, accelerations, rows[:, :3])
 
 
 def oxts_poses(rows: FloatArray) -> FloatArray:

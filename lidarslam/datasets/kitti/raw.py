@@ -11,17 +11,20 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
+from lidarslam.datasets.imu_samples import usable_samples
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_raw_calibration
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
-from lidarslam.datasets.kitti.raw_timing import offsets_from_azimuth, read_sweep_timing
+from lidarslam.datasets.kitti.raw_timing import read_sweep_timing
 from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.times.azimuth import AZIMUTH_TIME, offsets_from_azimuth
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows, read_stamps
 
@@ -47,11 +50,12 @@ class KittiRawRecording(FileRecording):
     """One drive."""
 
     reader = "kitti-raw"
+    imu_name = "oxts"
 
     def __init__(self, drive: Path, config: ReaderConfig) -> None:
         files, self._numbers = numbered_scans(drive / "velodyne_points" / "data")
         super().__init__(drive, config, files)
-        self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config.rate_hz)
+        self._timing = read_sweep_timing(drive / "velodyne_points", self._numbers, config)
         self.stamps = self._timing.stamps
 
     @cached_property
@@ -81,6 +85,20 @@ class KittiRawRecording(FileRecording):
         if not kept.any():
             return None
         return Trajectory(stamps[kept], inverse(T_enu_lidar[kept][0]) @ T_enu_lidar[kept])
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """Angular velocities and accelerations of the GPS/IMU unit, one for each camera image."""
+        oxts = self._oxts
+        if oxts is None:
+            return None
+        T_lidar_imu = self._calibration("calib_imu_to_velo.txt")
+        return usable_samples(self._oxts_stamps(oxts), oxts.angular_velocities, oxts.accelerations, T_lidar_imu)
+
+    @property
+    def oxts(self) -> tuple[OxtsPoses, FloatArray] | None:
+        """The GPS/IMU unit's rows and their stamps (N,), NaN where there is none; None without the unit."""
+        return None if self._oxts is None else (self._oxts, self._oxts_stamps(self._oxts))
 
     def _oxts_stamps(self, oxts: OxtsPoses) -> FloatArray:
         """Stamps (N,) of the unit's poses on the clock of the scans, NaN where there is none.
@@ -115,7 +133,11 @@ class KittiRawRecording(FileRecording):
         return None if self.ground_truth is None else self._folder / "oxts"
 
     def _point_time_model(self) -> PointTimeModel | None:
-        return None if self._config.time_reference == "none" else PointTimeModel("azimuth", "s", "relative")
+        return None if self._config.time_reference == "none" else AZIMUTH_TIME
+
+    @property
+    def _rate_is_assumed(self) -> bool:
+        return not self._timing.from_clock
 
     @property
     def warnings(self) -> tuple[str, ...]:

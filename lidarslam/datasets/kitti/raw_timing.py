@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.plain_text import count
-from lidarslam.datasets.times.stamps import mend_stamps, read_stamps
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.times.stamps import assumed_rate, mend_stamps, read_stamps
 
 # Sweeps of one drive last the same to 0.2 %; a larger difference than this part is a wrong stamp.
 _SWEEP_TOLERANCE = 0.25
@@ -26,13 +27,13 @@ class SweepTiming:
     notes: tuple[str, ...]  # facts for the user
 
 
-def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], rate_hz: float) -> SweepTiming:
+def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], config: ReaderConfig) -> SweepTiming:
     """Read timestamps.txt, timestamps_start.txt and timestamps_end.txt of a `velodyne_points` folder.
 
     Args:
         folder: where the three files are, if they are.
         numbers: (N,) the scans' numbers, which are the rows of the files; a missing scan has a blank row.
-        rate_hz: makes the stamps when timestamps.txt is missing or useless.
+        config: its rate makes the stamps when timestamps.txt is missing or useless.
 
     Raises:
         InputError: a file is damaged.
@@ -41,15 +42,13 @@ def read_sweep_timing(folder: Path, numbers: NDArray[np.intp], rate_hz: float) -
         found = _rows(folder / "timestamps.txt", numbers)
         stamps, replaced = mend_stamps(found, numbers.astype(np.float64))
     except ValueError:
-        half = np.full(len(numbers), 0.5 / rate_hz)
-        note = (
-            f"There is no timestamps.txt with two stamps that increase; the stamps assume {rate_hz:g} scans a second."
-        )
-        return SweepTiming(numbers / rate_hz, half, half, False, (note,))
+        half = np.full(len(numbers), 0.5 / config.rate_hz)
+        note = assumed_rate("There is no timestamps.txt with two stamps that increase", config)
+        return SweepTiming(numbers / config.rate_hz, half, half, False, (note,))
     notes = []
     if replaced:
         notes.append(f"{count(replaced, 'stamp')} of timestamps.txt interpolated: missing, repeated or backwards.")
-    period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / rate_hz
+    period = float(np.median(np.diff(stamps) / np.diff(numbers))) if len(stamps) > 1 else 1.0 / config.rate_hz
     start, end = (_rows(folder / f"timestamps_{which}.txt", numbers) for which in ("start", "end"))
     before_s, wrong_starts = _plausible(stamps - start, 0.5 * period)
     after_s, wrong_ends = _plausible(end - stamps, 0.5 * period)
@@ -68,15 +67,3 @@ def _rows(path: Path, numbers: NDArray[np.intp]) -> FloatArray:
 def _plausible(durations: FloatArray, expected: float) -> tuple[FloatArray, int]:
     wrong = ~(np.abs(durations - expected) < _SWEEP_TOLERANCE * expected)  # NaN is wrong too
     return np.where(wrong, expected, durations), int(np.count_nonzero(wrong))
-
-
-def offsets_from_azimuth(points: NDArray[np.floating], before_s: float, after_s: float) -> FloatArray:
-    """Seconds (N,) from the stamp at which points (N, 3) of one sweep were measured.
-
-    Seen from above the laser turns clockwise: it starts at the rear (azimuth pi), sweeps the left side, faces
-    forward (azimuth 0) at the stamp, sweeps the right side and ends at the rear (azimuth -pi). Measured on the
-    drives 0005 and 0009: deskewed in this direction, scans half a second apart lie closer to each other's planes
-    than without deskewing, deskewed in the opposite direction less close.
-    """
-    half_turns: FloatArray = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / -np.pi
-    return np.where(half_turns < 0.0, before_s * half_turns, after_s * half_turns)

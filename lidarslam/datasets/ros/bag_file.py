@@ -31,6 +31,7 @@ class BagFile:
 
     Attributes:
         topics: with their numbers of messages.
+        ros2: whether its messages are of ROS 2.
         damage: why it is read without its index or metadata; None when they are sound.
     """
 
@@ -43,7 +44,7 @@ class BagFile:
         if path.is_file() and not path.stat().st_size:
             raise InputError(f"{path}: is empty, 0 bytes; copy the bag again")
         self.path = path
-        self._ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
+        self.ros2 = not path.name.endswith((".bag", ".bag.active"))  # .active: the recorder was killed
         self._has_index = True
         self._messages_are_compressed = False
         self.damage: str | None = None
@@ -152,7 +153,7 @@ class BagFile:
             if self._messages_are_compressed:
                 with self._damage("a compressed message is damaged"):
                     raw = DECOMPRESSORS["zstd"](raw, 0)
-            header_ns, frame_id = read_header(raw, self._ros2)
+            header_ns, frame_id = read_header(raw, self.ros2)
         except (InputError, ValueError) as error:
             damage = str(error) if isinstance(error, InputError) else f"{self.path}: {error}"
             return BagMessage(record_ns, 0, "", topic.message_type, b"", damage)
@@ -185,14 +186,14 @@ class BagFile:
         """
         with self._damage("a point cloud cannot be decoded"):
             try:
-                return decode(message, self._ros2, time_field)
+                return decode(message, self.ros2, time_field)
             except InputError as error:
                 raise InputError(f"{self.path}: {error}") from error
 
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
-            reader = Rosbag2Reader(self.path) if self._ros2 else Rosbag1Reader(self.path)
+            reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
         try:
             yield reader
@@ -211,7 +212,7 @@ class BagFile:
             raise InputError(f"{self.path}: {place} ({reason}); {self._remedy()}") from error
 
     def _suffix(self, path: Path) -> str:
-        return path.suffix if self._ros2 else ".bag"
+        return path.suffix if self.ros2 else ".bag"
 
     def _remedy(self) -> str:
         if self.path.is_dir():

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
-from typing import cast
+from typing import Any, cast
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 from rosbags.typesys.stores.ros2_jazzy import sensor_msgs__msg__PointCloud2 as PointCloud2
 
@@ -16,7 +16,14 @@ from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_TYPES, decode_custom_mes
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud, decode_point_cloud2
 
 POINT_CLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
+TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 CLOUD_TYPES = (POINT_CLOUD2_TYPE, *CUSTOM_MESSAGE_TYPES)
+# Packets of a sensor that can be decoded: a sweep in a message, a packet in a message.
+VELODYNE_SCAN_TYPE = "velodyne_msgs/msg/VelodyneScan"
+OUSTER_PACKET_TYPES = tuple(
+    f"{package}/msg/PacketMsg" for package in ("ouster_ros", "ouster_sensor_msgs", "ouster_msgs")
+)
 
 _LONGEST_FRAME_ID = 256
 # Up to the end of a header's frame; a shorter message is none.
@@ -63,21 +70,33 @@ def read_header(raw: bytes, ros2: bool) -> tuple[int, str]:
 
 
 def decode(message: BagMessage, ros2: bool, time_field: str | None) -> DecodedCloud:
-    """Decode a message of one of the `CLOUD_TYPES`, by fixed definitions.
+    """Decode a message of one of the `CLOUD_TYPES`, or a sweep of packets, by fixed definitions.
 
     Those in the bag are not used: the definition of PointCloud2 has not changed, bags may lack definitions, and a
     damaged definition of some other topic must not matter.
     """
     if message.message_type in CUSTOM_MESSAGE_TYPES:
         return decode_custom_message(message.raw, ros2)
+    if message.message_type == VELODYNE_SCAN_TYPE:
+        from lidarslam.datasets.ros.velodyne_scan import decode_scan_message
+
+        return decode_scan_message(message.raw, ros2)
+    cloud = cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE, ros2))
+    return decode_point_cloud2(cloud, time_field)
+
+
+def deserialize(raw: bytes, message_type: str, ros2: bool) -> Any:
+    """A message of a type that ROS itself defines, by its fixed definition."""
     store = _typestore(ros2)
-    deserialize = store.deserialize_cdr if ros2 else store.deserialize_ros1
-    return decode_point_cloud2(cast(PointCloud2, deserialize(message.raw, POINT_CLOUD2_TYPE)), time_field)
+    return (store.deserialize_cdr if ros2 else store.deserialize_ros1)(raw, message_type)
 
 
 @cache
 def _typestore(ros2: bool) -> Typestore:
-    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+    store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
+    if TRANSFORMS_TYPE not in store.types:  # ROS 1 has it in another package than rosbags knows
+        store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
+    return store
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,24 @@ CUSTOM_MESSAGE_TYPES = (
     "livox_ros_driver2/msg/CustomMsg",
     "livox_interfaces/msg/CustomMsg",
 )
+# livox_ros_driver2's own definitions: their checksums name the types, so order and types are as there.
+CUSTOM_MESSAGE_DEFINITION = """\
+std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+"""
+CUSTOM_POINT_DEFINITION = """\
+uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+"""
 TIME_FIELD = "offset_time"
 TIME_UNIT: TimeUnit = "ns"
 

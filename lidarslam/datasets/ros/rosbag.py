@@ -14,17 +14,25 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.faults import NO_POINT_TIME, Faults, first_readable, readable_scans
+from lidarslam.datasets.faults import Faults, first_readable, readable_scans
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.folders.truth_files import find_truth_file
-from lidarslam.datasets.recording import Recording, RecordingInfo
-from lidarslam.datasets.ros import livox
+from lidarslam.datasets.packets.libraries import require
+from lidarslam.datasets.recording import Recording, RecordingInfo, Topic
 from lidarslam.datasets.ros.bag_file import BagFile
-from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
-from lidarslam.datasets.ros.bag_topics import choose_topic
+from lidarslam.datasets.ros.bag_imu import BagImu, CloudTopic
+from lidarslam.datasets.ros.bag_message import (
+    OUSTER_PACKET_TYPES,
+    VELODYNE_SCAN_TYPE,
+    BagMessage,
+    StampSource,
+    find_stamp_source,
+)
+from lidarslam.datasets.ros.bag_point_time import BagPointTime
+from lidarslam.datasets.ros.bag_topics import choose_topic, one_part
+from lidarslam.datasets.ros.ouster_bag import OusterBag
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
-from lidarslam.datasets.times.point_time import PointTimeModel, is_return
-from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.ros.timed_scan import timed_scan
 from lidarslam.datasets.times.stamp_order import in_stamp_order
 
 logger = logging.getLogger(__name__)
@@ -42,8 +50,15 @@ def open_recording(source: Path, config: ReaderConfig) -> Recording:
 
     Raises:
         InputError: the bag cannot be read, or it does not hold the one point cloud topic that is asked for.
+        ConfigError: the topic holds packets, and the library that decodes them is not installed.
     """
-    return BagRecording(source, config)
+    bag = BagFile(source)
+    topic = choose_topic(source, bag.topics, config.topic)
+    if topic.message_type in OUSTER_PACKET_TYPES:
+        return OusterBag(source, config, bag, topic)
+    if topic.message_type == VELODYNE_SCAN_TYPE:
+        require("velodyne_decoder", "packets of a Velodyne")
+    return BagRecording(source, config, bag, topic)
 
 
 class BagRecording:
@@ -53,13 +68,12 @@ class BagRecording:
     """
 
     T_cam_lidar: FloatArray | None = None  # no camera
-    imu: ImuSamples | None = None
 
-    def __init__(self, source: Path, config: ReaderConfig) -> None:
+    def __init__(self, source: Path, config: ReaderConfig, bag: BagFile, topic: Topic) -> None:
         self._source = source
         self._config = config
-        self._bag = BagFile(source)
-        self._topic = choose_topic(source, self._bag.topics, config.topic)
+        self._bag = bag
+        self._topic = topic
         folders = [source, source.resolve().parent] if source.is_dir() else [source.parent]
         self._truth_file = find_truth_file(folders, self.name)
 
@@ -67,6 +81,11 @@ class BagRecording:
     def name(self) -> str:
         """The folder's name, or the file's without its suffix."""
         return self._source.resolve().name if self._source.is_dir() else self._source.stem
+
+    @property
+    def frames(self) -> tuple[BagFile, str]:
+        """The bag, and the frame of its clouds."""
+        return self._bag, self._frame_id
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -76,19 +95,21 @@ class BagRecording:
     def __len__(self) -> int:
         return self._topic.messages
 
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU topic nearest to the clouds', unless another is asked for."""
+        return self._imu.samples()
+
+    @cached_property
+    def _imu(self) -> BagImu:
+        return BagImu(self._bag, CloudTopic(self._topic, self._frame_id, self._stamps), self._config.imu_topic)
+
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A lost index, and headers without stamps."""
+        """A lost index, headers without stamps, and times of points that could follow from their azimuth."""
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        return tuple(warning for warning in (self._bag.damage, unset, self._part()) if warning is not None)
-
-    def _part(self) -> str | None:
-        """That the file is one of several of a rosbag2."""
-        folder = self._source.absolute().parent
-        if self._source.is_dir() or not (folder / "metadata.yaml").is_file():
-            return None
-        parts = len(list(folder.glob(f"*{self._source.suffix}")))
-        return f"This file is one of {parts} parts of the bag {folder}; name the folder for all." if parts > 1 else None
+        found = (self._bag.damage, unset, one_part(self._source), self._point_time.azimuth.warning)
+        return tuple(warning for warning in found if warning is not None)
 
     def scans(
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
@@ -165,14 +186,9 @@ class BagRecording:
         return wanted
 
     def _scan(self, message: BagMessage, faults: Faults) -> Scan:
-        cloud, model, stamp = self._decode(message), self._point_time, self._stamps.stamp(message)
-        offsets = None
-        if model is not None and cloud.times is not None and cloud.time_field == model.field:
-            offsets = model.offsets(cloud.times, stamp)
-        scan = Scan.from_raw(cloud.points, stamp, offsets, cloud.rings, cloud.intensities, cloud.colours)
-        if model is not None and scan.time_offsets is None and len(scan):
-            faults.note(NO_POINT_TIME, f"{stamp:.9f}")
-        return scan
+        cloud, stamp = self._decode(message), self._stamps.stamp(message)
+        offsets = self._point_time.offsets(cloud, stamp)
+        return timed_scan(cloud, offsets, stamp, self._point_time.model is not None, faults)
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         return self._bag.decode(message, self._config.time_field)
@@ -187,27 +203,11 @@ class BagRecording:
         return None if last is None else self._stamps.stamp(last)
 
     @cached_property
-    def _point_time(self) -> PointTimeModel | None:
-        """Inferred once, so that all scans are read alike."""
-        unit, reference = self._config.time_unit, self._config.time_reference
-        if reference == "none":
-            return None
-        if self._topic.message_type in livox.CUSTOM_MESSAGE_TYPES:
-            unit, reference = livox.TIME_UNIT, "absolute"  # as the message type defines
-        first = next(self._sound(), None)
-        period_s = None
+    def _point_time(self) -> BagPointTime:
+        first, period_s = next(self._sound(), None), None
         if first is not None and self._last_stamp is not None and len(self) > 1:
             period_s = (self._last_stamp - self._stamps.stamp(first)) / (len(self) - 1)
-        return learn_point_time(self._timed_clouds(), unit, reference, period_s)
-
-    def _timed_clouds(self) -> Iterator[TimedCloud]:
-        for message in self._sound():
-            try:
-                cloud = self._decode(message)
-            except InputError:
-                continue  # counted when it is its turn
-            times = None if cloud.times is None else cloud.times[is_return(cloud.points)]
-            yield TimedCloud(cloud.time_field, times, self._stamps.stamp(message))
+        return BagPointTime(self._bag, self._topic, self._config, self._stamps, period_s)
 
     def describe(self) -> RecordingInfo:
         """Of the first readable scan; see `Recording`."""
@@ -226,21 +226,15 @@ class BagRecording:
             first=first,
             last_stamp=self._last_stamp or first.stamp,
             ground_truth=self._truth_file,
-            point_time=self._point_time,
+            point_time=self._point_time.model,
             topic=self._topic.name,
             topics=self._bag.topics,
             fields=cloud.fields,
-            notes=(*self.warnings, *faults.warnings(), *unreadable.warnings(), *self._notes(cloud, first.stamp)),
+            notes=(
+                *self.warnings,
+                *faults.warnings(),
+                *unreadable.warnings(),
+                *self._point_time.notes(cloud, first.stamp),
+            ),
+            imu=self._imu.summary(),
         )
-
-    def _notes(self, cloud: DecodedCloud, stamp: float) -> Iterator[str]:
-        if cloud.time_field is None or cloud.times is None:
-            return
-        if self._point_time is None:
-            if self._config.time_reference != "none":
-                yield f"The point field {cloud.time_field} holds no usable time."
-        elif not self._point_time.shares_clock(cloud.times, stamp):
-            yield (
-                f"The point field {cloud.time_field} reads another clock than the stamps,"
-                " so the earliest point of each scan gets the scan's stamp."
-            )

@@ -81,10 +81,10 @@ def infer_point_time(
     readings of a clock of their own. A given unit or reference is not questioned.
 
     Returns:
-        None when the values are no per-point time: `reference` is "none", all values are equal, too coarse (an epoch
-        in float32), or span a sweep in no unit; the last two are logged as a warning.
+        None when the values are no per-point time: `reference` is "none" or "azimuth", all values are equal, too
+        coarse (an epoch in float32), or span a sweep in no unit; the last two are logged as a warning.
     """
-    spread = None if reference == "none" else value_spread(values)
+    spread = None if reference in ("none", "azimuth") else value_spread(values)
     if spread is None:
         return None
     if spread.resolution > _COARSEST_OF_SWEEP * spread.span:

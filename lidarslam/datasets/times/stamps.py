@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.config import ReaderConfig
 
 # Clock readings count from 1970; a number outside these years is none.
 _EPOCH_1990_S, _EPOCH_2100_S = 6.3e8, 4.1e9
@@ -132,6 +133,14 @@ def mend_stamps(stamps: FloatArray, numbers: FloatArray) -> tuple[FloatArray, in
     period = float(np.median(np.diff(known) / np.diff(at)))
     outside = np.minimum(numbers - at[0], 0.0) + np.maximum(numbers - at[-1], 0.0)
     return np.interp(numbers, at, known) + outside * period, int(len(stamps) - np.count_nonzero(kept))
+
+
+def assumed_rate(missing: str, config: ReaderConfig) -> str:
+    """That scans without stamps are taken to come at a rate, and how to give another unless it was given."""
+    said = f"{missing}: {config.rate_hz:g} scans a second are assumed"
+    if "rate_hz" in config.model_fields_set:
+        return f"{said}, as set."
+    return f"{said}, which may be wrong. Give the rate if you know it, such as --set reader.rate_hz=5."
 
 
 def scan_rate(stamps: FloatArray) -> float | None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.simulation.casting.mesh import world_mesh
@@ -31,11 +32,13 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
     """Make the recording's folder; it appears when everything in it is complete.
 
     Raises:
-        InputError: no world, sensor, motion, mount or format has that name, or the trajectory cannot be followed
-            or leads through something solid.
+        InputError: no world, sensor, motion, mount or format has that name, the format holds no IMU, or the
+            trajectory cannot be followed or leads through something solid.
         OutputError: the folder holds something already, or cannot be written.
     """
     chosen = find_format(request.format)
+    if request.imu and not chosen.imu:
+        raise InputError(f"the format {request.format} has no place for an IMU; choose another, or leave out --imu")
     with new_folder(request.out, request.overwrite) as folder:
         simulation = _simulation(request)
         sensor, spacing_m = simulation.sensor, simulation.world.map_spacing_m
@@ -51,7 +54,8 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
                 yield simulated
                 progress(index + 1, len(simulation))
 
-        chosen.writer()(folder, scans(), Rig(sensor.driver, sensor.period_s, simulation.T_world_lidar_at))
+        imu = simulation.imu if request.imu else None
+        chosen.writer()(folder, scans(), Rig(sensor.driver, sensor.period_s, simulation.T_world_lidar_at, imu))
         truth = simulation.ground_truth
         stamps = np.array([clock_s(stamp, chosen.clock_start_ns) for stamp in truth.stamps])
         write_tum(folder / GROUND_TRUTH, Trajectory(stamps, truth.T_world_lidar))

@@ -18,6 +18,7 @@ class RecordRequest:
     format: str
     trajectory: Path | None = None  # TUM or KITTI file that `motion` moves along instead of the world's route
     speed_mps: float | None = None  # where no bend slows it down, instead of the carrier's own and the route's limit
+    imu: bool = False  # whether an IMU is recorded too
     overwrite: bool = False  # whether an earlier recording in `out` is replaced
 
     @property

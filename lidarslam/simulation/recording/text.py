@@ -27,7 +27,7 @@ _README = """\
 ## Files
 
 - **The scans** are in {layout}.
-- **{ground_truth}**: the exact pose of the sensor at each scan's stamp, T_world_lidar, as
+{imu}- **{ground_truth}**: the exact pose of the sensor at each scan's stamp, T_world_lidar, as
   `stamp tx ty tz qx qy qz qw`.
 - **{reference_map}**: {map_points:,} points with normals, exact, on the surfaces that the sensor saw, about
   {spacing} apart, in the same world frame; nothing that moves is in it.
@@ -47,11 +47,16 @@ _README = """\
 `run` finds the ground truth by itself and writes the errors to metrics.json.
 """
 
+_IMU = """\
+- **The IMU** is a MEMS unit of 200 Hz on the LiDAR, with noise and walking biases;
+  {where}.
+"""
+
 
 def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
     """The README as Markdown."""
     return _README.format(
-        **vars(request) | vars(summary),
+        **vars(request) | vars(summary) | {"imu": _imu(request)},
         made_by=MADE_BY,
         version=version("lidarslam"),
         simulate=_simulate_command(request, summary),
@@ -77,6 +82,10 @@ def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
     )
 
 
+def _imu(request: RecordRequest) -> str:
+    return _IMU.format(where=find_format(request.format).imu) if request.imu else ""
+
+
 def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
     """The command that makes the same recording again."""
     words = ["lidarslam", "simulate", "--out", str(request.out), "--world", request.world, "--sensor", request.sensor]
@@ -84,6 +93,7 @@ def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
     words += ["--motion", request.motion]
     words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
     words += ["--mount", request.mount, "--scans", str(summary.scans), "--seed", str(request.seed)]
+    words += ["--imu"] if request.imu else []
     return shlex.join([*words, "--format", request.format])
 
 

@@ -21,6 +21,8 @@ class DriverCloud:
     frame_id: str
     record: np.dtype[np.void]  # type of a point, padding included
     columns: Callable[[SimulatedScan, int], dict[str, ArrayLike]]  # beside x, y, z, by the sweep and its stamp_ns
+    imu_topic: str = "/imu/data"  # of the IMU in the sensor, or of one beside it
+    imu_frame_id: str = "imu_link"
     custom_message: bool = False  # Livox's own rather than PointCloud2
 
     def records(self, simulated: SimulatedScan, stamp_ns: int) -> Records:
@@ -95,7 +97,7 @@ _LIVOX_POINT = np.dtype([("offset_time", "<u4"), *_XYZ, ("reflectivity", "|u1"),
 
 DRIVERS: dict[str, DriverCloud] = {
     "velodyne": DriverCloud("/velodyne_points", "velodyne", _VELODYNE_POINT, _velodyne),
-    "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, _ouster),
+    "ouster": DriverCloud("/ouster/points", "os_lidar", _OUSTER_POINT, _ouster, "/ouster/imu", "os_imu"),
     "hesai": DriverCloud("/lidar_points", "hesai_lidar", _HESAI_POINT, _hesai),
-    "livox": DriverCloud("/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, custom_message=True),
+    "livox": DriverCloud("/livox/lidar", "livox_frame", _LIVOX_POINT, _livox, "/livox/imu", "livox_imu", True),
 }

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
 from lidarslam.simulation.recorder import SimulatedScan
 
 # Simulated time starts at zero, the clocks of drivers at 2024-01-01 00:00:00 UTC. Fixed, so that the same seed gives
@@ -29,6 +30,7 @@ class Rig:
     driver: str  # whose messages the sensor speaks: "velodyne", "ouster", "hesai" or "livox"
     sweep_s: float  # duration of a sweep
     T_world_lidar_at: Callable[[FloatArray], FloatArray]  # true poses (N, 4, 4) at times (N,), simulated seconds
+    imu: ImuSamples | None = None  # on simulated time too; None where none is to be recorded
 
 
 Writer = Callable[[Path, Iterable[SimulatedScan], Rig], None]

@@ -6,15 +6,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lidarslam.core.imu import ImuSamples
+from lidarslam.datasets.folders.imu_csv import COLUMNS, EXTRINSIC, IMU_FILE
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig, clock_s
 
 _PROPERTY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<u2": "ushort", "<u4": "uint"}
 
 
-def write_ply_scans(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:  # noqa: ARG001
-    """Write scan_000000.ply and so on, and timestamps.txt; implements `Writer`."""
+def write_ply_scans(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
+    """Write scan_000000.ply and so on, timestamps.txt and, with an IMU, imu.csv; implements `Writer`."""
     folder.mkdir()
+    if rig.imu is not None:
+        write_imu(folder / IMU_FILE, rig.imu)
     with (folder / "timestamps.txt").open("w", encoding="utf-8") as stamps:
         for number, simulated in enumerate(scans):
             scan = simulated.scan
@@ -28,6 +32,16 @@ def write_ply_scans(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> N
                 columns["ring"] = ("<u2", scan.rings)
             write_ply(folder / f"scan_{number:06d}.ply", as_records(columns))
             stamps.write(f"{clock_s(scan.stamp):.9f}\n")
+
+
+def write_imu(path: Path, imu: ImuSamples) -> None:
+    """Write samples, stamped in simulated seconds, as a table on the recording's clock."""
+    with path.open("w", encoding="utf-8") as table:
+        if imu.T_lidar_imu is not None:
+            table.write(f"# {EXTRINSIC}: {' '.join(f'{value:.12g}' for value in imu.T_lidar_imu[:3].ravel())}\n")
+        table.write(",".join(COLUMNS) + "\n")
+        for stamp, values in zip(imu.stamps, np.hstack([imu.angular_velocities, imu.accelerations]), strict=True):
+            table.write(f"{clock_s(stamp):.9f},{','.join(f'{value:.9g}' for value in values)}\n")
 
 
 def as_records(columns: Mapping[str, tuple[str, ArrayLike]]) -> NDArray[np.void]:

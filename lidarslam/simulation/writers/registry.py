@@ -18,6 +18,7 @@ class Format:
     layout: str  # of the files, for the recording's README
     files: tuple[str, ...]  # their names in the recording's folder, as patterns
     source: str = ""  # the one to give to `lidarslam run`; empty: the folder itself, which always works too
+    imu: str = ""  # where an IMU's samples are; empty where the format has no place for them
     clock_start_ns: int = CLOCK_START_NS  # the clock's reading at the simulated time zero
 
     def source_in(self, folder: Path) -> Path:
@@ -42,12 +43,17 @@ _PLY_LAYOUT = (
 _ROSBAG2_LAYOUT = f"a ROS 2 bag (SQLite) {_BAG_MESSAGES}; the folder is the bag"
 _MCAP_LAYOUT = f"a ROS 2 bag (MCAP) {_BAG_MESSAGES}; the folder is the bag, and its .mcap file can be read alone"
 
+_IMU_TABLE = "imu.csv has its samples, stamped by the same clock, and T_lidar_imu in its first line"
+_IMU_MESSAGES = "its messages are sensor_msgs/Imu on the topic of the sensor's driver, and /tf_static has T_lidar_imu"
+
 FORMATS: dict[str, Format] = {
     "kitti": Format("kitti", "write_kitti", _KITTI_LAYOUT, ("sequences", "poses"), clock_start_ns=0),
-    "ply": Format("ply", "write_ply_scans", _PLY_LAYOUT, ("scan_*.ply", "timestamps.txt")),
-    "rosbag1": Format("rosbag", "write_rosbag1", f"a ROS 1 bag {_BAG_MESSAGES}", ("*.bag",), source="{name}.bag"),
-    "rosbag2": Format("rosbag", "write_rosbag2", _ROSBAG2_LAYOUT, ("metadata.yaml", "*.db3")),
-    "mcap": Format("rosbag", "write_mcap", _MCAP_LAYOUT, ("metadata.yaml", "*.mcap")),
+    "ply": Format("ply", "write_ply_scans", _PLY_LAYOUT, ("scan_*.ply", "timestamps.txt", "imu.csv"), imu=_IMU_TABLE),
+    "rosbag1": Format(
+        "rosbag", "write_rosbag1", f"a ROS 1 bag {_BAG_MESSAGES}", ("*.bag",), source="{name}.bag", imu=_IMU_MESSAGES
+    ),
+    "rosbag2": Format("rosbag", "write_rosbag2", _ROSBAG2_LAYOUT, ("metadata.yaml", "*.db3"), imu=_IMU_MESSAGES),
+    "mcap": Format("rosbag", "write_mcap", _MCAP_LAYOUT, ("metadata.yaml", "*.mcap"), imu=_IMU_MESSAGES),
 }
 
 

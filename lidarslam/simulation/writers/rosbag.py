@@ -1,7 +1,8 @@
-"""Bags of ROS 1 and ROS 2 with one topic, the point clouds of the sensor's own driver."""
+"""Bags of ROS 1 and ROS 2 with the point clouds of the sensor's own driver and, if asked for, those of an IMU."""
 
+import heapq
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,32 +13,23 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from lidarslam.core.errors import OutputError
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
+from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.driver_clouds import DriverCloud, Records, find_driver
-from lidarslam.simulation.writers.interface import Rig, clock_ns
+from lidarslam.simulation.writers.imu_messages import (
+    IMU_TYPE,
+    STATIC_TRANSFORMS,
+    header,
+    imu_messages,
+    static_transform,
+)
+from lidarslam.simulation.writers.interface import CLOCK_START_NS, Rig, clock_ns
 
 _POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
 _CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
 _CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
 
-# livox_ros_driver2's own definitions; their checksums go into the bag, so order and types are as there.
-_CUSTOM_MESSAGE_DEFINITION = """\
-std_msgs/Header header
-uint64 timebase
-uint32 point_num
-uint8 lidar_id
-uint8[3] rsvd
-CustomPoint[] points
-"""
-_CUSTOM_POINT_DEFINITION = """\
-uint32 offset_time
-float32 x
-float32 y
-float32 z
-uint8 reflectivity
-uint8 tag
-uint8 line
-"""
 _LIDAR_ID = 192  # the last byte of the sensor's address
 _CDR_ALIGNMENT = 4
 # The newest version that ROS 2 Humble still reads.
@@ -61,19 +53,47 @@ def write_mcap(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
 
 
 def _write(bag: Rosbag1Writer | Rosbag2Writer, scans: Iterable[SimulatedScan], rig: Rig) -> None:
-    driver = find_driver(rig.driver)
     serializer = MessageSerializer(ros2=isinstance(bag, Rosbag2Writer))
-    # A message is published, and recorded, when its last point has been measured.
-    latency_ns = round(1e9 * rig.sweep_s)
     try:
         with bag:
-            connection = bag.add_connection(driver.topic, serializer.message_type(driver), typestore=serializer.store)
-            for number, simulated in enumerate(scans):
-                stamp_ns = clock_ns(simulated.scan.stamp)
-                records = driver.records(simulated, stamp_ns)
-                bag.write(connection, stamp_ns + latency_ns, serializer.serialize(driver, records, stamp_ns, number))
+            for message in heapq.merge(
+                _clouds(bag, serializer, scans, rig), _imu(bag, serializer, rig), key=lambda message: message[1]
+            ):
+                bag.write(*message)
     except sqlite3.Error as error:
         raise OutputError(f"{bag.path}: cannot be written ({error}); is the disk full?") from error
+
+
+Messages = Iterator[tuple[Any, int, bytes]]
+"""Connection, time of recording in nanoseconds, and bytes of messages in the order of time."""
+
+
+def _clouds(
+    bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", scans: Iterable[SimulatedScan], rig: Rig
+) -> Messages:
+    driver = find_driver(rig.driver)
+    connection = bag.add_connection(driver.topic, serializer.message_type(driver), typestore=serializer.store)
+    # A message is published, and recorded, when its last point has been measured.
+    latency_ns = round(1e9 * rig.sweep_s)
+    for number, simulated in enumerate(scans):
+        stamp_ns = clock_ns(simulated.scan.stamp)
+        records = driver.records(simulated, stamp_ns)
+        yield connection, stamp_ns + latency_ns, serializer.serialize(driver, records, stamp_ns, number)
+
+
+def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", rig: Rig) -> Messages:
+    """Where the IMU is on the LiDAR, then a message a sample."""
+    driver, imu = find_driver(rig.driver), rig.imu
+    if imu is None:
+        return
+    store = serializer.store
+    if imu.T_lidar_imu is not None:
+        placed = bag.add_connection(STATIC_TRANSFORMS, TRANSFORMS_TYPE, typestore=store)
+        message = static_transform(store, CLOCK_START_NS, driver.frame_id, driver.imu_frame_id, imu.T_lidar_imu)
+        yield placed, CLOCK_START_NS, serializer.serialized(message, TRANSFORMS_TYPE)
+    connection = bag.add_connection(driver.imu_topic, IMU_TYPE, typestore=store)
+    for stamp_ns, sample in imu_messages(store, imu, driver.imu_frame_id):
+        yield connection, stamp_ns, serializer.serialized(sample, IMU_TYPE)
 
 
 class MessageSerializer:
@@ -82,8 +102,10 @@ class MessageSerializer:
     def __init__(self, ros2: bool) -> None:
         self._ros2 = ros2
         self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-        self.store.register(get_types_from_msg(_CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
-        self.store.register(get_types_from_msg(_CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
+        self.store.register(get_types_from_msg(CUSTOM_POINT_DEFINITION, _CUSTOM_POINT))
+        self.store.register(get_types_from_msg(CUSTOM_MESSAGE_DEFINITION, _CUSTOM_MESSAGE))
+        if not ros2:  # ROS 2's store has it
+            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
 
     def message_type(self, driver: DriverCloud) -> str:
         """The name of the driver's message type."""
@@ -91,20 +113,19 @@ class MessageSerializer:
 
     def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
         """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
-        stamp = self.store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        counted = {} if self._ros2 else {"seq": sequence}
-        header = self.store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=driver.frame_id, **counted)
+        message_header = header(self.store, stamp_ns, driver.frame_id, sequence)
         message_type = self.message_type(driver)
         if not driver.custom_message:
-            return self._serialized(self._cloud(header, records), message_type)
+            return self.serialized(self._cloud(message_header, records), message_type)
         rsvd = np.zeros(3, np.uint8)
-        message = self.store.types[message_type](header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
+        message = self.store.types[message_type](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
         # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
         # empty list, which ends the message with its length.
-        without_points = self._serialized(message, message_type)[:-4]
+        without_points = self.serialized(message, message_type)[:-4]
         return without_points + len(records).to_bytes(4, "little") + self._packed(records)
 
-    def _serialized(self, message: Any, message_type: str) -> bytes:
+    def serialized(self, message: Any, message_type: str) -> bytes:
+        """The bytes of a message."""
         serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
         return bytes(serialize(message, message_type))
 

@@ -1,0 +1,175 @@
+"""What an IMU adds: trajectories with and without it beside the truth, on the same scans.
+
+    python benchmarks/imu.py --cases office/handheld hall/tracked-harsh --seeds 0 1 --scans 150
+    python benchmarks/imu.py --cases office/handheld/3 --scans 300
+    python benchmarks/imu.py 2011_09_26/2011_09_26_drive_0005_sync
+
+A case is WORLD/MOTION, or WORLD/MOTION/STEP where every STEP-th scan is taken; simulated recordings have a consumer's
+MEMS unit, with noise and a walking bias. Prints a Markdown table, a row for each recording and method:
+
+- ATE in metres after SE(3) alignment, and the largest error of the height after it;
+- the error of roll and pitch: root mean square of the vertical about its mean, degrees;
+- the error of the turn from scan to scan, root mean square, degrees;
+- scans that were lost and degraded.
+
+Every method runs in the pipeline of `lidarslam run` with its defaults; a graph is not part of it, but with `--graph`.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mapping_accuracy import BEYOND_TRUTH_S, make_simulation
+
+from lidarslam.config.settings import Config
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.alignment import align
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
+from lidarslam.mapping.inertial.inertial import Inertial
+from lidarslam.odometry.config import OdometryConfig, OdometryName
+from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.run.loop_closing import begin_graph
+
+METHODS: dict[str, tuple[OdometryName, bool]] = {
+    "KISS-ICP": ("kiss-icp", False),
+    "constant-velocity+map": ("constant-velocity", True),
+    "imu+map": ("imu", True),
+    "learned+map": ("learned", True),
+    "learned+imu+map": ("learned+imu", True),
+}
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recording in memory, with the samples of its IMU."""
+
+    name: str
+    scans: Sequence[Scan]
+    truth: Trajectory
+    imu: ImuSamples
+
+
+def simulate(case: str, sensor: str, scans: int, seed: int) -> Recorded:
+    """A recording straight from the simulator, of every STEP-th scan."""
+    world, motion, *step = case.split("/")
+    simulation = make_simulation(world, motion, sensor, scans, seed)
+    every = int(step[0]) if step else 1
+    name = f"{world}, {motion}, seed {seed}" + (f", {simulation.sensor.rate_hz / every:.1f} Hz" if step else "")
+    return Recorded(name, list(simulation.scans(step=every)), simulation.ground_truth, simulation.imu)
+
+
+def read(source: Path, step: int) -> Recorded:
+    """A recording from disk.
+
+    Raises:
+        InputError: it cannot be read, or has no ground truth or no IMU.
+    """
+    recording = open_recording(source)
+    truth, imu = recording.ground_truth, recording.imu
+    if truth is None or imu is None or imu.T_lidar_imu is None:
+        raise InputError(f"{source}: needs ground truth, and an IMU that it is known how to mount")
+    name = recording.name + (f", every {step}th scan" if step > 1 else "")
+    return Recorded(name, list(in_order(recording.scans(step=step))), truth, imu)
+
+
+def estimate(recorded: Recorded, config: Config) -> tuple[Trajectory, list[Status]]:
+    """The trajectory of a method, and the status of each scan."""
+    inertial, scans = None, recorded.scans
+    if config.odometry.uses_imu:
+        assert recorded.imu.T_lidar_imu is not None
+        inertial = Inertial(recorded.imu, recorded.imu.T_lidar_imu, config.mapping)
+        scans = [inertial.gyroscope.evened(scan) for scan in scans]
+    odometry, graph = make_odometry(config.odometry), begin_graph(config)
+    try:
+        results = list(Pipeline(odometry, make_localiser(config, inertial), config.global_map, graph).run(scans))
+        poses = np.array([result.T_world_lidar for result in results])
+        corrected = None if graph is None else graph.finish()
+        poses = poses if corrected is None else corrected.T_world_lidar
+    finally:
+        odometry.close()
+        if graph is not None:
+            graph.close()
+    return Trajectory(np.array([result.stamp for result in results]), poses), [result.status for result in results]
+
+
+def vertical_error_deg(estimated: FloatArray, true: FloatArray) -> float:
+    """Of poses (N, 4, 4): the true vertical in the estimated world, RMS about its mean."""
+    ups = np.einsum("nij,nkj,k->ni", estimated[:, :3, :3], true[:, :3, :3], _UP)
+    mean = ups.mean(axis=0)
+    across = np.linalg.norm(np.cross(ups, mean / np.linalg.norm(mean)), axis=1)
+    return float(np.rad2deg(np.sqrt((across**2).mean())))
+
+
+def row(recorded: Recorded, method: str, graph: bool) -> str:
+    """The cells of a recording and a method."""
+    odometry, has_map = METHODS[method]
+    config = Config(
+        odometry=OdometryConfig(method=odometry),
+        mapping=MappingConfig(method="surfels" if has_map else "off"),
+        pose_graph=PoseGraphConfig(enabled=graph and has_map),
+    )
+    trajectory, statuses = estimate(recorded, config)
+    errors = evaluate_trajectory(trajectory, recorded.truth).errors
+    true = Trajectory(trajectory.stamps, recorded.truth.at(trajectory.stamps, BEYOND_TRUTH_S))
+    aligned = transform_points(align(trajectory, true), trajectory.positions)
+    height_m = float(np.abs(aligned - true.positions)[:, 2].max())
+    tilt = vertical_error_deg(trajectory.T_world_lidar, true.T_world_lidar)
+    turns = (inverse(trajectory.relative_motions()) @ true.relative_motions())[:, :3, :3]
+    cosines = np.clip(0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0), -1.0, 1.0)
+    turn = float(np.rad2deg(np.sqrt((np.arccos(cosines) ** 2).mean())))
+    cells = [
+        recorded.name,
+        f"{errors.length_m:.0f}",
+        method + ("+graph" if config.pose_graph.enabled else ""),
+        f"{errors.ate_rmse_m:.3f}",
+        f"{height_m:.3f}",
+        f"{tilt:.2f}",
+        f"{turn:.2f}",
+        str(statuses.count(Status.LOST)),
+        str(statuses.count(Status.DEGRADED)),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def recordings(arguments: argparse.Namespace) -> Iterator[Recorded]:
+    """All that were asked for."""
+    for source in arguments.sources:
+        yield read(source, arguments.step)
+    for case in arguments.cases:
+        for seed in arguments.seeds:
+            yield simulate(case, arguments.sensor, arguments.scans, seed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth and IMU")
+    parser.add_argument("--step", type=int, default=1, help="take every n-th scan of a source")
+    parser.add_argument("--cases", nargs="*", default=[], metavar="WORLD/MOTION[/STEP]")
+    parser.add_argument("--seeds", nargs="*", type=int, default=[0])
+    parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--scans", type=int, default=300)
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--graph", action="store_true", help="with the pose graph")
+    arguments = parser.parse_args()
+    print("| Recording | Way, m | Method | ATE, m | Height, m | Roll, pitch, deg | Turn, deg | Lost | Degraded |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for recorded in recordings(arguments):
+        for method in arguments.methods:
+            print(row(recorded, method, arguments.graph), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""Localisation in a finished map from many starts: how soon it is found, how accurate, and whether it is ever wrong.
+
+    python benchmarks/localise.py
+    python benchmarks/localise.py --worlds office street --starts 12 --scans 60
+    python benchmarks/localise.py --run runs/loop --source vlp16_loop --starts 16 --scans 50
+
+A simulated world is mapped once round from the true poses (one point a voxel, as `lidarslam run` writes maps), with the
+sensor and the carrier of the map. Then recordings begin at `--starts` places of the round, each with another seed of
+sway and noise: with the same sensor, the other way round, with another sensor, and in another world of that kind (other
+seed), where every place that is found is wrong. With `--run` the map is that of a run, and the recording its own
+source; errors are then against the poses of the run.
+
+Prints a Markdown table, a row for each case. Found: recordings that were found and confirmed. Scans: until the place
+was confirmed, median and largest. Errors are of all scans with a status of ok; after the slash the largest. Wrong:
+scans that are ok or degraded, or placed afterwards, and off by more than 0.5 m or 3 degrees. Lost: scans after the
+first confirmation. Milliseconds are wall time of one scan that is tracked (median), and of a search (largest scan).
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from lidarslam.config.settings import Config
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.scan import Scan
+from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.fixed_map.fixed_map import FixedMap
+from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
+from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.estimates import SweepMotion
+from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.simulation.motion.carriers import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.worlds.registry import WORLDS, build_world
+from lidarslam.storage.finished_run import load_map
+
+WRONG_M, WRONG_DEG = 0.5, 3.0
+_MOTIONS = {"street": "car", "terrace": "car", "fields": "car", "tunnel": "tracked", "hall": "tracked"}
+_OTHER_SENSOR = {"vlp-16": "os1-64"}
+
+
+def simulate(world: str, seed: int, motion_seed: int, sensor: str, is_reversed: bool = False) -> Simulation:
+    """A round of a world, from the simulator."""
+    place = build_world(world, seed)
+    on_route = place
+    if is_reversed:
+        on_route = replace(place, route=replace(place.route, waypoints=place.route.waypoints[::-1].copy()))
+    carried = motion_along_route(_MOTIONS.get(world, "handheld"), on_route, motion_seed)
+    model = find_sensor(sensor)
+    count = int(carried.duration_s * model.rate_hz)
+    return Simulation(place, model, carried, mount_pose("upright", carried.sensor_height_m), count, motion_seed)
+
+
+def draw_map(simulation: Simulation, every: int) -> FixedMap:
+    """The map of the scans at their true poses, in the simulator's world."""
+    truth, merged = simulation.ground_truth.T_world_lidar, None
+    for index in range(0, len(simulation) - 1, every):
+        velocity = body_velocity(inverse(truth[index]) @ truth[index + 1], simulation.sensor.period_s)
+        points = SweepMotion(velocity, velocity).compensate(simulation.scan(index).scan)
+        if merged is None:
+            merged = GlobalMap(voxel_size_for(points))
+        points = points[one_per_cell(points, merged.voxel_size_m)]
+        merged.add(points[np.linalg.norm(points, axis=1) < 80.0], truth[index])
+    assert merged is not None
+    cloud = merged.cloud()
+    return FixedMap(cloud.points, cloud.normals)
+
+
+@dataclass(eq=False)
+class Outcome:
+    """All recordings of a case."""
+
+    recordings: int = 0
+    confirmed: list[int] = field(default_factory=list)
+    errors_m: list[float] = field(default_factory=list)
+    errors_deg: list[float] = field(default_factory=list)
+    wrong: int = 0
+    lost: int = 0
+    tracked_ms: list[float] = field(default_factory=list)
+    search_ms: list[float] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+
+    def add(self, localiser: MapLocaliser, scans: list[Scan], config: Config, truth: FloatArray | None) -> None:
+        """Localise a recording; truth (N, 4, 4) in the map's frame, None where the map is of another place."""
+        with closing(make_odometry(config.odometry, None)) as odometry:
+            pipeline = Pipeline(odometry, ScanToMap(localiser), config.global_map)
+            results = list(pipeline.run(scans))
+        self.recordings += 1
+        poses = np.array([result.T_world_lidar for result in results])
+        statuses = [result.status for result in results]
+        self.reasons += [reason for _, reason in localiser.refusals]
+        ms = np.array([result.stage_ms["refine"] for result in results])
+        self.tracked_ms += [one for one, status in zip(ms, statuses, strict=True) if status is Status.OK]
+        self.search_ms.append(float(ms.max()))
+        placed = np.array([status is not Status.LOST for status in statuses])
+        if localiser.found:
+            for number, pose in localiser.corrections.items():
+                poses[number] = pose
+            placed[localiser.placed_afterwards] = True
+            self.confirmed.append(localiser.found[0].confirmed + 1)
+            self.lost += int((~placed[localiser.found[0].confirmed :]).sum())
+        placed[localiser.unconfirmed()] = False
+        if truth is None:
+            self.wrong += int(placed.sum())
+            return
+        off = inverse(truth) @ poses
+        off_m, off_deg = np.linalg.norm(off[:, :3, 3], axis=1), np.rad2deg(rotation_angle(off))
+        self.wrong += int((placed & ((off_m > WRONG_M) | (off_deg > WRONG_DEG))).sum())
+        ok = np.array([status is Status.OK for status in statuses])
+        self.errors_m += off_m[ok].tolist()
+        self.errors_deg += off_deg[ok].tolist()
+
+    def cells(self) -> list[str]:
+        """Of the row."""
+        found, none = len(self.confirmed), "-"
+        return [
+            f"{found} of {self.recordings}",
+            f"{np.median(self.confirmed):.0f}, {max(self.confirmed)}" if found else none,
+            f"{100 * np.median(self.errors_m):.1f} / {100 * max(self.errors_m):.1f}" if self.errors_m else none,
+            f"{np.median(self.errors_deg):.2f} / {max(self.errors_deg):.2f}" if self.errors_deg else none,
+            str(self.wrong),
+            str(self.lost),
+            f"{np.median(self.tracked_ms):.0f}" if self.tracked_ms else none,
+            f"{max(self.search_ms):.0f}",
+        ]
+
+
+def cases(world: str, sensor: str, seed: int) -> Iterator[tuple[str, Simulation, bool]]:
+    """Name, recording, and whether it is of the world that is mapped."""
+    other = _OTHER_SENSOR.get(sensor, "vlp-16")
+    yield "same way", simulate(world, seed, seed + 1, sensor), True
+    yield "other way", simulate(world, seed, seed + 2, sensor, is_reversed=True), True
+    yield other, simulate(world, seed, seed + 3, other), True
+    yield "other world", simulate(world, seed + 1, seed + 4, sensor), False
+
+
+def starts(count: int, scans: int, available: int) -> list[int]:
+    """First scans of recordings, evenly spread."""
+    return [int(first) for first in np.linspace(0, max(0, available - scans), count)]
+
+
+def print_row(cells: list[str]) -> None:
+    """A row of a Markdown table."""
+    print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def of_worlds(arguments: argparse.Namespace, config: Config) -> None:
+    """Rows of simulated worlds."""
+    for world in arguments.worlds:
+        sensor, seed = arguments.sensor, arguments.seed
+        began = time.perf_counter()
+        fixed_map = draw_map(simulate(world, seed, seed, sensor), arguments.map_every)
+        drawn_s = time.perf_counter() - began
+        for name, recording, is_there in cases(world, sensor, seed):
+            if arguments.cases and name not in arguments.cases:
+                continue
+            outcome = Outcome()
+            for first in starts(arguments.starts, arguments.scans, len(recording)):
+                scans = list(recording.scans(first, first + arguments.scans))
+                truth = recording.ground_truth.T_world_lidar[first : first + arguments.scans] if is_there else None
+                outcome.add(MapLocaliser(config.mapping, fixed_map), scans, config, truth)
+            print_row([world, f"{sensor}, {name}", *outcome.cells()])
+            if arguments.reasons:
+                print(f"  {drawn_s:.0f} s for the map of {len(fixed_map):,} points; {sorted(set(outcome.reasons))}")
+
+
+def of_run(arguments: argparse.Namespace, config: Config) -> None:
+    """The row of a run whose own recording is localised."""
+    cloud, trajectory = load_map(arguments.run), read_tum(arguments.run / "trajectory.tum")
+    fixed_map, recording, outcome = (
+        FixedMap(cloud.points, cloud.normals), open_recording(arguments.source, config.reader), Outcome(),
+    )  # fmt: skip
+    for first in starts(arguments.starts, arguments.scans, len(recording)):
+        scans = list(recording.scans(first, first + arguments.scans))
+        truth = trajectory.T_world_lidar[first : first + arguments.scans]
+        outcome.add(MapLocaliser(config.mapping, fixed_map), scans, config, truth)
+    print_row([arguments.run.name, arguments.source.name, *outcome.cells()])
+
+
+def main() -> None:
+    """Parse and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", nargs="*", default=list(WORLDS), choices=WORLDS)
+    parser.add_argument("--cases", nargs="*", help="names of cases; default: all")
+    parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--starts", type=int, default=8)
+    parser.add_argument("--scans", type=int, default=50)
+    parser.add_argument("--map-every", type=int, default=5, help="scans of the round that the map is made of")
+    parser.add_argument("--odometry", default="learned", choices=["learned", "constant-velocity", "kiss-icp"])
+    parser.add_argument("--run", type=Path, help="a run directory, instead of simulated worlds")
+    parser.add_argument("--source", type=Path, help="the recording of that run")
+    parser.add_argument("--reasons", action="store_true", help="print why searches found no place")
+    arguments = parser.parse_args()
+    config = Config(odometry=OdometryConfig(method=arguments.odometry))
+    print_row(
+        ["map", "recording", "found", "scans", "error cm", "error deg", "wrong", "lost", "ms tracked", "ms search"]
+    )
+    print_row(["---"] * 10)
+    if arguments.run is not None:
+        of_run(arguments, config)
+    else:
+        of_worlds(arguments, config)
+
+
+if __name__ == "__main__":
+    main()

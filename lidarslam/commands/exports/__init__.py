@@ -1,0 +1,1 @@
+"""Commands that write the results of a run in the formats of other programs."""

@@ -1,0 +1,97 @@
+"""`lidarslam localise`: a recording found and tracked in a finished map."""
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarslam.commands.shared.options import (
+    PATH,
+    SOURCE,
+    CommandWithExample,
+    config_options,
+    default_out,
+    odometry_options,
+    out_option,
+    reader_options,
+    scan_options,
+    take_config,
+)
+from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say, serving, wait_for_interrupt
+
+
+@click.command(
+    cls=CommandWithExample,
+    epilog="""lidarslam localise tuesday.mcap --map runs/monday
+    lidarslam localise tuesday.mcap --map runs/monday -o runs/tuesday --rerun save
+    lidarslam localise tuesday.mcap --map hall.ply --guess 12.5 -3 90
+    lidarslam view runs/monday runs/tuesday""",
+)
+@SOURCE
+@click.option(
+    "--map", "map_path", type=PATH, required=True, metavar="RUN", help="Run directory, or a .ply or .pcd with normals."
+)
+@out_option("Run directory for the results.", "localised/SOURCE_TIME")
+@click.option(
+    "--guess",
+    type=(float, float, float),
+    metavar="X Y YAW",
+    help="Where the first scan is in the map, in metres, and its heading in degrees.  [default: found without]",
+)
+@odometry_options
+@scan_options
+@click.option(
+    "--rerun",
+    type=click.Choice(["off", "save", "web", "spawn"]),
+    default="off",
+    show_default=True,
+    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
+)
+@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
+@reader_options
+@config_options
+@click.pass_context
+def localise(
+    ctx: click.Context,
+    /,
+    source: Path,
+    map_path: Path,
+    out: Path | None,
+    guess: tuple[float, float, float] | None,
+    **options: Any,
+) -> None:
+    """Find a recording in the map of an earlier run, and track it there.
+
+    The poses in DIR are in the frame of that map, which is not changed. Scans that are not sure to fit are lost, with
+    the reason; the exit status is 3 if there are any, and 1 if the recording was not found at all.
+    """
+    from lidarslam.run.progress import show_progress
+
+    with contextlib.ExitStack() as serve:
+        with show_progress(source.name) as progress:
+            progress.phase("loading the program")
+            from lidarslam.run.localise.localise import execute
+            from lidarslam.run.localise.request import LocaliseRequest
+            from lidarslam.run.localise.text import format_localisation, format_not_found
+            from lidarslam.run.request import RunRequest
+            from lidarslam.storage.default_places import source_name
+
+            config = take_config(options, source)
+            out = out or default_out("localised", source_name(source, config.reader.sequence))
+            request = LocaliseRequest(RunRequest(source, out, config, resumable=False, **options), map_path, guess)
+            page = serve.enter_context(serving()) if request.run.rerun == "web" else None
+            outcome = execute(request, progress, progress.phase, page)
+        if outcome.localisation.found is None:
+            note(format_not_found(request, outcome))
+            ctx.exit(EXIT_MENDABLE)
+        say(format_localisation(request, outcome))
+        if page is not None and outcome.run.stopped is None:
+            say(f"serving {page.address} until Ctrl-C")
+            wait_for_interrupt()
+    if outcome.run.stopped is not None:
+        note(f"stopped after {outcome.run.summary.scans} scans: {outcome.run.stopped}")
+        ctx.exit(EXIT_MENDABLE)
+    if outcome.run.summary.lost_scans:
+        ctx.exit(EXIT_LOST)

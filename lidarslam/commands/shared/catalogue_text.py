@@ -1,0 +1,143 @@
+"""Output of `lidarslam datasets`: the published data sets, and which of them are on disk."""
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from difflib import get_close_matches
+from itertools import islice
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.plain_text import count, one_line
+from lidarslam.datasets.published import evalio_names
+from lidarslam.datasets.published.catalogue import CATALOGUE, DataSet
+from lidarslam.datasets.registry import recognise
+
+OnDisk = Mapping[str, Sequence[Path]]
+"""Recordings by the name of their data set."""
+
+_TRIED = {
+    "real files": "run on real files, parts of it",
+    "written sample": "run on samples written in its layout, not yet on real files",
+    "not yet": "not yet run",
+}
+_WIDTH = 100
+# How deep recordings are searched for, and among how many entries of a folder.
+_DEPTH, _MOST_ENTRIES = 3, 1000
+
+
+def choose(arguments: Sequence[str]) -> tuple[list[DataSet], list[Path]]:
+    """The data sets and the folders among the arguments of the command.
+
+    Raises:
+        InputError: an argument is neither.
+    """
+    known = {one.name: one for one in CATALOGUE}
+    chosen, folders = [], []
+    for argument in arguments:
+        name = argument.removeprefix(evalio_names.PREFIX)
+        if name in known:
+            chosen.append(known[name])
+        elif Path(argument).exists():
+            folders.append(Path(argument))
+        else:
+            close = get_close_matches(name.lower(), known, n=3, cutoff=0.5)
+            hint = f"; did you mean {' or '.join(close)}?" if close else ""
+            raise InputError(f"{argument}: neither a known data set nor a folder{hint} lidarslam datasets lists them")
+    return chosen, folders
+
+
+def find_on_disk(folders: Sequence[Path]) -> OnDisk:
+    """Recordings of known data sets in evalio's data folder and in these, down to three folders below."""
+    readers = {one.reader: one.name for one in CATALOGUE if one.reader != "evalio"}
+    found: dict[str, list[Path]] = defaultdict(list)
+    for path, reader in dict(_recordings([evalio_names.data_folder(), *folders], _DEPTH)).items():
+        if (name := path.parent.name if reader == "evalio" else readers.get(reader)) is not None:
+            found[name].append(path)
+    return found
+
+
+def _recordings(places: Iterable[Path], depth: int) -> Iterator[tuple[Path, str]]:
+    """Recordings at and below some places, in no other recording, and their readers."""
+    for place in map(Path.absolute, places):
+        reader = None
+        with suppress(OSError):
+            reader = recognise(place)
+        if reader is not None:
+            yield place, reader
+        elif depth and place.is_dir():
+            with suppress(OSError):
+                entries = sorted(entry for entry in islice(place.iterdir(), _MOST_ENTRIES) if entry.is_dir())
+                yield from _recordings(entries, depth - 1)
+
+
+def list_data_sets(on_disk: OnDisk) -> str:
+    """One line a data set, and how to go on."""
+    rows = [("name", "sensor", "reader", "truth", "IMU", "on disk")]
+    for one in CATALOGUE:
+        there = count(len(on_disk[one.name]), "recording") if on_disk.get(one.name) else "-"
+        rows.append((one.name, one.sensor, one.reader, one.truth, "yes" if one.imu else "no", there))
+    widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    lines = ["".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"looked for in {evalio_names.data_folder()} (EVALIO_DATA) and in folders that are named",
+            "more about one, with its sequences: lidarslam datasets hilti_2022",
+        ]
+    )
+
+
+def describe_data_set(one: DataSet, on_disk: OnDisk) -> str:
+    """All that is known about one."""
+    rows = list(_rows(one, on_disk.get(one.name, ())))
+    lines = [
+        f"{label if index == 0 else '':<11}{line}"
+        for label, text in rows
+        for index, line in enumerate(
+            wrap(one_line(text, 8000), _WIDTH - 11, break_long_words=False, break_on_hyphens=False) or [""]
+        )
+    ]
+    return "\n".join([one.title, *lines])
+
+
+def _rows(one: DataSet, found: Sequence[Path]) -> Iterator[tuple[str, str]]:
+    yield "name", one.name
+    yield "sensor", one.sensor
+    yield "truth", one.truth
+    yield "IMU", "yes" if one.imu else "no"
+    yield "page", one.url
+    yield "layout", one.layout
+    sequences = _sequences(one)
+    if sequences:
+        yield "sequences", ", ".join(sequences)
+    if one.reader == "evalio":
+        sequence = sequences[0] if sequences else "SEQUENCE"
+        yield "reader", "evalio" if sequences else "evalio, which is not installed: pip install 'lidarslam[datasets]'"
+        yield "download", evalio_names.how_to_get(evalio_names.data_folder() / one.name / sequence)
+        yield "run", f"lidarslam run {evalio_names.PREFIX}{one.name}/{sequence}"
+    else:
+        yield "reader", one.reader
+        yield "download", "from its page, under its licence"
+        yield "run", " ".join(["lidarslam run FOLDER", one.choose]).strip()
+    yield "tried", _TRIED[one.tried]
+    yield from (("on disk" if index == 0 else "", str(path)) for index, path in enumerate(found))
+
+
+def _sequences(one: DataSet) -> tuple[str, ...]:
+    return evalio_names.sequences().get(one.name, ()) if one.reader == "evalio" else ()
+
+
+def as_json(chosen: Sequence[DataSet], on_disk: OnDisk) -> str:
+    """The facts of the table as JSON, with the paths on disk and, of single ones, the sequences that evalio has."""
+
+    def content(one: DataSet) -> dict[str, Any]:
+        paths = [str(path) for path in on_disk.get(one.name, ())]
+        return {**asdict(one), "sequences": list(_sequences(one)) if chosen else [], "on_disk": paths}
+
+    return json.dumps([content(one) for one in chosen or CATALOGUE], indent=2)

@@ -1,0 +1,64 @@
+"""The samples of an IMU as recorded, made usable: in order, finite, in SI units."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.plain_text import count
+from lidarslam.datasets.recording import ImuSummary
+
+_STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
+# Medians of the specific force's size, in the unit of the recording: what is carried feels about one g on average.
+_IN_G = (0.7, 1.5)
+_IN_SI = (7.0, 15.0)
+
+
+def usable_samples(
+    stamps: FloatArray,
+    angular_velocities: FloatArray,
+    accelerations: FloatArray,
+    T_lidar_imu: FloatArray | None,
+    notes: tuple[str, ...] = (),
+) -> ImuSamples | None:
+    """The samples in the order of time; None where there are none.
+
+    Samples with a number that is not finite or the stamp of another one are left out, and accelerations in g are
+    converted; both are noted.
+
+    Args:
+        stamps: (N,) seconds, in any order.
+        angular_velocities: (N, 3) rad/s.
+        accelerations: (N, 3) specific force, m/s^2 or g.
+        T_lidar_imu: (4, 4) or None if unknown.
+        notes: what is known about the samples already.
+    """
+    finite = np.isfinite(np.column_stack([stamps, angular_velocities, accelerations])).all(axis=1)
+    finite_rows = np.flatnonzero(finite)
+    rows = finite_rows[np.unique(stamps[finite_rows], return_index=True)[1]]
+    if not len(rows):
+        return None
+    notes = (*notes, *_left_out(len(stamps) - len(finite_rows), len(finite_rows) - len(rows)))
+    force = accelerations[rows]
+    size = float(np.median(np.linalg.norm(force, axis=1)))
+    if _IN_G[0] < size < _IN_G[1]:
+        force = force * _STANDARD_GRAVITY
+        notes = (*notes, f"The IMU's accelerations are in g (median {size:.2f}) and were converted to m/s^2.")
+    elif not _IN_SI[0] < size < _IN_SI[1]:
+        notes = (*notes, f"The IMU's accelerations have a median of {size:.3g}, which is gravity in no known unit.")
+    return ImuSamples(stamps[rows], angular_velocities[rows], force, T_lidar_imu, notes)
+
+
+def _left_out(not_finite: int, repeated: int) -> Iterator[str]:
+    kinds = [(not_finite, "with a number that is not finite"), (repeated, "with the stamp of another")]
+    for number, kind in kinds:
+        if number:
+            yield f"{count(number, 'IMU sample')} {kind} left out."
+
+
+def summarise(name: str, samples: ImuSamples | None) -> ImuSummary | None:
+    """The description of the samples of a topic, file or folder; None of none."""
+    if samples is None:
+        return None
+    return ImuSummary(name, len(samples), samples.rate_hz, samples.T_lidar_imu is not None, samples.notes)

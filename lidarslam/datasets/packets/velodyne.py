@@ -1,0 +1,131 @@
+"""Packets of Velodyne's sensors, decoded by velodyne-decoder: those of one sweep, and captures (.pcap)."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.folders.point_table import coordinates
+from lidarslam.datasets.packets.libraries import require
+from lidarslam.datasets.packets.packet_recording import PacketRecording
+from lidarslam.datasets.recording import PointField
+from lidarslam.datasets.times.point_time import PointTimeModel
+
+# Beyond the range of any model; the library's own limit is short of some.
+_FARTHEST_M = 1000.0
+_PACKETS_LOOKED_AT = 2000
+# First bytes and lengths of others' packets.
+_HESAI, _ROBOSENSE = b"\xee\xff", (b"\x55\xaa", b"\xa5\xff")
+
+
+class VelodyneCapture(PacketRecording):
+    """The sweeps of a .pcap file, stamped by the host at their first packet."""
+
+    point_time = PointTimeModel("time", "s", "relative")
+
+    def __init__(self, source: Path, config: ReaderConfig) -> None:
+        require("velodyne_decoder", "packets of a Velodyne")
+        super().__init__(source, config)
+
+    @cached_property
+    def _extent(self) -> tuple[int, float]:
+        count, last = 0, 0.0
+        for stamp, _ in self._clouds():
+            count, last = count + 1, stamp
+        return count, last
+
+    def _sweeps(self, wanted: range) -> Iterator[Scan]:
+        return (self._scan(*cloud) for cloud in islice(self._clouds(), wanted.start, wanted.stop, wanted.step))
+
+    def _scan(self, stamp: float, cloud: NDArray[np.void]) -> Scan:
+        offsets = self._offsets(cloud["time"].astype(np.float64))
+        return Scan.from_raw(coordinates(cloud), stamp, offsets, cloud["ring"], cloud["intensity"])
+
+    def _clouds(self) -> Iterator[tuple[float, NDArray[np.void]]]:
+        """Stamp and points of each sweep.
+
+        Raises:
+            InputError: the file is damaged, of another format, or holds no packets of a Velodyne.
+        """
+        import velodyne_decoder
+
+        config = velodyne_decoder.Config(max_range=_FARTHEST_M, timestamp_first_packet=True)
+        found = False
+        try:
+            for stamp, cloud in velodyne_decoder.read_pcap(self._source, config, as_pcl_structs=True):
+                if len(cloud):
+                    found = True
+                    yield stamp.host, cloud
+        except Exception as error:  # the library and its reader of captures raise nearly anything
+            if found and type(error).__name__ == "NeedData":
+                return  # the recording of the capture was cut short
+            raise InputError(f"{self._source}: {_reason(self._source, error)}") from error
+        if not found:
+            raise InputError(f"{self._source}: {_other_sensor(self._source)}")
+
+    def _fields(self) -> tuple[PointField, ...]:
+        _, cloud = next(self._clouds())
+        return fields_of(cloud)
+
+
+def decode_sweep(packets: Sequence[tuple[float, bytes]]) -> tuple[float, NDArray[np.void]]:
+    """The host's stamp in seconds that the times of the points count from, and the points (N,), of one or more packets.
+
+    Args:
+        packets: stamps in seconds, and data of 1206 bytes each.
+
+    Raises:
+        InputError: the library cannot decode them.
+    """
+    import velodyne_decoder
+
+    decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config(max_range=_FARTHEST_M))
+    sweep = velodyne_decoder.PacketVector([velodyne_decoder.VelodynePacket(*packet) for packet in packets])
+    try:
+        stamp, cloud = decoder.decode(sweep, as_pcl_structs=True)
+    except RuntimeError as error:
+        raise InputError(f"packets of a Velodyne cannot be decoded ({error})") from error
+    return stamp.host, cloud
+
+
+def fields_of(cloud: NDArray[np.void]) -> tuple[PointField, ...]:
+    """The fields of decoded points."""
+    return tuple(PointField(name, str(cloud.dtype[name])) for name in cloud.dtype.names or ())
+
+
+def _reason(path: Path, error: Exception) -> str:
+    """Why a capture cannot be read, and what to do."""
+    said = " ".join(str(error).split()) or type(error).__name__
+    if "tcpdump" in said or type(error).__name__ == "NeedData":
+        return f"is no capture that can be read; a .pcapng is converted by `editcap -F pcap {path} {path.stem}.pcap`"
+    return f"its packets cannot be decoded ({said}); record it again, or play it through the sensor's driver"
+
+
+def _other_sensor(path: Path) -> str:
+    """What a capture without packets of a Velodyne holds, and what to do."""
+    import velodyne_decoder
+
+    payloads: list[bytes] = []
+    with suppress(Exception):  # damaged; what was found so far is judged
+        for _, payload in islice(velodyne_decoder.util.iter_pcap(path), _PACKETS_LOOKED_AT):
+            payloads.append(bytes(payload)) if isinstance(payload, bytes) else None
+    maker = None
+    if any(payload.startswith(_HESAI) for payload in payloads):
+        maker = "Hesai"
+    elif any(payload.startswith(_ROBOSENSE) for payload in payloads):
+        maker = "RoboSense"
+    if maker is not None:
+        return (
+            f"holds packets of a {maker}, which are not decoded; play it through the sensor's driver, and record a bag"
+        )
+    return (
+        "holds no packets of a Velodyne; for an Ouster, put the sensor's metadata beside it as"
+        f" {path.with_suffix('.json').name}; else play it through the sensor's driver, and record a bag"
+    )

@@ -1,0 +1,96 @@
+"""Apollo-SouthBay: `pcds/*.pcd` and `poses/gt_poses.txt`, a line of index, stamp, position and quaternion a scan."""
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import parse_numbers
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.folders.scan_folder import ScanFolderRecording
+from lidarslam.datasets.published.poses import poses_wxyz
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.times.stamps import increasing_rows
+
+_COLUMNS = 9
+_LISTED = 8
+
+
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open a folder with pcds and poses, or `config.sequence` of one above several such.
+
+    Raises:
+        InputError: no such sequence, or its poses do not go with its scans.
+    """
+    return ApolloRecording(_find_sequence(source, config.sequence), config)
+
+
+def is_sequence(folder: Path) -> bool:
+    """Whether a folder has Apollo's layout."""
+    return (folder / "pcds").is_dir() and (folder / "poses" / "gt_poses.txt").is_file()
+
+
+def _find_sequence(source: Path, wanted: str | None) -> Path:
+    if is_sequence(source):
+        if wanted not in (None, source.resolve().name):
+            raise InputError(f"{source}: is one sequence, not {wanted}; leave --sequence out or give the folder above")
+        return source
+    names = sorted(folder.name for folder in source.iterdir() if is_sequence(folder)) if source.is_dir() else []
+    if wanted in names or (wanted is None and len(names) == 1):
+        return source / (wanted or names[0])
+    if not names:
+        raise InputError(f"{source}: expected pcds and poses/gt_poses.txt in it, or in folders in it; found neither")
+    more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
+    reason = "choose a sequence with --sequence" if wanted is None else f"has no sequence {wanted!r}"
+    raise InputError(f"{source}: {reason}; there are: {', '.join(names[:_LISTED])}{more}")
+
+
+class ApolloRecording(ScanFolderRecording):
+    """One sequence; its scans are read as those of any folder."""
+
+    reader = "apollo"
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        super().__init__(folder / "pcds", config)
+        self._sequence = folder
+        self._rows = self._read_poses()
+        self.stamps = self._rows[:, 1]
+        self._layout = replace(self._layout, stamps=self.stamps, from_clock=True, notes=())
+        if not increasing_rows(self.stamps).all():
+            raise InputError(f"{self._truth_path()}: expected stamps that increase from line to line; mend it")
+
+    def _read_poses(self) -> FloatArray:
+        """The rows (N, 9) of the scans; by the index where the scans are named so, else in their order."""
+        rows = parse_numbers(self._truth_path(), _COLUMNS)
+        numbers = [int(path.stem) if path.stem.isdecimal() else -1 for path in self._files]
+        by_index = {int(row[0]): row for row in rows}
+        if all(number in by_index for number in numbers):
+            return np.array([by_index[number] for number in numbers])
+        if len(rows) != len(self._files):
+            raise InputError(
+                f"{self._truth_path()}: expected a line for each of the {len(self._files)} scans, by its index or in"
+                f" their order, got {len(rows)} lines; download it again"
+            )
+        return rows
+
+    @property
+    def name(self) -> str:
+        """The sequence's folder."""
+        return self._sequence.resolve().name
+
+    @cached_property
+    def ground_truth(self) -> Trajectory:
+        """T_world_lidar at every scan; the poses are taken for those of the scans' frame."""
+        try:
+            # The scalar is the last of the file's four numbers.
+            poses = poses_wxyz(self._rows[:, 2:5], np.roll(self._rows[:, 5:9], 1, axis=1))
+        except ValueError as error:
+            raise InputError(f"{self._truth_path()}: {error}; download it again") from error
+        return Trajectory(self.stamps, poses)
+
+    def _truth_path(self) -> Path:
+        return self._sequence / "poses" / "gt_poses.txt"

@@ -1,0 +1,138 @@
+"""Argoverse 2, Sensor and LiDAR data sets: the sweeps of one log, two stacked 32-beam LiDARs in one.
+
+Points are published in the vehicle's frame at the rear axle, compensated to the sweep's stamp. Here they are in the
+frame of the upper LiDAR, from where rings and elevations are those of a sensor.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.file_recording import FileRecording
+from lidarslam.datasets.published.poses import poses_wxyz
+from lidarslam.datasets.recording import PointField, Recording
+from lidarslam.datasets.times.stamps import increasing_rows
+
+_NANOSECOND = 1e-9
+_POINT = ("x", "y", "z", "intensity", "laser_number")
+_POSITION, _QUATERNION = ("tx_m", "ty_m", "tz_m"), ("qw", "qx", "qy", "qz")
+_SENSOR = "up_lidar"
+
+
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open a log, the folder with sensors/lidar.
+
+    Raises:
+        InputError: it has no sweep, or pyarrow is not installed.
+    """
+    return Argoverse2Recording(source, config)
+
+
+class Argoverse2Recording(FileRecording):
+    """One log."""
+
+    reader = "argoverse-2"
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        files = sorted((folder / "sensors" / "lidar").glob("*.feather"), key=lambda path: path.stem.zfill(20))
+        if not files:
+            raise InputError(f"{folder}: holds no sweep sensors/lidar/*.feather; give the folder of one log")
+        if wrong := next((path for path in files if not path.stem.isdecimal()), None):
+            raise InputError(f"{wrong}: expected a name that is the sweep's stamp in nanoseconds; move it away")
+        super().__init__(folder, config, files)
+        self.stamps = np.array([int(path.stem) for path in files]) * _NANOSECOND
+
+    @property
+    def name(self) -> str:
+        """Such as argoverse2_02678d04."""
+        return f"argoverse2_{self._folder.resolve().name.partition('-')[0]}"
+
+    @cached_property
+    def _T_ego_lidar(self) -> FloatArray | None:
+        """The mounting of the upper LiDAR; None without a calibration."""
+        path = self._folder / "calibration" / "egovehicle_SE3_sensor.feather"
+        if not path.is_file():
+            return None
+        sensors = _read_columns(path, ("sensor_name", *_POSITION, *_QUATERNION))
+        rows = np.flatnonzero(sensors["sensor_name"] == _SENSOR)
+        if len(rows) != 1:
+            raise InputError(f"{path}: expected one row of {_SENSOR}, got {len(rows)}; download it again")
+        T_ego_lidar: FloatArray = _poses(path, sensors)[rows[0]]
+        return T_ego_lidar
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar at the vehicle's poses, more than there are sweeps."""
+        path = self._truth_path()
+        if path is None:
+            return None
+        table = _read_columns(path, ("timestamp_ns", *_POSITION, *_QUATERNION))
+        stamps, T_world_ego = table["timestamp_ns"].astype(np.float64) * _NANOSECOND, _poses(path, table)
+        T_world_lidar = T_world_ego if self._T_ego_lidar is None else T_world_ego @ self._T_ego_lidar
+        order = np.argsort(stamps, kind="stable")
+        kept = order[increasing_rows(stamps[order])]
+        return Trajectory(stamps[kept], T_world_lidar[kept])
+
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
+        table = _read_columns(self._files[index], _POINT)
+        points = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
+        if self._T_ego_lidar is not None:
+            missing = ~points.any(axis=1)
+            points = transform_points(inverse(self._T_ego_lidar), points)
+            points[missing] = 0.0
+        stamp = float(self.stamps[index])
+        return Scan.from_raw(points, stamp, rings=table["laser_number"], intensities=table["intensity"])
+
+    def _truth_path(self) -> Path | None:
+        path = self._folder / "city_SE3_egovehicle.feather"
+        return path if path.is_file() else None
+
+    def _fields(self, index: int) -> tuple[PointField, ...]:
+        table = _read_columns(self._files[index], _POINT)
+        return tuple(PointField(name, str(values.dtype)) for name, values in table.items())
+
+    def _notes(self) -> Iterator[str]:
+        yield "The scans are motion compensated by the publishers; their per-point times are not needed."
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A missing calibration."""
+        if self._T_ego_lidar is not None:
+            return ()
+        return (
+            "There is no calibration/egovehicle_SE3_sensor.feather; points and poses are in the vehicle's frame,"
+            " not that of the upper LiDAR.",
+        )
+
+
+def _read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    try:
+        from pyarrow import feather
+    except ImportError as error:
+        raise InputError(f"{path}: needs pyarrow; pip install 'lidarslam[datasets]'") from error
+    try:
+        table = feather.read_table(path, columns=list(names))
+        return {name: table.column(name).to_numpy() for name in names}
+    except Exception as error:  # of pyarrow, of many classes
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: cannot be read ({reason}); download it again") from error
+
+
+def _poses(path: Path, table: dict[str, NDArray[Any]]) -> FloatArray:
+    try:
+        positions, quaternions = (
+            np.column_stack([table[name] for name in names]) for names in (_POSITION, _QUATERNION)
+        )
+        return poses_wxyz(positions, quaternions)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; download it again") from error

@@ -1,0 +1,101 @@
+"""A session of NCLT (Carlevaris-Bianco et al., IJRR 2016): `velodyne_sync/*.bin`, ground truth and `ms25.csv`.
+
+Points are those of one turn in the frame of the robot's body, whose z axis points down, in steps of 5 mm. The LiDAR's
+frame here is that of the HDL-32E's centre with the axes of the body turned by 180 degrees about x: x forward, y left,
+z up. The world of the ground truth is turned likewise.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse, make_transform, transform_points
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.folders.file_recording import FileRecording
+from lidarslam.datasets.folders.scan_files import read_bytes
+from lidarslam.datasets.imu_samples import usable_samples
+from lidarslam.datasets.published.stamped_files import increasing, read_table, stamped_scans
+from lidarslam.datasets.recording import PointField, Recording
+
+SCANS = "velodyne_sync"
+_POINT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
+_STEP_M, _ORIGIN_M = 0.005, -100.0
+# Places of the sensors in the frame of the body, from the data set's paper; the IMU has the body's axes.
+_LIDAR_IN_BODY, _IMU_IN_BODY = np.array([0.002, -0.004, -0.957]), np.array([-0.11, -0.18, -0.71])
+_UPRIGHT = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+_T_BODY_LIDAR = make_transform(np.diag([1.0, -1.0, -1.0]), _LIDAR_IN_BODY)
+_T_LIDAR_IMU = inverse(_T_BODY_LIDAR) @ make_transform(np.eye(3), _IMU_IN_BODY)
+_US = 1e-6
+
+
+def open_recording(source: Path, config: ReaderConfig) -> Recording:
+    """Open the folder of a session, such as 2012-01-08.
+
+    Raises:
+        InputError: it holds no scans, or their names are no stamps.
+    """
+    if not (source / SCANS).is_dir():
+        raise InputError(f"{source}: expected a session of NCLT with a folder {SCANS} in it, found none")
+    return NcltRecording(source, config)
+
+
+class NcltRecording(FileRecording):
+    """One session."""
+
+    reader = "nclt"
+    imu_name = "ms25.csv"
+
+    def __init__(self, folder: Path, config: ReaderConfig) -> None:
+        files, stamps = stamped_scans(folder / SCANS)
+        super().__init__(folder, config, files)
+        self.stamps = stamps
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar; the world is the truth's with its z axis turned up."""
+        path = self._truth_path()
+        if path is None:
+            return None
+        rows = read_table(path, 7)
+        R_world_body = Rotation.from_euler("ZYX", rows[:, [6, 5, 4]]).as_matrix()
+        T_down_body = make_transform(R_world_body, rows[:, 1:4])
+        return increasing(_US * rows[:, 0], _UPRIGHT @ T_down_body @ _T_BODY_LIDAR)
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """The samples of ms25.csv: stamp, magnetic field, acceleration, angular velocity."""
+        path = self._folder / self.imu_name
+        if not path.is_file():
+            return None
+        rows = read_table(path, 10)
+        return usable_samples(_US * rows[:, 0], rows[:, 7:10], rows[:, 4:7], _T_LIDAR_IMU)
+
+    def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
+        path = self._files[index]
+        data = read_bytes(path)
+        if len(data) % _POINT.itemsize:
+            raise InputError(f"{path}: expected points of {_POINT.itemsize} bytes, got {len(data)}; copy it again")
+        records = np.frombuffer(data, _POINT)
+        in_body = _STEP_M * np.column_stack([records[axis] for axis in "xyz"]).astype(np.float64) + _ORIGIN_M
+        points: FloatArray = transform_points(inverse(_T_BODY_LIDAR), in_body)
+        return Scan.from_raw(points, self.stamps[index], None, records["laser"], records["intensity"])
+
+    def _truth_path(self) -> Path | None:
+        name = f"groundtruth_{self.name}.csv"
+        above = self._folder.resolve().parent
+        places = (self._folder, above, above / "ground_truth")
+        return next((place / name for place in places if (place / name).is_file()), None)
+
+    def _fields(self, index: int) -> tuple[PointField, ...]:  # noqa: ARG002
+        return tuple(PointField(name, str(_POINT[name])) for name in _POINT.names or ())
+
+    def _notes(self) -> Iterator[str]:
+        yield "Points have no times in this layout. The body's axes are turned so that z points up."

@@ -1,0 +1,107 @@
+"""The JSON tables of nuScenes, as far as LIDAR_TOP needs them.
+
+sample_data and ego_pose have millions of records in v1.0-trainval. Their records hold no others, so that the few wanted
+ones are found by their text, and only those are parsed.
+"""
+
+import json
+import mmap
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.published.poses import poses_wxyz
+
+_TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
+_LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
+_MICROSECOND = 1e-6
+_SWEEP = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "timestamp", "filename")
+_POSE = ("token", "translation", "rotation")
+_TAIL = 100  # bytes
+
+Record = dict[str, Any]
+
+
+class Sweeps(NamedTuple):
+    """The sweeps of a scene in the order of time, samples (key frames) among them."""
+
+    files: list[str]  # N paths below the root
+    stamps: FloatArray  # (N,) seconds
+    T_world_lidar: FloatArray  # (N, 4, 4)
+
+
+def scenes(version: Path) -> dict[str, str]:
+    """The tokens of the scenes of a version by their names.
+
+    Raises:
+        InputError: the table is missing or damaged.
+    """
+    return {record["name"]: record["token"] for record in _table(version / "scene.json", "name", "token")}
+
+
+def read_sweeps(version: Path, scene: str) -> Sweeps:
+    """The sweeps of a scene, given by its token.
+
+    Raises:
+        InputError: a table is missing or damaged, or the scene has no sweep.
+    """
+    samples = {
+        one["token"] for one in _table(version / "sample.json", "token", "scene_token") if one["scene_token"] == scene
+    }
+    data = _select(version / "sample_data.json", _LIDAR_FILE, lambda _: True, *_SWEEP)
+    sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
+    if not sweeps:
+        raise InputError(f"{version / 'sample_data.json'}: has no sweep of LIDAR_TOP for the scene; download it again")
+    wanted = {one["ego_pose_token"].encode() for one in sweeps}
+    ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, *_POSE)
+    T_world_ego = _poses(version, list(ego_poses), [one["ego_pose_token"] for one in sweeps])
+    sensors = _table(version / "calibrated_sensor.json", *_POSE)
+    T_ego_lidar = _poses(version, sensors, [one["calibrated_sensor_token"] for one in sweeps])
+    stamps = np.array([one["timestamp"] for one in sweeps]) * _MICROSECOND
+    return Sweeps([one["filename"] for one in sweeps], stamps, T_world_ego @ T_ego_lidar)
+
+
+def _poses(version: Path, records: list[Record], tokens: list[str]) -> FloatArray:
+    """Transforms (N, 4, 4) of N tokens."""
+    by_token = {one["token"]: one for one in records}
+    if missing := next((token for token in tokens if token not in by_token), None):
+        raise InputError(f"{version}: has no pose {missing!r}; download the tables again")
+    found = [by_token[token] for token in tokens]
+    try:
+        return poses_wxyz([one["translation"] for one in found], [one["rotation"] for one in found])
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{version}: a pose is damaged ({error}); download the tables again") from error
+
+
+def _table(path: Path, *keys: str) -> list[Record]:
+    try:
+        return [_checked(record, keys) for record in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
+
+
+def _select(
+    path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], *keys: str
+) -> Iterator[Record]:
+    """The records of a large table in which a pattern is found, as far as the match is wanted."""
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            if not text[-_TAIL:].rstrip().endswith(b"]"):
+                raise ValueError("its end is missing")
+            for match in pattern.finditer(text):
+                if wanted(match):
+                    start, end = text.rfind(b"{", 0, match.start()), text.find(b"}", match.end()) + 1
+                    yield _checked(json.loads(text[start:end]), keys)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
+
+
+def _checked(record: Record, keys: tuple[str, ...]) -> Record:
+    if missing := [key for key in keys if key not in record]:
+        raise ValueError(f"a record has no {missing[0]}")
+    return record

@@ -1,0 +1,43 @@
+"""Files that the data sets of cars and robots have in common: scans named by their stamps, and CSV tables."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import parse_numbers
+from lidarslam.datasets.times.stamps import increasing_rows, stamps_from_names
+
+
+def stamped_scans(folder: Path) -> tuple[list[Path], FloatArray]:
+    """The .bin files of a folder by their stamps, and the stamps (N,) in seconds.
+
+    Raises:
+        InputError: there is none, or a name is no clock reading in micro- or nanoseconds.
+    """
+    files = np.array([path for path in folder.glob("*.bin") if not path.name.startswith(".")], dtype=object)
+    if not len(files):
+        raise InputError(f"{folder}: holds no .bin scan")
+    stamps = stamps_from_names([path.stem for path in files])
+    if stamps is None or len(np.unique(stamps)) < len(stamps):
+        raise InputError(f"{folder}: expected scans named by their stamps, such as 1561000444390857630.bin")
+    order = np.argsort(stamps)
+    return list(files[order]), stamps[order]
+
+
+def read_table(path: Path, columns: int) -> FloatArray:
+    """The rows (N, columns) of a table whose numbers are all finite; the first column is a stamp.
+
+    Raises:
+        InputError: the file cannot be read, or a row does not hold that many numbers.
+    """
+    table = parse_numbers(path, columns)
+    return np.asarray(table[np.isfinite(table).all(axis=1)])
+
+
+def increasing(stamps: FloatArray, T_world_lidar: FloatArray) -> Trajectory | None:
+    """The poses (N, 4, 4) whose stamps (N,) increase; None if there is none."""
+    kept = increasing_rows(stamps)
+    return Trajectory(stamps[kept], T_world_lidar[kept]) if kept.any() else None

@@ -1,0 +1,134 @@
+"""The IMU of a bag: its topic, its messages sensor_msgs/Imu, and its extrinsic from /tf_static."""
+
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import islice, takewhile
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.plain_text import count
+from lidarslam.datasets.imu_samples import summarise, usable_samples
+from lidarslam.datasets.recording import ImuSummary, Topic
+from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
+from lidarslam.datasets.ros.static_transforms import static_transform
+
+_IMU_TYPE = "sensor_msgs/msg/Imu"
+# Enough for the median of a rate.
+_SAMPLES_LOOKED_AT = 200
+# Behind the header, in float64: orientation 4, its covariance 9, angular velocity 3, covariance 9, acceleration 3, 9.
+_NUMBERS = 37
+_ANGULAR_VELOCITY, _ACCELERATION = slice(13, 16), slice(25, 28)
+
+
+class CloudTopic(NamedTuple):
+    """What the point clouds of a bag are stamped and located by."""
+
+    topic: Topic
+    frame_id: str
+    stamps: StampSource
+
+
+class BagImu:
+    """The IMU beside the point clouds of a bag."""
+
+    def __init__(self, bag: BagFile, clouds: CloudTopic, wanted: str | None) -> None:
+        """Choose the topic.
+
+        Raises:
+            InputError: the wanted topic is no IMU's.
+        """
+        self._bag = bag
+        self._clouds = clouds
+        self._topic = _choose(bag, clouds, wanted)
+
+    def samples(self) -> ImuSamples | None:
+        """All samples, by one pass over their topic; None of a bag without any."""
+        return None if self._topic is None else self._decoded(self._bag.messages(self._topic))
+
+    def summary(self) -> ImuSummary | None:
+        """The description, by the first samples; how many there are stands in the index."""
+        if self._topic is None:
+            return None
+        first = self._decoded(islice(self._bag.messages(self._topic), _SAMPLES_LOOKED_AT))
+        found = summarise(self._topic.name, first)
+        return None if found is None else replace(found, samples=self._topic.messages)
+
+    def _decoded(self, messages: Iterator[BagMessage]) -> ImuSamples | None:
+        sound: list[BagMessage] = []
+        rows: list[FloatArray] = []
+        damaged = 0
+        for message in messages:
+            numbers = None if message.damage is not None else _numbers(message.raw, self._bag.ros2)
+            if numbers is None:
+                damaged += 1
+                continue
+            sound.append(message)
+            rows.append(numbers)
+        if not sound:
+            return None
+        source = find_stamp_source(sound) if self._clouds.stamps.from_header else self._clouds.stamps
+        stamps = np.array([source.stamp(message) for message in sound])
+        stamps[stamps <= source.before_first] = np.nan
+        T_lidar_imu, notes = self._extrinsic(sound[0].frame_id)
+        if damaged:
+            notes = (*notes, f"{count(damaged, 'damaged IMU message')} left out.")
+        table = np.stack(rows)
+        return usable_samples(stamps, table[:, _ANGULAR_VELOCITY], table[:, _ACCELERATION], T_lidar_imu, notes)
+
+    def _extrinsic(self, frame_id: str) -> tuple[FloatArray | None, tuple[str, ...]]:
+        lidar = self._clouds.frame_id
+        if frame_id.lstrip("/") == lidar.lstrip("/"):
+            note = f"LiDAR and IMU share the frame {lidar!r}, so the IMU is taken to have the LiDAR's axes and place."
+            return np.eye(4), (note,)
+        return static_transform(self._bag, lidar, frame_id), ()
+
+
+def _choose(bag: BagFile, clouds: CloudTopic, wanted: str | None) -> Topic | None:
+    """The wanted topic, or of several the nearest by the names of topic and frame, of these the fastest."""
+    imus = [topic for topic in bag.topics if topic.message_type == _IMU_TYPE and topic.messages]
+    if wanted is not None:
+        named = (topic for topic in imus if topic.name.lstrip("/") == wanted.lstrip("/"))
+        if (found := next(named, None)) is None:
+            raise InputError(f"{bag.path}: reader.imu_topic is {wanted!r}; its IMU topics: {_listing(imus)}")
+        return found
+    if len(imus) < 2:
+        return imus[0] if imus else None
+
+    def nearness(topic: Topic) -> tuple[int, int]:
+        message = next((one for one in bag.messages(topic) if one.damage is None), None)
+        frame_id = "" if message is None else message.frame_id
+        shared = _common(_parts(topic.name), _parts(clouds.topic.name)[:-1])
+        return shared + _common(_parts(frame_id, "[/_]"), _parts(clouds.frame_id, "[/_]")), topic.messages
+
+    return max(imus, key=nearness)
+
+
+def _listing(topics: Sequence[Topic]) -> str:
+    return ", ".join(topic.name for topic in topics) or "none"
+
+
+def _parts(name: str, separator: str = "/") -> list[str]:
+    return re.split(separator, name.lstrip("/"))
+
+
+def _common(first: Sequence[str], second: Sequence[str]) -> int:
+    """How many parts two names share from the left."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(first, second, strict=False)))
+
+
+def _numbers(raw: bytes, ros2: bool) -> FloatArray | None:
+    """The numbers (37,) of a serialised message, all of one size behind its header; None if it is cut off."""
+    order = ">" if ros2 and raw[1] != 1 else "<"
+    (characters,) = struct.unpack_from(f"{order}I", raw, 12)
+    # CDR aligns numbers to their size, counted from behind the four bytes of encapsulation.
+    start = 4 + -(-(12 + characters) // 8) * 8 if ros2 else 16 + characters
+    if len(raw) < start + 8 * _NUMBERS:
+        return None
+    return np.frombuffer(raw, f"{order}f8", _NUMBERS, start).astype(np.float64)

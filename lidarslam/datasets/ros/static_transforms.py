@@ -1,0 +1,58 @@
+"""Fixed transforms between the frames of a bag, from its messages tf2_msgs/TFMessage on /tf_static."""
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
+from lidarslam.datasets.ros.bag_file import BagFile
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, deserialize
+
+_TOPIC = "tf_static"
+
+Edges = dict[str, dict[str, FloatArray]]
+"""T_from_to (4, 4) by the names of both frames, in both directions."""
+
+
+def static_transform(bag: BagFile, target: str, source: str) -> FloatArray | None:
+    """T_target_source (4, 4) along the chain of fixed transforms between two frames; None where there is no chain."""
+    edges = _edges(bag)
+    reached = {_name(target): np.eye(4)}
+    waiting = [_name(target)]
+    while waiting:
+        frame = waiting.pop()
+        for other, T_frame_other in edges.get(frame, {}).items():
+            if other not in reached:
+                reached[other] = reached[frame] @ T_frame_other
+                waiting.append(other)
+    return reached.get(_name(source))
+
+
+def _edges(bag: BagFile) -> Edges:
+    edges: Edges = {}
+    for topic in bag.topics:
+        if topic.message_type != TRANSFORMS_TYPE or topic.name.split("/")[-1] != _TOPIC:
+            continue
+        for message in bag.messages(topic):
+            with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
+                for stamped in deserialize(message.raw, TRANSFORMS_TYPE, bag.ros2).transforms:
+                    parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+                    T_parent_child = _matrix(stamped.transform)
+                    edges.setdefault(parent, {})[child] = T_parent_child
+                    edges.setdefault(child, {})[parent] = inverse(T_parent_child)
+    return edges
+
+
+def _name(frame_id: str) -> str:
+    return frame_id.lstrip("/")
+
+
+def _matrix(transform: Any) -> FloatArray:
+    """(4, 4) of a geometry_msgs/Transform."""
+    q, t = transform.rotation, transform.translation
+    T = make_transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
+    if not np.isfinite(T).all():
+        raise ValueError("a transform that is not finite")
+    return T

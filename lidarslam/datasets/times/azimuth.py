@@ -1,0 +1,142 @@
+"""Time of the points of a spinning sensor from their azimuth, where a sweep has no times but its order of firing."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.times.point_time import PointTimeModel, is_return
+
+AZIMUTH_TIME = PointTimeModel("azimuth", "s", "relative")
+
+# The mean azimuth of so many blocks of consecutive points is followed round the circle.
+_BLOCKS, _FEWEST_IN_BLOCK = 180, 8
+# Length of a block's mean direction: 1 where all its points have one azimuth; 0.95 is about +-18 degrees.
+_CONCENTRATED, _SHARE = 0.95, 0.95
+_TURN_DEG = (340.0, 385.0)
+# Lasers of one firing differ in azimuth by at most this.
+_WIDEST_FIRING_DEG = 12.0
+# Of the seam: its width at the end and at the start of a sweep, the largest angle between two points that are
+# compared, and the nearest and largest differences of range that count.
+_END_DEG, _START_DEG, _SAME_DIRECTION, _NEAREST_M = 3.0, 8.0, np.radians(0.5), 2.0
+_DIFFERS_M, _LARGEST_M = 0.05, 1.0
+_FEWEST_COMPARED, _CLEAR = 100, 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class SweepOrder:
+    """Points of a sweep in the order of firing."""
+
+    points: FloatArray  # (N, 3) the returns
+    turned_deg: FloatArray  # (N,) the angle that the sensor has turned since the sweep's first point
+
+    def end(self) -> FloatArray:
+        """The points (M, 3) before the seam."""
+        return np.asarray(self.points[self.turned_deg > self.turned_deg.max() - _END_DEG])
+
+    def start(self) -> FloatArray:
+        """The points (M, 3) behind the seam."""
+        return np.asarray(self.points[self.turned_deg < _START_DEG])
+
+
+def turned_angles(points: FloatArray, rings: NDArray[np.generic] | None = None) -> FloatArray | None:
+    """Angle in degrees by which the sensor had turned since the first point, for returns (N, 3) in their stored order.
+
+    The mean azimuth of blocks of consecutive points has to run round the circle once, in either direction. Rings
+    remove the constant angles between the lasers of one firing.
+
+    Returns:
+        (N,) from 0; None where the points are not in the order of firing of one turn.
+    """
+    if len(points) < _BLOCKS * _FEWEST_IN_BLOCK:
+        return None
+    edges = np.linspace(0, len(points), _BLOCKS + 1).astype(np.intp)
+    azimuths = np.arctan2(points[:, 1], points[:, 0])
+    means = np.add.reduceat(np.exp(1j * azimuths), edges[:-1]) / np.diff(edges)
+    path = np.degrees(np.unwrap(np.angle(means)))
+    direction = np.sign(path[-1] - path[0])
+    path *= direction
+    turn_deg = (path[-1] - path[0]) * _BLOCKS / (_BLOCKS - 1)
+    is_even = np.mean(np.abs(means) > _CONCENTRATED) >= _SHARE and np.mean(np.diff(path) > 0.0) >= _SHARE
+    if not (is_even and _TURN_DEG[0] < turn_deg < _TURN_DEG[1]):
+        return None
+    along = np.interp(np.arange(len(points)), 0.5 * (edges[:-1] + edges[1:] - 1), path)
+    aside = (direction * np.degrees(azimuths) - along + 180.0) % 360.0 - 180.0
+    for ring in () if rings is None else np.unique(rings):
+        aside[rings == ring] -= np.median(aside[rings == ring])
+    turned = along + np.clip(aside, -_WIDEST_FIRING_DEG, _WIDEST_FIRING_DEG)
+    return np.asarray(turned - turned[: edges[1]].min()).clip(min=0.0)
+
+
+def offsets_from_order(points: FloatArray, rings: NDArray[np.generic] | None, period_s: float) -> FloatArray | None:
+    """Seconds (N,) from the sweep's first point, for the raw points (N, 3) of a sweep that lasts a period.
+
+    Points without a return get NaN; None where the points are not in the order of firing.
+    """
+    found = is_return(points)
+    turned = turned_angles(points[found], None if rings is None else rings[found])
+    if turned is None:
+        return None
+    offsets = np.full(len(points), np.nan)
+    offsets[found] = turned * (period_s / turned.max())
+    return offsets
+
+
+def sweep_order(points: FloatArray, rings: NDArray[np.generic] | None) -> SweepOrder | None:
+    """The returns of a raw sweep (N, 3) with their angles; None where they are not in the order of firing."""
+    found = is_return(points)
+    turned = turned_angles(points[found], None if rings is None else rings[found])
+    return None if turned is None else SweepOrder(points[found], turned)
+
+
+def are_as_measured(pairs: Iterable[Sequence[SweepOrder]]) -> bool | None:
+    """Whether sweeps are as measured, by pairs of consecutive ones, each in its own frame.
+
+    At the seam of a sweep as measured, its last points continue in the first points of the next sweep, while its own
+    first points, in the same direction, are a whole turn older. Where the sensor moves, ranges across the seam then
+    differ less between the sweeps than within one. In a motion compensated sweep, or where sweeps have been left out
+    between, it is the other way round.
+
+    Returns:
+        None where too few ranges differ, as at rest, or the ranges contradict one another.
+    """
+    between, within = [np.empty(0)], [np.empty(0)]
+    for sweep, following in pairs:
+        differences = _across_seam(sweep, following)
+        between.append(differences[0])
+        within.append(differences[1])
+    gain = np.concatenate(within) - np.concatenate(between)
+    gain = gain[np.abs(gain) > _DIFFERS_M]
+    if len(gain) < _FEWEST_COMPARED:
+        return None
+    share = float(np.mean(gain > 0.0))
+    return True if share > _CLEAR else False if share < 0.5 else None
+
+
+def _across_seam(sweep: SweepOrder, following: SweepOrder) -> tuple[FloatArray, FloatArray]:
+    """Differences of range (K,) of a sweep's last points to the next one's first points, and to its own."""
+    end = sweep.end()
+    end = end[np.linalg.norm(end, axis=1) > _NEAREST_M]
+    ranges = np.linalg.norm(end, axis=1, keepdims=True)
+    differences, is_same = [], np.ones(len(end), dtype=bool)
+    for start in (following.start(), sweep.start()):
+        start_ranges = np.linalg.norm(start, axis=1, keepdims=True)
+        apart, nearest = KDTree(start / start_ranges).query(end / ranges)
+        is_same &= apart < _SAME_DIRECTION
+        differences.append(np.minimum(np.abs(start_ranges[nearest] - ranges)[:, 0], _LARGEST_M))
+    return differences[0][is_same], differences[1][is_same]
+
+
+def offsets_from_azimuth(points: NDArray[np.floating], before_s: float, after_s: float) -> FloatArray:
+    """Seconds (N,) from the stamp at which points (N, 3) of one sweep of KITTI's raw data were measured, in any order.
+
+    Seen from above the laser turns clockwise: it starts at the rear (azimuth pi), sweeps the left side, faces
+    forward (azimuth 0) at the stamp, sweeps the right side and ends at the rear (azimuth -pi). Measured on the
+    drives 0005 and 0009: deskewed in this direction, scans half a second apart lie closer to each other's planes
+    than without deskewing, deskewed in the opposite direction less close.
+    """
+    half_turns: FloatArray = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64) / -np.pi
+    return np.where(half_turns < 0.0, before_s * half_turns, after_s * half_turns)

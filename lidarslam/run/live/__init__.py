@@ -1,0 +1,1 @@
+"""A robot that is running: its clouds over DDS, poses in return, and the results of a run."""

@@ -1,0 +1,109 @@
+"""Scans of a topic's messages, as they come."""
+
+from dataclasses import dataclass
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.ros import livox
+from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
+from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
+from lidarslam.datasets.ros.timed_scan import field_offsets, timed_scan
+from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, PointTimeModel, is_return
+from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+
+# Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
+_MOST_LOOKED_AT = 10
+
+_NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
+_OTHER_SENSOR = "scans were left out: they come from another sensor; name one with --set reader.frame_id=NAME"
+
+
+@dataclass(frozen=True, eq=False)
+class LiveScan:
+    """A scan with what its message says beside the points."""
+
+    scan: Scan
+    stamp_ns: int  # of the header, or of the publication where the header has none
+    frame_id: str  # the sensor's frame
+
+
+class CloudDecoder:
+    """Scans from the messages of one topic, in the order of their stamps.
+
+    The sensor is that of the first message unless `reader.frame_id` names one, and unit and reference of the point
+    times are inferred from the first messages, as for a bag.
+    """
+
+    def __init__(self, config: ReaderConfig, message_type: str, faults: Faults) -> None:
+        self._config = config
+        self._type = message_type
+        self._faults = faults
+        self._frame_id = config.frame_id
+        self._last_ns: int | None = None
+        self._has_header_stamps = True
+        self._clouds: list[TimedCloud] = []
+        self._point_time: PointTimeModel | None = None
+        self._is_settled = config.time_reference == "none"
+
+    def scan(self, raw: bytes, published_ns: int) -> LiveScan | None:
+        """The scan of a serialised message; None where it cannot be used, which is counted."""
+        try:
+            header_ns, frame_id = read_header(raw, ros2=True)
+            stamp_ns = self._stamp_ns(header_ns, published_ns)
+            if not self._is_wanted(stamp_ns, frame_id):
+                return None
+            cloud = self._decode(BagMessage(published_ns, header_ns, frame_id, self._type, raw))
+        except (InputError, ValueError) as error:
+            self._faults.unreadable(InputError(str(error)))
+            return None
+        stamp = stamp_ns / 10**9
+        self._learn(cloud, stamp)
+        self._last_ns, self._frame_id = stamp_ns, frame_id
+        model = self._point_time
+        offsets = None if model is None else field_offsets(cloud, model, stamp)
+        return LiveScan(timed_scan(cloud, offsets, stamp, model is not None, self._faults), stamp_ns, frame_id)
+
+    def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
+        """The header's stamp; the time of publication where the first header has none."""
+        if self._last_ns is None:
+            self._has_header_stamps = header_ns != 0
+        return header_ns if self._has_header_stamps else published_ns
+
+    def _is_wanted(self, stamp_ns: int, frame_id: str) -> bool:
+        if self._frame_id is not None and frame_id != self._frame_id:
+            self._faults.leave_out(_OTHER_SENSOR, f"{frame_id!r} instead of {self._frame_id!r}")
+        elif self._last_ns is not None and stamp_ns <= self._last_ns:
+            self._faults.leave_out(_NOT_AFTER, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+        else:
+            return True
+        return False
+
+    def _decode(self, message: BagMessage) -> DecodedCloud:
+        """Decode the points.
+
+        Raises:
+            InputError: the message is damaged or lacks a field.
+        """
+        try:
+            return decode(message, True, self._config.time_field)
+        except InputError:
+            raise
+        except Exception as error:  # of a message that breaks off: an assertion, struct.error, IndexError
+            raise InputError(f"a message cannot be decoded ({error or type(error).__name__})") from error
+
+    def _learn(self, cloud: DecodedCloud, stamp: float) -> None:
+        """Infer unit and reference of the time field, until they are clear."""
+        if self._is_settled:
+            return
+        unit, reference = self._config.time_unit, self._config.time_reference
+        if self._type in livox.CUSTOM_MESSAGE_TYPES:
+            unit, reference = livox.TIME_UNIT, "absolute"  # as the message type defines
+        times = None if cloud.times is None else cloud.times[is_return(cloud.points)]
+        self._clouds.append(TimedCloud(cloud.time_field, times, stamp))
+        self._point_time = learn_point_time(self._clouds, unit, reference)
+        is_clear = self._point_time is not None and stamp > 2 * CLOCK_LIMIT_S
+        self._is_settled = is_clear or len(self._clouds) == _MOST_LOOKED_AT
+        if self._is_settled:
+            self._clouds.clear()

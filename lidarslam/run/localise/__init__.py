@@ -1,0 +1,1 @@
+"""A recording localised in a finished map, on disk."""

@@ -1,0 +1,1 @@
+"""Localisation in a finished map, which stays as it is."""

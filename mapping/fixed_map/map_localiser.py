@@ -1,0 +1,212 @@
+"""Localisation in a finished map: found without a guess, tracked, searched for again where tracking is lost.
+
+While the place is unknown, the recording has a local map of its own, whose scans are searched for in the finished map.
+A place counts once the scans of the next second confirm it.
+"""
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.fixed_map.fixed_map import FixedMap
+from lidarslam.mapping.fixed_map.local_mapping import LocalMapping
+from lidarslam.mapping.fixed_map.place_search import Place, PlaceSearch, Regions, Search
+from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
+from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
+from lidarslam.mapping.tracking.tracker import Tracker
+
+logger = logging.getLogger(__name__)
+
+# A scan with less of its points near surfaces of the map is outside of it, or the world has changed.
+_LEAST_OVERLAP = 0.25
+# Radius of the region that scans are registered to, in median ranges, and what it is drawn larger by, as a share.
+_RANGES = 5.0
+_SPARE = 0.5
+# The way, in median ranges, over which the recording's own map places the scans before the first place.
+_BACK_RANGES = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A place that was found and confirmed; scans are numbered from 0."""
+
+    scan: int  # that was found
+    confirmed: int  # that confirmed it
+    fits: tuple[Fit, ...]  # of the scans that it was found with
+
+
+class MapLocaliser(Stateful):
+    """Registers scans to a finished map. It cannot be saved and restored.
+
+    Args:
+        config: of the mapping.
+        fixed_map: the finished map.
+        guess: rough x, y and heading of the first scan; None: anywhere.
+    """
+
+    def __init__(
+        self, config: MappingConfig, fixed_map: FixedMap, guess: tuple[float, float, float] | None = None
+    ) -> None:
+        self._config = config
+        self._map = fixed_map
+        self._sampler = Sampler(config)
+        self._search = PlaceSearch(fixed_map, config.max_range_m)
+        self._local: LocalMapping | None = LocalMapping(config, None)
+        self._guess = guess
+        self._tracker: Tracker | None = None
+        self._regions: Regions | None = None
+        self._last: MotionState | None = None
+        self._pending: tuple[Found, FloatArray] | None = None  # unconfirmed, and its `T_map_local` (4, 4)
+        self._count = 0
+        self.found: list[Found] = []  # one a time that it was found
+        # Of every search without a place: the number of the scan, from 0, and the reason.
+        self.refusals: list[tuple[int, str]] = []
+        # Better poses than those returned, known by now, by the numbers of the scans; and which of these scans lie on
+        # the way to the first place, and which at a place that was not confirmed.
+        self.corrections: dict[int, FloatArray] = {}
+        self.placed_afterwards: list[int] = []
+        self.revoked: list[int] = []
+
+    def process(self, scan: Scan, prior: Prior) -> MappedScan:
+        """Register the next scan."""
+        sampled = self._sampler.sample(scan)
+        own = None if self._local is None else self._local.add(sampled, prior)
+        if self._tracker is not None and self._last is not None:
+            mapped = self._track(sampled, prior, self._tracker, self._last)
+            if mapped.status is Status.LOST and own is not None:  # the place was not confirmed
+                self._revoke()
+                mapped = self._dead_reckoned(own, f"the place that was found is not confirmed: {mapped.message}")
+        else:
+            assert own is not None
+            mapped = self._look(sampled, own)
+        self._last = mapped.state
+        self._count += 1
+        return mapped
+
+    def unconfirmed(self) -> list[int]:
+        """Numbers of the scans at places that were not confirmed, by now."""
+        pending = [] if self._pending is None else range(self._pending[0].scan, self._count)
+        return [*self.revoked, *pending]
+
+    def _track(self, scan: SampledScan, prior: Prior, tracker: Tracker, last: MotionState) -> MappedScan:
+        """Predict, register, judge."""
+        prediction = tracker.predict(scan, prior, last)
+        if scan.is_sparse:
+            return self._lose(tracker, prediction, None, f"only {len(scan)} points within range")
+        surfel_map = self._regions_for(scan).around(prediction.T_world_lidar[:3, 3])
+        attempt = tracker.register(scan, prior, prediction, last, surfel_map)
+        if attempt.registration is None or attempt.status is Status.LOST:
+            reason = attempt.fit.explain(self._config.tracking) or "several places nearby fit alike"
+            return self._lose(tracker, attempt.prediction, attempt.fit, reason)
+        if attempt.fit.overlap < _LEAST_OVERLAP:
+            reason = f"only {100.0 * attempt.fit.overlap:.0f} % of the scan is near surfaces of the map"
+            return self._lose(tracker, attempt.prediction, attempt.fit, reason)
+        mapped = tracker.accept(attempt, scan, prior, prediction, last)
+        if self._pending is not None and not tracker.is_unconfirmed:
+            self._confirm(*self._pending)
+        return replace(mapped, added=False)
+
+    def _confirm(self, pending: Found, T_map_local: FloatArray) -> None:
+        """Accept a place; the scans on the way to the first one are placed too, as far as drift is small."""
+        local = self._local
+        if local is not None and not self.found:
+            self.corrections = {number: T_map_local @ T for number, T in local.poses.items() if number < pending.scan}
+            reached = set(local.followed_within(_BACK_RANGES, pending.scan))
+            self.placed_afterwards = sorted(reached)
+            self.revoked = [number for number in self.revoked if number not in reached]
+        self.found.append(replace(pending, confirmed=self._count))
+        self._pending = self._local = None
+        self._guess = None
+        logger.info("found at scan %d, confirmed at scan %d", pending.scan, self._count)
+
+    def _revoke(self) -> None:
+        """Give up a place that later scans contradict."""
+        local, pending = self._local, self._pending
+        assert local is not None
+        assert pending is not None
+        T_map_local = np.eye(4) if local.T_map_local is None else local.T_map_local
+        for number in range(pending[0].scan, self._count):
+            self.corrections[number] = T_map_local @ local.poses[number]
+            self.revoked.append(number)
+        self._tracker = self._pending = None
+
+    def _lose(self, tracker: Tracker, prediction: Prediction, fit: Fit | None, reason: str) -> MappedScan:
+        """A scan that is not registered stays at its prediction; after many a local map of its own begins."""
+        T_map_lidar, velocity = prediction.T_world_lidar, prediction.velocity
+        if tracker.loses(has_points=fit is not None):
+            self._tracker = None
+            self._local = LocalMapping(self._config, T_map_lidar, self._count + 1)
+        lost = MotionState(prediction.stamp, T_map_lidar, FADING * velocity, LOST_MOTION)
+        return MappedScan(lost, T_map_lidar, False, Status.LOST, reason, fit, is_connected=False)
+
+    def _look(self, scan: SampledScan, own: MappedScan) -> MappedScan:
+        """Search for the place of the latest scans, if a search is due."""
+        found = self._searched(own)
+        if found is None:
+            return self._dead_reckoned(own, "the place is searched for")
+        if found.place is None:
+            self.refusals.append((self._count, found.reason))
+            logger.info("scan %d: not found: %s", self._count, found.reason)
+            return self._dead_reckoned(own, f"not found: {found.reason}")
+        return self._begin(scan, own, found.place)
+
+    def _searched(self, own: MappedScan) -> Search | None:
+        local = self._local
+        assert local is not None
+        if own.status is Status.LOST:
+            return None
+        nearby = None
+        if local.searches_nearby:
+            if self._guess is not None:
+                local.T_map_local = self._search.guessed(local.kept, local.up, *self._guess)
+            if local.T_map_local is not None:
+                nearby = self._search.around(local.kept, local.T_map_local @ own.state.T_world_lidar)
+                if nearby.place is not None:
+                    return nearby
+        if self._guess is None and local.searches_anywhere():
+            return self._search.anywhere(local.kept, local.up)
+        return nearby
+
+    def _begin(self, scan: SampledScan, own: MappedScan, place: Place) -> MappedScan:
+        """Track from a place on."""
+        local = self._local
+        assert local is not None
+        T_map_local = place.T_map_lidar @ inverse(own.state.T_world_lidar)
+        self._pending = Found(self._count, -1, place.fits), T_map_local
+        self._tracker = Tracker(self._config)
+        self._tracker.begin_at(scan.stamp, place.quality)
+        covariance = own.state.covariance.copy()
+        covariance[:6, :6] = place.registration.covariance[:6, :6]
+        state = replace(own.state, T_world_lidar=place.T_map_lidar, covariance=covariance)
+        message = f"found in the map; {NOT_CONFIRMED}"
+        return MappedScan(
+            state, place.T_map_lidar, True, Status.DEGRADED, message, place.fits[0],
+            place.registration.degeneracy.names, place.registration.iterations, is_connected=False,
+        )  # fmt: skip
+
+    def _dead_reckoned(self, own: MappedScan, reason: str) -> MappedScan:
+        """A scan at its pose in the local map, placed where that is supposed."""
+        assert self._local is not None
+        T_map_local = self._local.T_map_local
+        state = own.state
+        if T_map_local is not None:
+            state = replace(state, T_world_lidar=T_map_local @ state.T_world_lidar)
+        state = replace(state, covariance=LOST_MOTION)
+        return MappedScan(state, state.T_world_lidar, False, Status.LOST, reason, None, is_connected=False)
+
+    def _regions_for(self, scan: SampledScan) -> Regions:
+        """The drawn region of the map; a new one where the scale of the scene has changed."""
+        cell_m = self._map.cell_m(scan.cell_m)
+        if self._regions is None or self._regions.cell_m != cell_m:
+            reach_m = min(_RANGES * scan.range_m, self._config.radius_m)
+            self._regions = Regions(self._map, cell_m, reach_m, _SPARE * reach_m)
+        return self._regions

@@ -1,0 +1,264 @@
+"""Search for the place of a recording in a finished map: bird's-eye correlation, registration, a test of ambiguity.
+
+Some scans that lie apart must fit at one place, and clearly better than at any other.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
+from lidarslam.mapping.fixed_map.fixed_map import FixedMap
+from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.surfels.registration import Registration, register
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.attempts import measure_fit
+from lidarslam.mapping.tracking.birds_eye_map import levelling
+from lidarslam.mapping.tracking.fit import Fit
+from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
+
+# Places around a supposed one that are tried: how far, in cells, and turned by how much.
+_NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
+# Radius of the view from above and of the points that are registered, in median ranges; places that are tried.
+_RANGES, _PLACES = 3.0, 24
+# Points that are registered first, and the share of the best quality above which all points are.
+_FEW_POINTS, _LIKELY = 500, 0.7
+# Of these, that are registered.
+_PROMISING = 12
+# A region of the map serves several places, farther than what the scans reach by so many times that; so many are kept.
+_SPARE, _REGIONS = 1.5, 8
+# Other scans that must fit, and what they may be off from where the recording's own motion puts them.
+_OTHERS = 5
+_MOST_TURN, _MOST_SHIFT_CELLS, _MOST_SHIFT_SHARE = np.deg2rad(4.0), 2.0, 0.04
+# Standard deviations of a place that may be anywhere near, and of one that follows from another: radians, metres.
+_ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
+_STILL = 1e-3
+# What scans need, on average: inlier ratio, share of inliers among all points, directional support.
+_LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
+# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it.
+_RIVAL = 1.0 / 1.25
+_SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place where the latest scan was registered."""
+
+    registration: Registration  # of the latest scan
+    surfel_map: SurfelMap  # that it was registered to
+    fits: tuple[Fit, ...]  # of the latest scan, and of others
+
+    @property
+    def T_map_lidar(self) -> FloatArray:
+        """(4, 4) of the latest scan."""
+        return self.registration.T_world_lidar
+
+    @property
+    def ratio(self) -> float:
+        """Mean inlier ratio."""
+        return float(np.mean([fit.inlier_ratio or 0.0 for fit in self.fits]))
+
+    @property
+    def share(self) -> float:
+        """Mean share of inliers among all points."""
+        return float(np.mean([fit.inlier_share for fit in self.fits]))
+
+    @property
+    def support(self) -> float:
+        """Mean directional support."""
+        return float(np.mean([fit.support or 0.0 for fit in self.fits]))
+
+    @property
+    def quality(self) -> float:
+        """Score among places."""
+        return self.share * self.support
+
+    def objection(self) -> str:
+        """Why the scans do not fit; empty when they do."""
+        if self.share < _LEAST_SHARE:
+            return f"only {100.0 * self.share:.0f} % of the points lie on surfaces of the map"
+        if self.ratio < _LEAST_RATIO:
+            return f"only {100.0 * self.ratio:.0f} % of the points near surfaces of the map fit"
+        if self.support < _LEAST_SUPPORT:
+            return f"only {100.0 * self.support:.0f} % of the points that constrain one direction fit"
+        return ""
+
+    def is_at(self, other: "Place") -> bool:
+        """Whether two places are the same."""
+        motion = inverse(self.T_map_lidar) @ other.T_map_lidar
+        near = np.linalg.norm(motion[:3, 3]) < _SAME_CELLS * self.surfel_map.cell_m
+        return bool(near and rotation_angle(motion) < _SAME_RAD)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Result of a search: a place, or the reason for none."""
+
+    place: Place | None
+    reason: str = ""
+
+
+class PlaceSearch:
+    """Searches a map.
+
+    Args:
+        fixed_map: the map.
+        max_range_m: farther points are left out.
+    """
+
+    def __init__(self, fixed_map: FixedMap, max_range_m: float) -> None:
+        self._map = fixed_map
+        self._max_range_m = max_range_m
+        self._regions: Regions | None = None
+
+    def anywhere(self, scans: KeptScans, up: FloatArray) -> Search:
+        """Search the whole map with the scans kept so far; `up` (3,) is the vertical of their local frame."""
+        latest = scans.latest
+        if latest is None:
+            return Search(None, "no scan could be registered to the scans before")
+        cell_m, reach_m = self._map.cell_m(latest.cell_m), _RANGES * latest.range_m
+        points = scans.points_around(reach_m)
+        R_level_lidar = levelling(up) @ latest.T_local_lidar[:3, :3]
+        starts: list[FloatArray] = []
+        for view in self._map.views(cell_m):
+            T = make_transform(view.R_level_world.T @ R_level_lidar, np.zeros(3))
+            starts.extend(view.find(points, T, reach_m, _PLACES))
+        return self.among(scans, starts)
+
+    def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Search:
+        """The one of the places near poses (4, 4) of the latest scan where all scans fit, if no other fits alike."""
+        kept = scans.chosen(_OTHERS)
+        if not kept or not starts:
+            return Search(None, "there is nothing upright to search with")
+        reach_m = self._reach_m(kept[0])
+        cell_m = self._map.cell_m(kept[0].cell_m)
+        if self._regions is None or self._regions.cell_m != cell_m:
+            self._regions = Regions(self._map, cell_m, reach_m, _SPARE * reach_m, _REGIONS)
+        regions = self._regions
+        few = replace(kept[0], keypoints=kept[0].keypoints[:: max(1, len(kept[0].keypoints) // _FEW_POINTS)])
+        scores = [start_score(few.keypoints, start, regions.around(start[:3, 3])) for start in starts]
+        promising = [starts[index] for index in np.argsort(scores)[::-1][:_PROMISING]]
+        rough = self._places(few, promising, _ROUGH, regions)
+        likely = [place.T_map_lidar for place in rough if place.quality > _LIKELY * rough[0].quality]
+        places = self._places(kept[0], likely, _CHAINED, regions)
+        if not places:
+            return Search(None, "no place in the map fits at all")
+        if not places[0].objection():
+            places = [place for place in places if place.quality > _RIVAL * places[0].quality]
+            places = [self._with_others(place, kept, regions) for place in places]
+            places.sort(key=lambda place: -place.quality)
+        return _decided(places)
+
+    def _places(
+        self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float], regions: "Regions"
+    ) -> list[Place]:
+        """The different places that a scan is registered at from poses (4, 4), by descending quality."""
+        places: list[Place] = []
+        for start in starts:
+            place = self._register(scan, start, sigmas, regions)
+            if place is not None and not any(place.is_at(other) for other in places):
+                places.append(place)
+        return sorted(places, key=lambda place: -place.quality)
+
+    def guessed(self, scans: KeptScans, up: FloatArray, x: float, y: float, yaw: float) -> FloatArray | None:
+        """`T_map_local` (4, 4) for a rough position and heading of the local frame, at the height that fits."""
+        latest = scans.latest
+        if latest is None:
+            return None
+        reach_m, R_level_local = _RANGES * latest.range_m, levelling(up)
+        points = transform_points(latest.T_local_lidar, scans.points_around(reach_m)) @ R_level_local.T
+        view = min(self._map.views(self._map.cell_m(latest.cell_m)), key=lambda view: view.distance_m(x, y))
+        T = make_transform(view.R_level_world.T @ R_level_local, np.zeros(3))
+        return view.pose_at(yaw, np.array([x, y]), points, T, reach_m)
+
+    def around(self, scans: KeptScans, T_map_lidar: FloatArray) -> Search:
+        """Search near a pose (4, 4) of the latest scan."""
+        latest = scans.latest
+        if latest is None:
+            return Search(None, "no scan could be registered to the scans before")
+        cell_m = self._map.cell_m(latest.cell_m)
+        reach_m = self._reach_m(latest)
+        region = self._map.region(T_map_lidar[:3, 3], 1.5 * reach_m, cell_m)
+        up, starts = region.vertical(), []
+        for yaw_deg in (0.0, _NEAR_YAW_DEG, -_NEAR_YAW_DEG):
+            T = T_map_lidar.copy()
+            T[:3, :3] = exp(np.array([*(np.deg2rad(yaw_deg) * up), 0.0, 0.0, 0.0]))[:3, :3] @ T[:3, :3]
+            starts.append(positions_around(T, up, _NEAR_CELLS * cell_m, 0.5 * _NEAR_CELLS * cell_m))
+        return self.among(scans, list(best_starts(latest.keypoints, np.concatenate(starts), region)))
+
+    def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: "Regions") -> Place:
+        """A place with the fits of the other scans; none where one is off from where the motion puts it."""
+        fits, last, T_map_last = list(place.fits), kept[0], place.T_map_lidar
+        for scan in kept[1:]:
+            motion = inverse(last.T_local_lidar) @ scan.T_local_lidar
+            start = T_map_last @ motion
+            found = self._register(scan, start, _CHAINED, regions)
+            if found is None or _is_off(start, found.T_map_lidar, motion, regions.cell_m):
+                fits.append(Fit(0, 0.0, None, None))
+                continue
+            fits += found.fits
+            last, T_map_last = scan, found.T_map_lidar
+        return replace(place, fits=tuple(fits))
+
+    def _register(
+        self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float], regions: "Regions"
+    ) -> Place | None:
+        surfel_map = regions.around(start[:3, 3])
+        points = scan.keypoints
+        points = points[np.einsum("ij,ij->i", points, points) < self._reach_m(scan) ** 2]
+        variances = np.array([sigmas[0]] * 3 + [sigmas[1]] * 3 + [_STILL] * 6) ** 2
+        prediction = Prediction(0.0, start, np.zeros(6), np.diag(variances))
+        found = register(Sweep(points), prediction, surfel_map, with_velocity=False, patient=True)
+        if found is None:
+            return None
+        return Place(found, surfel_map, (measure_fit(points, found.T_world_lidar, surfel_map),))
+
+    def _reach_m(self, scan: KeptScan) -> float:
+        return min(_RANGES * scan.range_m, self._max_range_m)
+
+
+def _decided(places: Sequence[Place]) -> Search:
+    """The first of places by descending quality, unless it does not fit, or a rival fits alike."""
+    best = places[0]
+    if objection := best.objection():
+        return Search(None, f"{objection}, at the best place")
+    rivals = [place for place in places[1:] if place.quality > _RIVAL * best.quality]
+    if rivals:
+        apart_m = float(np.linalg.norm(rivals[0].T_map_lidar[:3, 3] - best.T_map_lidar[:3, 3]))
+        return Search(None, f"{len(rivals) + 1} places fit alike, two of them {apart_m:.1f} m apart")
+    return Search(best)
+
+
+def _is_off(start: FloatArray, found: FloatArray, motion: FloatArray, cell_m: float) -> bool:
+    """Whether a scan was registered elsewhere than where the motion (4, 4) from another one puts it."""
+    off, way_m = inverse(start) @ found, float(np.linalg.norm(motion[:3, 3]))
+    far = np.linalg.norm(off[:3, 3]) > _MOST_SHIFT_CELLS * cell_m + _MOST_SHIFT_SHARE * way_m
+    return bool(far or rotation_angle(off) > _MOST_TURN)
+
+
+class Regions:
+    """Regions of the map as surfels.
+
+    Args:
+        fixed_map: the map.
+        cell_m: edge of the surfel cells.
+        reach_m: how far around a position a region must reach.
+        spare_m: how much farther it reaches, so that it serves other positions too.
+        kept: how many are kept.
+    """
+
+    def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:
+        self._map, self.cell_m, self._reach_m, self._spare_m, self._kept = fixed_map, cell_m, reach_m, spare_m, kept
+        self._drawn: list[tuple[FloatArray, SurfelMap]] = []
+
+    def around(self, position: FloatArray) -> SurfelMap:
+        """A region with all that is within reach of a position (3,)."""
+        for centre, region in self._drawn:
+            if np.linalg.norm(centre - position) < self._spare_m:
+                return region
+        region = self._map.region(position, self._reach_m + self._spare_m, self.cell_m)
+        self._drawn = [*self._drawn, (position.copy(), region)][-self._kept :]
+        return region

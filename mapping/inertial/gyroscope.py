@@ -1,0 +1,133 @@
+"""Integration of a gyroscope's samples: turns between instants, and sweeps as of a constant rate."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+
+# Longest step of the integration: within it the axis of rotation is taken as constant.
+_STEP_S = 0.0025
+# A gap between samples is longer than so many usual intervals, and than this.
+_GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.02
+_NO_BIAS = np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Turns:
+    """The LiDAR's rotations R_stamp_t (N, 3, 3) at N times from a scan's stamp, seconds."""
+
+    times: FloatArray
+    rotations: FloatArray
+
+    def mean_rate(self) -> FloatArray:
+        """(3,) rad/s: the constant rate that fits the rotations best."""
+        vectors = log(make_transform(self.rotations, np.zeros(3)))[:, :3]
+        return np.asarray(self.times @ vectors / (self.times @ self.times), dtype=np.float64)
+
+    def uneven(self, rate: FloatArray) -> FloatArray:
+        """(N, 3) rotation vectors that remain of the rotations when those of a constant rate are undone."""
+        steady = exp(np.pad(self.times[:, None] * rate, ((0, 0), (0, 3))))
+        vectors = log(inverse(steady) @ make_transform(self.rotations, np.zeros(3)))[:, :3]
+        return np.asarray(vectors, dtype=np.float64)
+
+
+class Integral:
+    """The integral of samples (N, 3), linear between their stamps (N,)."""
+
+    def __init__(self, stamps: FloatArray, samples: FloatArray) -> None:
+        self._begin = stamps[0]  # of clocks that count from 1970 half the digits would be lost
+        self._curve = make_interp_spline(stamps - stamps[0], samples, k=1).antiderivative()
+
+    def between(self, instants: FloatArray) -> FloatArray:
+        """(M - 1, 3) from each of M instants to the next."""
+        return np.diff(self._curve(instants - self._begin), axis=0)
+
+    def rates(self, instants: FloatArray) -> FloatArray:
+        """(M, 3) the samples' values at M instants."""
+        return np.asarray(self._curve(instants - self._begin, 1), dtype=np.float64)
+
+
+class Gyroscope:
+    """The angular velocity of the LiDAR, linear between samples.
+
+    Args:
+        samples: of at least two instants.
+        R_lidar_imu: (3, 3) extrinsic rotation.
+    """
+
+    def __init__(self, samples: ImuSamples, R_lidar_imu: FloatArray) -> None:
+        self._stamps = samples.stamps
+        self._angle = Integral(samples.stamps, samples.angular_velocities @ R_lidar_imu.T)
+        self._longest_s = max(_GAP_INTERVALS * float(np.median(np.diff(samples.stamps))), _LEAST_GAP_S)
+
+    def covers(self, first_s: float, last_s: float) -> bool:
+        """Whether samples without a gap surround a time."""
+        before, after = np.searchsorted(self._stamps, (first_s, last_s), "right")
+        near = self._stamps[max(0, before - 1) : after + 1]
+        at_ends = first_s >= near[0] - self._longest_s and last_s <= near[-1] + self._longest_s if len(near) else False
+        return bool(at_ends and (np.diff(near) <= self._longest_s).all())
+
+    def turn(self, first_s: float, last_s: float, bias: FloatArray) -> FloatArray:
+        """(3, 3) R_first_last of the LiDAR between two instants; the bias (3,) is of the LiDAR's axes, rad/s."""
+        steps = max(1, int(np.ceil(abs(last_s - first_s) / _STEP_S)))
+        return np.asarray(self.rotations(np.linspace(first_s, last_s, steps + 1), bias)[-1], dtype=np.float64)
+
+    def rotations(self, instants: FloatArray, bias: FloatArray) -> FloatArray:
+        """(N, 3, 3) R_first_t of the LiDAR at N instants, the first of which is the reference."""
+        inside = np.clip(instants, self._stamps[0], self._stamps[-1])  # the last rate is held for the rest
+        angles = self._angle.between(inside)
+        beyond = np.diff(instants) - np.diff(inside)
+        if beyond.any():
+            angles = angles + beyond[:, None] * self._angle.rates(inside[1:])
+        steps = exp(np.pad(angles - np.diff(instants)[:, None] * bias, ((0, 0), (0, 3)))).reshape(-1, 4, 4)[:, :3, :3]
+        rotations: FloatArray = np.empty((len(instants), 3, 3))
+        rotations[0] = np.eye(3)
+        for n, step in enumerate(steps):
+            rotations[n + 1] = rotations[n] @ step
+        return rotations
+
+    def change(self, first_s: float, last_s: float) -> FloatArray:
+        """(3,) by how much the angular velocity changes between two instants, rad/s."""
+        rates = self._angle.rates(np.clip([first_s, last_s], self._stamps[0], self._stamps[-1]))
+        return np.asarray(rates[1] - rates[0], dtype=np.float64)
+
+    def mean_rate(self, scan: Scan) -> FloatArray | None:
+        """(3,) the constant rate during a sweep, rad/s, with the bias; None where sweep or samples have no times."""
+        turns = self._turns(scan)
+        return None if turns is None else turns.mean_rate()
+
+    def evened(self, scan: Scan) -> Scan:
+        """The sweep as if the sensor had turned at `mean_rate` all the time.
+
+        Methods that compensate a sweep with one angular velocity then compensate it for the whole turn. The bias, a
+        constant rate, has no part in it.
+        """
+        turns = self._turns(scan)
+        if turns is None or scan.time_offsets is None:
+            return scan
+        remaining = turns.uneven(turns.mean_rate())
+        vectors = np.stack([np.interp(scan.time_offsets, turns.times, axis) for axis in remaining.T], axis=1)
+        return replace(scan, points=_rotated(scan.points, vectors))
+
+    def _turns(self, scan: Scan) -> _Turns | None:
+        if scan.time_offsets is None or not len(scan):
+            return None
+        begin, end = min(0.0, float(scan.time_offsets.min())), max(0.0, float(scan.time_offsets.max()))
+        if end <= begin or not self.covers(scan.stamp + begin, scan.stamp + end):
+            return None
+        times = np.union1d(np.linspace(begin, end, max(2, int(np.ceil((end - begin) / _STEP_S)) + 1)), [0.0])
+        rotations = self.rotations(scan.stamp + times, _NO_BIAS)
+        return _Turns(times, rotations[np.searchsorted(times, 0.0)].T @ rotations)
+
+
+def _rotated(points: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Points (N, 3), each turned by its own rotation vector (N, 3)."""
+    angle2 = np.einsum("ij,ij->i", vectors, vectors)
+    angle = np.sqrt(angle2)
+    sine, versine = np.sinc(angle / np.pi)[:, None], 0.5 * np.sinc(0.5 * angle / np.pi)[:, None] ** 2
+    once = np.cross(vectors, points)
+    return np.asarray(points + sine * once + versine * np.cross(vectors, once), dtype=np.float64)

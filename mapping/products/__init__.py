@@ -1,0 +1,1 @@
+"""Products of a finished map: occupancy grid, mesh, georeference."""

@@ -1,0 +1,116 @@
+"""Alignment of a trajectory with a GNSS track: where the world of a run lies on the Earth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.geometry import FloatArray, exp, make_transform, skew
+from lidarslam.core.trajectory import Trajectory
+
+# The world's z is up to about this angle, a standard deviation: what positions on a straight line leave open.
+_TILT = float(np.deg2rad(5.0))
+_ITERATIONS = 30
+# Of the scale of the residuals: of the median of |N(0, 1)|, a floor in metres, and Cauchy's weights.
+_MAD, _LEAST_SCALE_M, _CAUCHY = 1.4826, 0.01, 2.385
+_FEWEST = 5
+
+
+@dataclass(frozen=True, eq=False)
+class GnssTrack:
+    """Positions of an antenna."""
+
+    stamps: FloatArray  # (N,) seconds, on the clock of the scans
+    geodetic: FloatArray  # (N, 3) latitude and longitude in degrees, altitude in metres (WGS 84)
+    sigma_m: FloatArray  # (N,) horizontal standard deviation as stated; NaN where unknown
+    lidar_antenna: FloatArray  # (3,) position of the antenna in the LiDAR frame
+    notes: tuple[str, ...] = ()  # remarks, a sentence each
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """The world of a run in a map projection; `p_map = scale * R @ p_world + t`."""
+
+    T_map_world: FloatArray  # (4, 4) rotation and translation; x east, y north, z up
+    scale: float  # of the projection at this place
+    matched: int  # GNSS positions that were used
+    rms_m: float  # residuals of these, all of them
+    median_m: float
+    heading_sigma_deg: float  # a bound of the error of the heading
+
+    def positions(self, points: FloatArray) -> FloatArray:
+        """Points (N, 3) of the world in the projection."""
+        return self.scale * points @ self.T_map_world[:3, :3].T + self.T_map_world[:3, 3]
+
+
+def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArray, scale: float) -> Georeference:
+    """Robust rigid alignment of a trajectory with a GNSS track.
+
+    Minimises Cauchy's loss of the distances between the antenna on the trajectory and its measured positions. The tilt
+    of the world has a weak prior, as positions on a straight line do not determine the rotation about it.
+
+    Args:
+        trajectory: the poses of the LiDAR.
+        track: stamps, accuracies and the antenna's place.
+        projected: (N, 3) the track's positions in the map projection.
+        scale: of the projection at this place.
+
+    Raises:
+        ValueError: fewer than five positions are within the time of the trajectory.
+    """
+    within = (track.stamps >= trajectory.stamps[0]) & (track.stamps <= trajectory.stamps[-1])
+    within &= np.isfinite(projected).all(axis=1)
+    if within.sum() < _FEWEST:
+        raise ValueError(f"{within.sum()} GNSS positions are within the time of the run, expected {_FEWEST} or more")
+    poses = trajectory.at(track.stamps[within])
+    measured = projected[within]
+    antenna = scale * (poses[:, :3, :3] @ track.lidar_antenna + poses[:, :3, 3])
+    middle, centre = measured.mean(axis=0), antenna.mean(axis=0)
+    y, x = measured - middle, antenna - centre
+    T = make_transform(_heading(x, y), np.zeros(3))
+    sigma = track.sigma_m[within]
+    stated = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else 0.0
+    for _ in range(_ITERATIONS):
+        change = _step(T, x, y)
+        T = T @ exp(change)
+        if np.linalg.norm(change) < 1e-10:
+            break
+    errors = np.linalg.norm(y - (x @ T[:3, :3].T + T[:3, 3]), axis=1)
+    spread = float(np.sqrt((x[:, :2] ** 2).sum(axis=1).mean()))
+    # Errors of GNSS are correlated in time: they do not average out over the track.
+    uncertain = max(stated, float(np.median(errors)), _LEAST_SCALE_M)
+    R = T[:3, :3]
+    return Georeference(
+        T_map_world=make_transform(R, T[:3, 3] + middle - R @ centre),
+        scale=scale,
+        matched=int(within.sum()),
+        rms_m=float(np.sqrt((errors**2).mean())),
+        median_m=float(np.median(errors)),
+        heading_sigma_deg=float(np.rad2deg(np.arctan2(uncertain, spread))),
+    )
+
+
+def _heading(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Rotation (3, 3) about z that aligns centred positions (N, 3) best."""
+    sine = (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum()
+    cosine = (x[:, :2] * y[:, :2]).sum()
+    return np.asarray(Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix(), dtype=np.float64)
+
+
+def _step(T: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """One reweighted Gauss-Newton step (6,), rotation first, to be multiplied from the right."""
+    R = T[:3, :3]
+    residuals = y - (x @ R.T + T[:3, 3])
+    errors = np.linalg.norm(residuals, axis=1)
+    scale = max(_LEAST_SCALE_M, _MAD * float(np.median(errors)))
+    weights = 1.0 / (scale**2 * (1.0 + (errors / (_CAUCHY * scale)) ** 2))
+    J = np.concatenate([-R @ np.stack([skew(each) for each in x]), np.tile(R, (len(x), 1, 1))], axis=2)
+    H = np.einsum("n,nij,nik->jk", weights, J, J)
+    b = np.einsum("n,nij,ni->j", weights, J, residuals)
+    # The prior: R z is up, a vector whose horizontal part is the tilt; d(R z) = R (d x z) = -R [z] d.
+    tilt = (R @ np.array([0.0, 0.0, 1.0]))[:2]
+    J_tilt = np.zeros((2, 6))
+    J_tilt[:, :3] = -(R @ skew(np.array([0.0, 0.0, 1.0])))[:2]
+    H += J_tilt.T @ J_tilt / _TILT**2
+    b -= J_tilt.T @ tilt / _TILT**2
+    return np.asarray(np.linalg.solve(H, b), dtype=np.float64)

@@ -1,0 +1,90 @@
+"""The Apollo reader on scans and poses in the layout that KISS-ICP reads too."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.registry import choose_reader, open_recording
+
+START = 1_530_000_000.0
+SCANS = 12
+
+
+def _T_world_lidar(index: int) -> np.ndarray:
+    return exp([0.0, 0.0, 2.0, 10.0, -20.0, 3.0]) @ exp(np.multiply(index, [0.0, 0.0, 0.05, 1.0, 0.0, 0.0]))
+
+
+def _write_pcd(path: Path, points: np.ndarray) -> None:
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
+        f"COUNT 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n"
+    )
+    path.write_bytes(header.encode() + points.astype("<f4").tobytes())
+
+
+@pytest.fixture
+def area(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Two sequences of one area; scans are counted from 1 on, without leading zeros."""
+    for name in ("MathildaAVE-1", "SanJoseDowntown-2"):
+        folder = tmp_path / "TrainData" / name
+        (folder / "pcds").mkdir(parents=True)
+        (folder / "poses").mkdir()
+        lines = []
+        for index in range(1, SCANS + 1):
+            points = rng.uniform(-30.0, 30.0, (20, 4))
+            points[:, 3] = index
+            _write_pcd(folder / "pcds" / f"{index}.pcd", points)
+            T = _T_world_lidar(index)
+            numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+            lines.append(f"{index} {START + 0.1 * index:.6f} {' '.join(f'{number:.9f}' for number in numbers)}\n")
+        (folder / "poses" / "gt_poses.txt").write_text("".join(lines))
+    return tmp_path / "TrainData"
+
+
+def test_scans_and_poses_in_the_order_of_numbers(area: Path) -> None:
+    assert choose_reader(area) == choose_reader(area / "MathildaAVE-1") == "apollo"
+    recording = open_recording(area, ReaderConfig(sequence="SanJoseDowntown-2"))
+    assert recording.name == "SanJoseDowntown-2"
+    scans = list(recording.scans())
+    assert [scan.intensities[0] for scan in scans] == list(range(1, SCANS + 1))
+    assert [scan.stamp for scan in scans] == pytest.approx([START + 0.1 * index for index in range(1, SCANS + 1)])
+    np.testing.assert_allclose(
+        recording.ground_truth.T_world_lidar, [_T_world_lidar(index) for index in range(1, SCANS + 1)], atol=1e-8
+    )
+
+
+def test_poses_by_index_where_scans_are_missing(area: Path) -> None:
+    folder = area / "MathildaAVE-1"
+    (folder / "pcds" / "1.pcd").unlink()
+    recording = open_recording(folder)
+    assert len(recording) == len(recording.ground_truth) == SCANS - 1
+    assert next(recording.scans()).stamp == pytest.approx(START + 0.2)
+
+
+def test_the_description_has_no_assumed_rate(area: Path) -> None:
+    info = open_recording(area / "MathildaAVE-1").describe()
+    assert info.rate_hz == pytest.approx(10.0)
+    assert (info.reader, info.ground_truth) == ("apollo", area / "MathildaAVE-1" / "poses" / "gt_poses.txt")
+    assert info.notes == ()
+
+
+def test_the_sequence_has_to_be_chosen(area: Path) -> None:
+    with pytest.raises(InputError, match="choose a sequence with --sequence; there are: MathildaAVE-1, SanJose"):
+        open_recording(area)
+    with pytest.raises(InputError, match="has no sequence 'x'; there are: MathildaAVE-1"):
+        open_recording(area, ReaderConfig(sequence="x"))
+    with pytest.raises(InputError, match="is one sequence, not x"):
+        open_recording(area / "MathildaAVE-1", ReaderConfig(sequence="x"))
+
+
+def test_poses_that_do_not_go_with_the_scans(area: Path) -> None:
+    poses = area / "MathildaAVE-1" / "poses" / "gt_poses.txt"
+    lines = poses.read_text().splitlines(keepends=True)
+    poses.write_text("".join(lines[:-1]))
+    with pytest.raises(InputError, match="expected a line for each of the 12 scans, by its index or in their order"):
+        open_recording(area / "MathildaAVE-1")

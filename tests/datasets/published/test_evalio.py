@@ -1,0 +1,310 @@
+"""evalio's own readers over files written in the layouts of Hilti 2022, Newer College 2021 and Oxford Spires."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp, inverse, log, make_transform
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.registry import choose_reader, is_recording, open_recording
+
+START_NS = 1_640_000_000 * 10**9
+PERIOD_NS, IMU_PERIOD_NS = 10**8, 2_500_000
+# The published calibration of Hilti 2022.
+HILTI_T_IMU_LIDAR = make_transform(
+    Rotation.from_quat([0.7071068, -0.7071068, 0.0, 0.0]).as_matrix(), [-0.001, -0.00855, 0.055]
+)
+SPIRES_BAG = "1710406700_2024-03-14-08-58-21_0_blurred_filtered_compressed"
+
+
+def _T_world_imu(seconds: float) -> np.ndarray:
+    return exp([0.1, -0.2, 0.4, 3.0, 2.0, 1.0]) @ exp(np.multiply(seconds, [0.2, -0.1, 0.5, 1.0, 0.3, -0.1]))
+
+
+def _imu_messages(kit: Any, samples: int) -> tuple[list[tuple[int, Any]], np.ndarray]:
+    """Messages, and their content (N, 6): angular velocity, acceleration."""
+    content = np.random.default_rng(3).normal(size=(samples, 6))
+
+    def vector(values: np.ndarray) -> Any:
+        return kit.new("geometry_msgs/Vector3", x=values[0], y=values[1], z=values[2])
+
+    messages = []
+    for index, row in enumerate(content):
+        stamp = START_NS + index * IMU_PERIOD_NS
+        message = kit.new(
+            "sensor_msgs/Imu",
+            header=kit.header(stamp),
+            orientation=kit.new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.zeros(9),
+            angular_velocity=vector(row[:3]),
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=vector(row[3:]),
+            linear_acceleration_covariance=np.zeros(9),
+        )
+        messages.append((stamp, message))
+    return messages, content
+
+
+def _quaternion(T: np.ndarray) -> str:
+    return " ".join(f"{value:.9f}" for value in Rotation.from_matrix(T[:3, :3]).as_quat())
+
+
+@pytest.fixture
+def evalio_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """evalio's data folder, empty."""
+    pytest.importorskip("evalio")
+    monkeypatch.setenv("EVALIO_DATA", str(tmp_path / "published"))
+    return tmp_path / "published"
+
+
+@pytest.fixture
+def hilti(evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]) -> SimpleNamespace:
+    """Three scans of basement_2; its columns hold the returns alone, in the order of firing."""
+    folder = evalio_data / "hilti_2022" / "basement_2"
+    folder.mkdir(parents=True)
+    kit = make_bag_kit("bag")
+    kit.folder = folder
+    sweeps, clouds = [], []
+    for index in range(3):
+        stamp = START_NS + index * PERIOD_NS
+        sweep = make_sweep("hesai", stamp, height=32, width=40)
+        sweeps.append(sweep)
+        clouds.append((stamp + PERIOD_NS, kit.cloud(sweep.records.T.copy().reshape(1, -1), stamp)))
+    imu, content = _imu_messages(kit, 100)
+    kit.write({"/hesai/pandar": clouds, "/alphasense/imu": imu}, name="exp14_basement_2")
+    times = 0.05 * np.arange(8)
+    rows = [(START_NS * 1e-9 + time, _T_world_imu(time)) for time in times]
+    text = "".join(f"{t:.6f} {' '.join(map(repr, T[:3, 3].tolist()))} {_quaternion(T)}\n" for t, T in rows)
+    (folder / "exp14_basement_2_imu.txt").write_text(text)
+    return SimpleNamespace(folder=folder, sweeps=sweeps, imu=content, times=times)
+
+
+def test_scans_have_their_points_times_rings_and_intensities(hilti: SimpleNamespace) -> None:
+    recording = open_recording(Path("evalio:hilti_2022/basement_2"))
+    assert recording.name == "hilti_2022_basement_2"
+    scans = list(recording.scans())
+    assert [scan.stamp for scan in scans] == pytest.approx([START_NS * 1e-9 + 0.1 * index for index in range(3)])
+    for scan, sweep in zip(scans, hilti.sweeps, strict=True):
+        order, expected = np.lexsort(scan.points.T), np.lexsort(sweep.points.T)
+        np.testing.assert_allclose(scan.points[order], sweep.points[expected], atol=1e-6)
+        np.testing.assert_array_equal(scan.rings[order], sweep.rings[expected])
+        np.testing.assert_allclose(scan.time_offsets[order], sweep.offsets[expected], atol=1e-6)
+        np.testing.assert_allclose(scan.intensities[order], sweep.records["intensity"].reshape(-1)[expected])
+
+
+def test_the_truth_is_of_the_lidar(hilti: SimpleNamespace) -> None:
+    truth = open_recording(hilti.folder).ground_truth
+    assert truth.stamps - START_NS * 1e-9 == pytest.approx(hilti.times, abs=1e-6)
+    for T_world_lidar, time in zip(truth.T_world_lidar, hilti.times, strict=True):
+        assert log(inverse(_T_world_imu(time) @ HILTI_T_IMU_LIDAR) @ T_world_lidar) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_imu_comes_with_its_calibration(hilti: SimpleNamespace) -> None:
+    imu = open_recording(hilti.folder).imu
+    assert imu.stamps == pytest.approx(START_NS * 1e-9 + 0.0025 * np.arange(100), abs=1e-6)
+    np.testing.assert_allclose(np.hstack([imu.angular_velocities, imu.accelerations]), hilti.imu)
+    np.testing.assert_allclose(imu.T_lidar_imu @ HILTI_T_IMU_LIDAR, np.eye(4), atol=1e-6)
+
+
+def test_some_of_the_scans(hilti: SimpleNamespace) -> None:
+    recording = open_recording(hilti.folder)
+    assert [scan.stamp for scan in recording.scans(1, None, 1)] == [scan.stamp for scan in recording.scans()][1:]
+    assert len(list(recording.scans(0, 9, 2))) == 2
+    assert not list(recording.scans(3))
+
+
+def test_the_description_names_data_set_and_sensor(hilti: SimpleNamespace) -> None:
+    info = open_recording(hilti.folder).describe()
+    assert (info.scans, info.reader, info.ground_truth) == (3, "evalio", hilti.folder)
+    assert info.rate_hz == pytest.approx(10.0)
+    assert "hilti_2022/basement_2 by evalio, Hesai PandarXT-32" in info.notes[0]
+
+
+def test_newer_college_2021(
+    evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]
+) -> None:
+    """Organised clouds with holes; the truth is of a frame of its own, in a table with seconds and nanoseconds."""
+    folder = evalio_data / "newer_college_2021" / "stairs"
+    folder.mkdir(parents=True)
+    kit = make_bag_kit("bag")
+    kit.folder = folder
+    sweep = make_sweep("ouster", START_NS, height=16, width=50, holes=True)
+    sweep.records["x"][~np.isfinite(sweep.records["x"])] = 0.0  # the driver marks no return by zeros
+    for axis in "yz":
+        sweep.records[axis][sweep.records["x"] == 0.0] = 0.0
+    imu, _ = _imu_messages(kit, 5)
+    clouds = [(START_NS, kit.cloud(sweep.records, START_NS))]
+    kit.write({"/os_cloud_node/points": clouds, "/os_cloud_node/imu": imu}, name="2021-07-01-10-40-50_0-stairs")
+    T = exp([0.1, 0.2, 0.3, 4.0, 5.0, 6.0])
+    values = ",".join([*map(repr, T[:3, 3].tolist()), *_quaternion(T).split()])
+    (folder / "gt-nc-stairs.csv").write_text(f"#sec,nsec,x,y,z,qx,qy,qz,qw\n1640000000,500000000,{values}\n")
+
+    recording = open_recording(folder)
+    (scan,) = recording.scans()
+    np.testing.assert_allclose(scan.points, sweep.points[sweep.returns], atol=1e-6)
+    np.testing.assert_array_equal(scan.rings, sweep.rings[sweep.returns])
+    np.testing.assert_allclose(scan.time_offsets, sweep.offsets[sweep.returns], atol=1e-9)
+    # Published positions of the LiDAR and of the truth's frame in that of the IMU, turned alike.
+    shift = np.subtract([0.013801, -0.012207, -0.01514], [0.013642, -0.011607, -0.10583])
+    R = Rotation.from_quat([0.0032925, -0.004627, -0.0024302, 0.99998]).as_matrix()
+    T_truth_lidar = make_transform(np.eye(3), R.T @ shift)
+    assert recording.ground_truth.stamps == pytest.approx([1640000000.5])
+    np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], T @ T_truth_lidar, atol=1e-5)
+
+
+def test_oxford_spires(evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]) -> None:
+    """A rosbag2, which the reader of bags would take too."""
+    folder = evalio_data / "oxford_spires" / "blenheim_palace_01"
+    folder.mkdir(parents=True)
+    kit = make_bag_kit("db3")
+    sweep = make_sweep("hesai", START_NS, height=64, width=10)
+    imu, _ = _imu_messages(kit, 5)
+    clouds = [(START_NS, kit.cloud(sweep.records.T.copy().reshape(1, -1), START_NS))]
+    written = kit.write({"/hesai/pandar": clouds, "/alphasense_driver_ros/imu": imu}, name=SPIRES_BAG)
+    for file in written.iterdir():
+        file.rename(folder / file.name)
+    rows = [f"{1640000000 + 0.1 * index:.3f} {index} 0 0 0 0 0 1\n" for index in range(3)]
+    (folder / "gt-tum.txt").write_text("# timestamp x y z qx qy qz qw\n" + "".join(rows))
+
+    assert choose_reader(folder) == "evalio"
+    recording = open_recording(folder)
+    (scan,) = recording.scans()
+    assert len(scan) == len(sweep.points)
+    assert recording.ground_truth.length_m == pytest.approx(1.0, abs=1e-3)  # evalio drops the first pose
+    assert len(recording.imu) == 5
+
+
+def test_what_is_not_downloaded_names_the_command(evalio_data: Path) -> None:
+    with pytest.raises(InputError, match=r"is not downloaded: evalio dl hilti_2022/basement_2$"):
+        open_recording(Path("evalio:hilti_2022/basement_2"))
+    (evalio_data / "hilti_2022" / "basement_2").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"exp14_basement_2.bag is missing.*; evalio dl hilti_2022/basement_2$"):
+        open_recording(Path("evalio:hilti_2022/basement_2"))
+
+
+def test_the_command_names_a_folder_of_its_own(evalio_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"evalio -D {tmp_path} dl hilti_2022/basement_2$"):
+        open_recording(tmp_path / "hilti_2022" / "basement_2")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("evalio:hilti_2022", r"is a data set of evalio; name one of its sequences: evalio:hilti_2022/construction_"),
+        ("evalio:hilti_2022/exp99", r"evalio has no hilti_2022/exp99; there are: evalio:hilti_2022/construction_"),
+        ("evalio:kitty/04", r"evalio has no data set kitty; there are: boreas, "),
+    ],
+)
+def test_wrong_names(evalio_data: Path, name: str, message: str) -> None:
+    assert not is_recording(Path(name))
+    with pytest.raises(InputError, match=message):
+        open_recording(Path(name))
+
+
+def test_a_folder_of_somebody_else(evalio_data: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "boreas" / "scans"
+    folder.mkdir(parents=True)
+    np.save(folder / "0.npy", np.ones((10, 3)))
+    with pytest.raises(InputError, match="is read with --reader"):
+        open_recording(folder)
+    assert len(open_recording(folder, ReaderConfig(name="scan-folder"))) == 1
+
+
+def test_a_bag_cut_short_ends_the_scans(hilti: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    from evalio.datasets import loaders
+
+    converted = loaders.RosbagIter._lidar_conversion
+
+    def fail_at_the_second(self: Any, message: Any) -> Any:
+        if message.header.stamp.nanosec:
+            raise ValueError("cut short")
+        return converted(self, message)
+
+    monkeypatch.setattr(loaders.RosbagIter, "_lidar_conversion", fail_at_the_second)
+    faults = Faults()
+    recording = open_recording(hilti.folder)
+    assert len(list(recording.scans(faults=faults))) == 1
+    assert faults.left_out == 2
+    with pytest.raises(InputError, match=r"cannot read scan 1 \(cut short\)"):
+        list(recording.scans())
+
+
+def test_without_evalio_the_extra_is_named(evalio_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "evalio", None)
+    (evalio_data / "hilti_2022" / "basement_2").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"evalio is not installed.*pip install 'lidarslam\[datasets\]'"):
+        open_recording(Path("evalio:hilti_2022/basement_2"))
+    with pytest.raises(InputError, match=r"is not downloaded: evalio dl .*pip install 'lidarslam\[datasets\]'"):
+        open_recording(Path("evalio:hilti_2022/basement_3"))
+
+
+_OWN_DATA_SET = """
+from enum import auto
+import numpy as np
+from evalio.datasets import Dataset, RawDataIter
+from evalio.types import SE3, SO3, Duration, ImuMeasurement, ImuParams, LidarMeasurement, LidarParams, Point, Stamp
+
+class MyRig(Dataset):
+    loop = auto()
+
+    def data_iter(self):
+        numbers = np.load(self.folder / "points.npy")
+        scans = (
+            LidarMeasurement(
+                Stamp(sec=100 + k, nsec=0),
+                [Point(x=x, y=y, z=z, intensity=7.0, t=Duration.from_nsec(0), row=3, col=i)
+                 for i, (x, y, z) in enumerate(numbers)],
+            )
+            for k in range(2)
+        )
+        samples = (ImuMeasurement(Stamp(sec=100, nsec=k), np.ones(3), np.zeros(3)) for k in range(3))
+        return RawDataIter(scans, samples, 2)
+
+    def imu_T_lidar(self):
+        return SE3.identity()
+
+    def imu_T_gt(self):
+        return SE3.identity()
+
+    def imu_params(self):
+        return ImuParams(gravity=np.zeros(3))
+
+    def lidar_params(self):
+        return LidarParams(num_rows=16, num_columns=100, min_range=0.1, max_range=50.0, rate=1.0)
+
+    def files(self):
+        return ["points.npy"]
+"""
+
+
+def test_a_data_set_of_the_user(evalio_data: Path, tmp_path: Path) -> None:
+    """A class of evalio's in a module that EVALIO_CUSTOM lists; points without times, no truth, no usable IMU."""
+    folder = evalio_data / "my_rig" / "loop"
+    folder.mkdir(parents=True)
+    np.save(folder / "points.npy", np.arange(30.0).reshape(10, 3) + 1.0)
+    (tmp_path / "my_rig_data.py").write_text(_OWN_DATA_SET)
+    code = (
+        "import lidarslam\n"
+        "from lidarslam.datasets.registry import open_recording\n"
+        "from pathlib import Path\n"
+        "recording = open_recording(Path('evalio:my_rig/loop'))\n"
+        "scans = list(recording.scans())\n"
+        "print(len(scans), scans[1].stamp, len(scans[1]), scans[1].time_offsets, set(scans[1].rings.tolist()))\n"
+        "print(recording.ground_truth, recording.imu, recording.describe().rate_hz)\n"
+    )
+    environment = {**os.environ, "EVALIO_CUSTOM": "my_rig_data", "EVALIO_DATA": str(evalio_data)}
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.stdout.splitlines() == ["2 101.0 10 None {3}", "None None 1.0"], done.stderr

@@ -1,0 +1,134 @@
+"""The MulRan reader on a little sequence written in the published layout."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import inverse, make_transform
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.registry import choose_reader, open_recording
+
+FIRST_NS = 1_561_000_444_390_857_630
+PERIOD_NS = 99_778_780
+EAST, NORTH, SPEED, TURN = 353_067.5, 4_026_008.25, 9.0, 0.3  # UTM metres, m/s, rad/s
+
+
+def turn(degrees):
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+# On the roof, 1.7 m before the rear axle, facing backwards.
+T_BASE_LIDAR = make_transform(turn(179.6654), [1.7042, -0.021, 1.8047])
+
+
+def T_utm_base(time):
+    """A car on a circle to the left."""
+    yaw = TURN * time
+    radius = SPEED / TURN
+    return make_transform(
+        turn(np.rad2deg(yaw)), [EAST + radius * np.sin(yaw), NORTH + radius * (1.0 - np.cos(yaw)), 25.5]
+    )
+
+
+def sweep(index):
+    """Column after column of 64 lasers: range, azimuth and elevation name the column and the laser."""
+    column, laser = np.divmod(np.arange(64 * 1024), 64)
+    azimuth, elevation = 2.0 * np.pi * column / 1024, np.deg2rad(16.611 - 33.222 * laser / 63)
+    reach = 5.0 + index + 0.01 * laser
+    points = reach[:, None] * np.column_stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    points[(column + laser) % 7 == 0] = 0.0  # no return
+    return np.column_stack([points, laser + 100.0]).astype("<f4")
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    folder = tmp_path / "KAIST01"
+    (folder / "Ouster").mkdir(parents=True)
+    stamps_ns = [FIRST_NS + k * PERIOD_NS for k in range(4)]
+    for k, stamp_ns in enumerate(stamps_ns):
+        sweep(k).tofile(folder / "Ouster" / f"{stamp_ns}.bin")
+    with (folder / "global_pose.csv").open("w") as file:
+        for k in range(60):
+            time = -0.05 + 0.01 * k
+            numbers = ",".join(repr(float(v)) for v in T_utm_base(time)[:3].ravel())
+            file.write(f"{FIRST_NS + round(1e9 * time)},{numbers}\n")
+    (folder / "data_stamp.csv").write_text("".join(f"{stamp_ns},ouster\n" for stamp_ns in stamps_ns))
+    with (folder / "xsens_imu.csv").open("w") as file:
+        for k in range(50):
+            numbers = [0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3, 0.01, 0.02, TURN, 0.5, SPEED * TURN, 9.81, 1.0, 2.0, 3.0]
+            file.write(f"{FIRST_NS + k * 10_000_000},{','.join(map(str, numbers))}\n")
+    return folder
+
+
+def test_scans_with_columns_for_times_and_lasers_for_rings(sequence):
+    assert choose_reader(sequence) == "mulran"
+    recording = open_recording(sequence)
+    assert (recording.name, len(recording)) == ("KAIST01", 4)
+    for k, scan in enumerate(recording.scans()):
+        assert scan.stamp == (FIRST_NS + k * PERIOD_NS) / 10**9
+        rows = sweep(k)
+        returned = rows[:, :3].any(axis=1)
+        np.testing.assert_array_equal(scan.points, rows[returned, :3])
+        np.testing.assert_array_equal(scan.intensities, rows[returned, 3])
+        np.testing.assert_array_equal(scan.rings, scan.intensities - 100)
+        azimuth = np.mod(np.arctan2(scan.points[:, 1], scan.points[:, 0]), 2.0 * np.pi)
+        np.testing.assert_allclose(
+            scan.time_offsets, 0.1 * np.mod(azimuth + 1e-4, 2.0 * np.pi) / (2.0 * np.pi), atol=1e-5
+        )
+    info = recording.describe()
+    assert info.point_time.field == "column"
+    assert any("start of its sweep" in note for note in info.notes)
+
+
+def test_truth_is_that_of_the_lidar(sequence):
+    truth = open_recording(sequence).ground_truth
+    assert len(truth) == 60
+    T_utm_lidar = np.stack([T_utm_base(-0.05 + 0.01 * k) @ T_BASE_LIDAR for k in range(60)])
+    np.testing.assert_allclose(truth.T_world_lidar, inverse(T_utm_lidar[0]) @ T_utm_lidar, atol=1e-4)
+    # The base is behind the LiDAR, which moves outwards in the bend: faster than the base by the lever arm.
+    speed = truth.length_m / truth.duration_s
+    assert speed == pytest.approx(np.hypot(SPEED + 0.021 * TURN, 1.7042 * TURN), rel=1e-4)
+    assert open_recording(sequence).describe().ground_truth == sequence / "global_pose.csv"
+
+
+@pytest.mark.parametrize("place", ["", "sensor_data"])
+def test_imu(sequence, place):
+    (sequence / place).mkdir(exist_ok=True)
+    (sequence / "xsens_imu.csv").rename(sequence / place / "xsens_imu.csv")
+    imu = open_recording(sequence).imu
+    assert len(imu) == 50
+    assert imu.stamps[0] == pytest.approx(FIRST_NS / 1e9, abs=1e-6)
+    np.testing.assert_allclose(imu.angular_velocities[7], [0.01, 0.02, TURN])
+    np.testing.assert_allclose(imu.accelerations[7], [0.5, SPEED * TURN, 9.81])
+    assert imu.T_lidar_imu is None
+    assert open_recording(sequence).describe().imu.rate_hz == pytest.approx(100.0, rel=1e-3)
+
+
+def test_first_sequences_have_orientations_alone(sequence):
+    (sequence / "xsens_imu.csv").write_text(f"{FIRST_NS},0,0,0,1,0.1,0.2,0.3\n")
+    assert open_recording(sequence).imu is None
+
+
+def test_a_broken_scan_has_no_times(sequence):
+    broken = sequence / "Ouster" / f"{FIRST_NS + PERIOD_NS}.bin"
+    broken.write_bytes(broken.read_bytes()[: 16 * 30_000])
+    faults = Faults()
+    scans = list(open_recording(sequence).scans(faults=faults))
+    assert [scan.time_offsets is None for scan in scans] == [False, True, False, False]
+    assert "1 scan" in faults.warnings()[0]
+
+
+def test_without_anything_beside_the_scans(sequence):
+    for name in ("global_pose.csv", "xsens_imu.csv", "data_stamp.csv"):
+        (sequence / name).unlink()
+    recording = open_recording(sequence, ReaderConfig(time_reference="none"))
+    assert recording.ground_truth is None
+    assert recording.imu is None
+    assert next(recording.scans()).time_offsets is None
+    (sequence / "Ouster" / "first.bin").write_bytes(b"")
+    with pytest.raises(InputError, match="named by their stamps"):
+        open_recording(sequence)

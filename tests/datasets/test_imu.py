@@ -1,0 +1,255 @@
+"""IMU samples of bags, folders and KITTI raw drives, and how they are made usable."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp, inverse
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.imu_samples import usable_samples
+from lidarslam.datasets.info_text import describe_source
+from lidarslam.datasets.registry import open_recording
+
+STAMP_NS = 1_700_000_000_250_000_000
+IMU_PERIOD_NS = 5_000_000
+T_LIDAR_BASE = exp([0.1, -0.2, 0.3, 0.5, 0.0, -1.0])
+T_BASE_IMU = exp([0.0, 0.0, 3.0, 0.1, 0.2, 0.3])
+
+
+class Samples:
+    """Random samples of an IMU, and the messages that hold them."""
+
+    def __init__(self, rng, count=41, in_g=False):
+        self.stamps_ns = [STAMP_NS + IMU_PERIOD_NS * k for k in range(count)]
+        self.stamps = np.array([stamp_ns / 10**9 for stamp_ns in self.stamps_ns])
+        self.w = rng.normal(0.0, 0.2, (count, 3))
+        self.a = rng.normal([0.0, 0.0, 9.8], 0.2, (count, 3))
+        self.in_g = in_g
+
+    def messages(self, kit, frame_id="imu", order=None):
+        found = []
+        for number in range(len(self.w)) if order is None else order:
+            stamp_ns = self.stamps_ns[number]
+            header = kit.header(stamp_ns)
+            header.frame_id = frame_id
+            w, a = self.w[number].tolist(), (self.a[number] / (9.80665 if self.in_g else 1.0)).tolist()
+            message = kit.new(
+                "sensor_msgs/Imu",
+                header=header,
+                orientation=kit.new("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+                orientation_covariance=np.full(9, 1.0),
+                angular_velocity=kit.new("geometry_msgs/Vector3", x=w[0], y=w[1], z=w[2]),
+                angular_velocity_covariance=np.full(9, 2.0),
+                linear_acceleration=kit.new("geometry_msgs/Vector3", x=a[0], y=a[1], z=a[2]),
+                linear_acceleration_covariance=np.full(9, 3.0),
+            )
+            found.append((STAMP_NS + IMU_PERIOD_NS * len(found) + 1_000_000, message))
+        return found
+
+    def assert_found(self, imu, rtol=1e-15):
+        np.testing.assert_array_equal(imu.stamps, self.stamps)
+        np.testing.assert_array_equal(imu.angular_velocities, self.w)
+        np.testing.assert_allclose(imu.accelerations, self.a, rtol=rtol)
+
+
+@pytest.fixture
+def samples(rng):
+    return Samples(rng)
+
+
+def transforms(kit, *edges):
+    """A message of transforms from named parents to named children."""
+    stamped = []
+    for parent, child, T in edges:
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        t = T[:3, 3].tolist()
+        header = kit.header(0)
+        header.frame_id = parent
+        transform = kit.new(
+            "geometry_msgs/Transform",
+            translation=kit.new("geometry_msgs/Vector3", x=t[0], y=t[1], z=t[2]),
+            rotation=kit.new("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w),
+        )
+        stamped.append(
+            kit.new("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=transform)
+        )
+    return kit.new("tf2_msgs/TFMessage", transforms=stamped)
+
+
+def clouds(kit, make_sweep):
+    return [
+        (stamp_ns + 10**8, kit.cloud(make_sweep("velodyne", stamp_ns).records, stamp_ns))
+        for stamp_ns in (STAMP_NS, STAMP_NS + 10**8)
+    ]
+
+
+@pytest.mark.parametrize("frame_id", ["imu", "imu_link", "/a/longer_name_of_23_bytes"])  # CDR pads behind it
+def test_every_kind_of_bag(bag_kit, make_sweep, samples, frame_id):
+    path = bag_kit.write({"/points": clouds(bag_kit, make_sweep), "/imu": samples.messages(bag_kit, frame_id)})
+    imu = open_recording(path).imu
+    samples.assert_found(imu)
+    assert imu.T_lidar_imu is None
+    assert imu.notes == ()
+    assert imu.rate_hz == pytest.approx(200.0, rel=1e-3)
+
+
+def test_a_bag_without_one(ros2_kit, make_sweep):
+    recording = open_recording(ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": "sensor_msgs/msg/Imu"}))
+    assert recording.imu is None
+    assert recording.describe().imu is None
+
+
+def test_the_extrinsic_goes_along_the_chain_of_frames(bag_kit, make_sweep, samples):
+    static = [(STAMP_NS, transforms(bag_kit, ("base", "/imu", T_BASE_IMU), ("base", "mast", np.eye(4))))]
+    static += [(STAMP_NS + 1, transforms(bag_kit, ("mast", "lidar", inverse(T_LIDAR_BASE))))]
+    path = bag_kit.write(
+        {"/points": clouds(bag_kit, make_sweep), "/imu": samples.messages(bag_kit), "/tf_static": static}
+    )
+    recording = open_recording(path)
+    np.testing.assert_allclose(recording.imu.T_lidar_imu, T_LIDAR_BASE @ T_BASE_IMU, atol=1e-12)
+    text = describe_source(path, ReaderConfig())
+    assert "/imu, 41 samples at 200 Hz, extrinsic known" in text
+
+
+def test_frames_that_are_not_connected(ros2_kit, make_sweep, samples):
+    static = [(STAMP_NS, transforms(ros2_kit, ("base", "imu", T_BASE_IMU), ("map", "lidar", np.eye(4))))]
+    path = ros2_kit.write(
+        {"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit), "/tf_static": static}
+    )
+    assert open_recording(path).imu.T_lidar_imu is None
+    assert "extrinsic unknown" in describe_source(path, ReaderConfig())
+
+
+def test_one_frame_for_both(ros2_kit, make_sweep, samples):
+    path = ros2_kit.write(
+        {"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit, frame_id="lidar")}
+    )
+    imu = open_recording(path).imu
+    np.testing.assert_array_equal(imu.T_lidar_imu, np.eye(4))
+    assert "share the frame 'lidar'" in imu.notes[0]
+
+
+def test_samples_in_disorder_repeated_and_broken(ros2_kit, make_sweep, samples):
+    order = [*range(5, 41), 3, 3, *range(5)]
+    samples.w[10] = np.nan
+    path = ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit, order=order)})
+    imu = open_recording(path).imu
+    kept = np.delete(np.arange(41), 10)
+    np.testing.assert_array_equal(imu.stamps, samples.stamps[kept])
+    np.testing.assert_array_equal(imu.angular_velocities, samples.w[kept])
+    assert "1 IMU sample with a number that is not finite left out." in imu.notes
+    assert "2 IMU samples with the stamp of another left out." in imu.notes
+
+
+def test_accelerations_in_g(ros2_kit, make_sweep, rng):
+    samples = Samples(rng, in_g=True)
+    path = ros2_kit.write({"/points": clouds(ros2_kit, make_sweep), "/imu": samples.messages(ros2_kit)})
+    imu = open_recording(path).imu
+    samples.assert_found(imu, rtol=1e-12)
+    assert "in g" in imu.notes[0]
+    assert "are in g" in describe_source(path, ReaderConfig())
+
+
+def test_accelerations_without_gravity(rng):
+    imu = usable_samples(np.arange(50.0), np.zeros((50, 3)), rng.normal(0.0, 0.1, (50, 3)), None)
+    assert "gravity in no known unit" in imu.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ({"/camera/imu": "imu_camera", "/front/imu": "imu_front"}, "/front/imu"),
+        ({"/camera/imu": "base", "/vn100/data": "front_imu"}, "/vn100/data"),
+    ],
+)
+def test_of_several_the_nearest(ros2_kit, make_sweep, rng, names, expected):
+    messages = [(t, m) for t, m in clouds(ros2_kit, make_sweep)]
+    for _, message in messages:
+        message.header.frame_id = "front_lidar"
+    found = {name: Samples(rng, 60 - 10 * k) for k, name in enumerate(names)}
+    path = ros2_kit.write(
+        {"/front/points": messages}
+        | {name: found[name].messages(ros2_kit, frame_id) for name, frame_id in names.items()}
+    )
+    found[expected].assert_found(open_recording(path).imu)
+    other = next(name for name in names if name != expected)
+    found[other].assert_found(open_recording(path, ReaderConfig(imu_topic=other)).imu)
+    with pytest.raises(InputError, match=f"imu_topic is '/none'; its IMU topics: .*{expected}"):
+        _ = open_recording(path, ReaderConfig(imu_topic="/none")).imu
+
+
+def test_of_several_as_near_the_fastest(ros2_kit, make_sweep, rng):
+    slow, fast = Samples(rng, 11), Samples(rng, 41)
+    path = ros2_kit.write(
+        {
+            "/points": clouds(ros2_kit, make_sweep),
+            "/a/imu": slow.messages(ros2_kit),
+            "/b/imu": fast.messages(ros2_kit),
+        }
+    )
+    fast.assert_found(open_recording(path).imu)
+
+
+def test_where_no_cloud_is_stamped_samples_have_the_times_of_recording(ros2_kit, make_sweep, samples):
+    unset = [(t, ros2_kit.cloud(make_sweep("velodyne", STAMP_NS).records, 0)) for t, _ in clouds(ros2_kit, make_sweep)]
+    path = ros2_kit.write({"/points": unset, "/imu": samples.messages(ros2_kit)})
+    imu = open_recording(path).imu
+    np.testing.assert_allclose(imu.stamps, samples.stamps + 1e-3, atol=1e-6)
+
+
+def folder_of_scans(path: Path, count=3):
+    path.mkdir()
+    for number in range(count):
+        np.save(path / f"scan_{number}.npy", np.random.default_rng(number).uniform(1, 9, (50, 3)))
+    (path / "timestamps.txt").write_text("".join(f"{STAMP_NS / 1e9 + 0.1 * k:.9f}\n" for k in range(count)))
+    return path
+
+
+@pytest.mark.parametrize("unit", ["s", "ns"])
+def test_a_table_beside_the_scans(tmp_path, samples, unit):
+    folder = folder_of_scans(tmp_path / "scans")
+    rows = [
+        f"{t if unit == 'ns' else f'{t / 10**9:.9f}'},{','.join(map(repr, (*w.tolist(), *a.tolist())))}"
+        for t, w, a in zip(samples.stamps_ns, samples.w, samples.a, strict=True)
+    ]
+    extrinsic = " ".join(map(repr, T_BASE_IMU[:3].ravel().tolist()))
+    euroc = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1]"
+    head = [euroc] if unit == "ns" else [f"# T_lidar_imu: {extrinsic}", "stamp_s,wx,wy,wz,ax,ay,az"]
+    (folder / "imu.csv").write_text("\n".join([*head, *rows, ""]))
+    recording = open_recording(folder)
+    samples.assert_found(recording.imu)
+    if unit == "ns":
+        assert recording.imu.T_lidar_imu is None
+    else:
+        np.testing.assert_allclose(recording.imu.T_lidar_imu, T_BASE_IMU, atol=1e-12)
+    assert f"imu.csv, 41 samples at 200 Hz, extrinsic {'unknown' if unit == 'ns' else 'known'}" in describe_source(
+        folder, ReaderConfig()
+    )
+    assert len(recording) == 3
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("stamp,a\n1,2,3,4,5,6,7\n2,x,3,4,5,6,7\n", "expected lines `stamp, wx.*got '2,x"),
+        ("1,2,3\n", "expected lines"),
+        ("# T_lidar_imu: 1 2 3\n1,2,3,4,5,6,7\n", "first three rows of a rigid transform"),
+        (f"# T_lidar_imu: {'2 ' * 12}\n1,2,3,4,5,6,7\n", "rigid transform"),
+    ],
+)
+def test_a_damaged_table(tmp_path, content, message):
+    folder = folder_of_scans(tmp_path / "scans")
+    (folder / "imu.csv").write_text(content)
+    recording = open_recording(folder)
+    assert len(list(recording.scans())) == 3
+    with pytest.raises(InputError, match=message):
+        _ = recording.imu
+
+
+def test_an_empty_table(tmp_path):
+    folder = folder_of_scans(tmp_path / "scans")
+    (folder / "imu.csv").write_text("stamp_s,wx,wy,wz,ax,ay,az\n")
+    assert open_recording(folder).imu is None

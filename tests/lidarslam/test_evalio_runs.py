@@ -1,0 +1,153 @@
+"""Runs of a sequence named as evalio names it: a drive through the room in the layout of Hilti 2022."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+import lidarslam
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
+
+SOURCE = "evalio:hilti_2022/basement_2"
+START_NS = 1_640_000_000 * 10**9
+SCANS = 8
+T_IMU_LIDAR = make_transform(
+    Rotation.from_quat([0.7071068, -0.7071068, 0.0, 0.0]).as_matrix(), [-0.001, -0.00855, 0.055]
+)
+POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "timestamp", "ring"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<f8", "<u2"],
+        "offsets": [0, 4, 8, 16, 24, 32],
+        "itemsize": 48,
+    }
+)
+DATATYPES = {"<f4": 7, "<f8": 8, "<u2": 4}
+
+
+def _write_bag(path: Path, room: Any, drive: Callable[[FloatArray], FloatArray]) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    packages = ("builtin_interfaces", "geometry_msgs", "sensor_msgs", "std_msgs")
+    wanted = {name: kind for name, kind in store.types.items() if name.startswith(packages)}
+    types = {name.rpartition("/")[2]: wanted[name] for name in sorted(wanted, reverse=True)}
+
+    def header(stamp_ns: int) -> Any:
+        stamp = types["Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return types["Header"](seq=0, stamp=stamp, frame_id="PandarXT-32")
+
+    def vector(values: FloatArray) -> Any:
+        return types["Vector3"](x=values[0], y=values[1], z=values[2])
+
+    fields = [
+        types["PointField"](name=name, offset=offset, datatype=DATATYPES[kind.str], count=1)
+        for name, (kind, offset) in POINT.fields.items()
+    ]
+    with Writer(path) as writer:
+        clouds = writer.add_connection("/hesai/pandar", "sensor_msgs/msg/PointCloud2", typestore=store)
+        imu = writer.add_connection("/alphasense/imu", "sensor_msgs/msg/Imu", typestore=store)
+        for index in range(SCANS):
+            scan = room.ring_sweep(drive, 0.1 * index + 0.05)
+            stamp_ns = START_NS + index * 10**8
+            table = np.zeros(len(scan), POINT)
+            table["x"], table["y"], table["z"] = scan.points.T
+            table["timestamp"] = stamp_ns * 1e-9 + scan.time_offsets + 0.05
+            table["ring"] = scan.rings
+            cloud = types["PointCloud2"](
+                header=header(stamp_ns),
+                height=1,
+                width=len(scan),
+                fields=fields,
+                is_bigendian=False,
+                point_step=POINT.itemsize,
+                row_step=table.nbytes,
+                data=table.view(np.uint8),
+                is_dense=True,
+            )
+            writer.write(clouds, stamp_ns, store.serialize_ros1(cloud, cloud.__msgtype__))
+            sample = types["Imu"](
+                header=header(stamp_ns),
+                orientation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+                orientation_covariance=np.zeros(9),
+                angular_velocity=vector(np.zeros(3)),
+                angular_velocity_covariance=np.zeros(9),
+                linear_acceleration=vector(np.array([0.0, 0.0, 9.81])),
+                linear_acceleration_covariance=np.zeros(9),
+            )
+            writer.write(imu, stamp_ns, store.serialize_ros1(sample, sample.__msgtype__))
+
+
+@pytest.fixture
+def sequence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: Any, drive: Callable[[FloatArray], FloatArray]
+) -> Path:
+    """The folder of the sequence in evalio's default place; the current folder is empty but for that."""
+    pytest.importorskip("evalio")
+    monkeypatch.delenv("EVALIO_DATA", raising=False)
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "evalio_data" / "hilti_2022" / "basement_2"
+    folder.mkdir(parents=True)
+    _write_bag(folder / "exp14_basement_2.bag", room, drive)
+    lines = []
+    for time in np.arange(0.0, 0.1 * SCANS + 0.05, 0.01):
+        T = drive(np.array(time)) @ inverse(T_IMU_LIDAR)
+        numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+        lines.append(f"{START_NS // 10**9}.{round(time * 1e6):06d} {' '.join(f'{number:.9f}' for number in numbers)}\n")
+    (folder / "exp14_basement_2_imu.txt").write_text("".join(lines))
+    return folder
+
+
+def _invoke(*arguments: str) -> str:
+    done = CliRunner().invoke(main, list(arguments))
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_run_and_what_follows_it(sequence: Path, tmp_path: Path) -> None:
+    _invoke("run", SOURCE, "--odometry", "kiss-icp", "--no-report")
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name.startswith("hilti_2022_basement_2_")
+    description = yaml.safe_load((run / "config.yaml").read_text())["run"]
+    assert description["source"] == str(sequence)
+    _invoke("evaluate", str(run))
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["association"]["matched"] == SCANS
+    assert metrics["trajectory"]["ate_rmse_m"] < 0.03
+    _invoke("view", str(run), "--picture", "map.png")
+    assert not (tmp_path / "evalio:hilti_2022").exists()
+
+
+def test_info_as_json(sequence: Path) -> None:
+    known = json.loads(_invoke("info", SOURCE, "--json"))
+    assert (known["reader"], known["scans"], known["source"]) == ("evalio", SCANS, str(sequence))
+    assert known["first_scan"]["has_rings"]
+    assert known["point_time"]["last_s"] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_compare_names_folders_without_slashes(sequence: Path, tmp_path: Path) -> None:
+    _invoke("compare", SOURCE, "--methods", "kiss-icp", "--out", "compared")
+    assert (tmp_path / "compared" / "hilti_2022_basement_2" / "kiss-icp" / "trajectory.tum").is_file()
+
+
+def test_python_opens_the_name(sequence: Path) -> None:
+    recording = lidarslam.open(SOURCE, stop=2)
+    assert len(list(recording)) == len(recording) == 2
+    assert recording.ground_truth is not None
+
+
+def test_what_is_missing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("evalio")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("EVALIO_DATA", raising=False)
+    done = CliRunner().invoke(main, ["run", SOURCE, "--out", "run"])
+    assert done.exit_code == 1
+    (line,) = done.output.strip().splitlines()
+    assert line.endswith(f"is not downloaded: evalio -D {tmp_path / 'evalio_data'} dl hilti_2022/basement_2")

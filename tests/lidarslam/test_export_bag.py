@@ -1,0 +1,203 @@
+"""A run as a bag, read back by rosbags and by the libraries of MCAP, and as a recording."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
+
+from lidarslam.cli import main
+from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, transform_points
+from lidarslam.core.scan import PointAttributes
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.storage.exports.run_scans import read_run_scans
+
+SCANS = 6
+FIRST_STAMP = 1_700_000_000.123456789
+VELOCITY = np.array([0.0, 0.0, 0.4, 6.0, 0.3, 0.0])
+SIGMAS = (0.001, 0.002, 0.003, 0.01, 0.02, 0.05)
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+@pytest.fixture
+def landmarks(rng: np.random.Generator) -> FloatArray:
+    """Fixed points of the world."""
+    return rng.uniform(-20.0, 20.0, (500, 3))
+
+
+@pytest.fixture
+def run(tmp_path: Path, landmarks: FloatArray) -> Path:
+    """A run of constant velocity over sweeps of 0.1 s; the odometry drifts, and the last scan is lost."""
+    recording, folder = tmp_path / "recording", tmp_path / "run"
+    recording.mkdir()
+    folder.mkdir()
+    stamps = FIRST_STAMP + 0.1 * np.arange(SCANS)
+    offsets = np.linspace(0.0, 0.1, len(landmarks))
+    for number in range(SCANS):
+        T = exp(np.multiply.outer(0.1 * number + offsets, VELOCITY))
+        points = np.concatenate(
+            [transform_points(inverse(pose), p[None]) for pose, p in zip(T, landmarks, strict=True)]
+        )
+        kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "f4"), ("intensity", "f4"), ("ring", "u2")]
+        table = np.zeros(len(points), kinds)
+        table["x"], table["y"], table["z"], table["t"] = *points.T, offsets
+        table["intensity"], table["ring"] = np.arange(len(points)), np.arange(len(points)) % 16
+        np.save(recording / f"{number:06d}.npy", table)
+    np.savetxt(recording / "timestamps.txt", stamps, fmt="%.9f")
+    T = exp(np.multiply.outer(0.1 * np.arange(SCANS), VELOCITY))
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, T))
+    drift = exp(np.multiply.outer(np.arange(SCANS), [0.0, 0.0, 0.01, 0.02, 0.0, 0.0]))
+    write_tum(folder / "odometry.tum", Trajectory(stamps, T @ drift))
+    intensity = np.arange(len(landmarks), dtype=np.float32)
+    write_cloud(folder / "map.ply", PointCloud(landmarks, np.zeros((500, 3)), PointAttributes(intensity=intensity)))
+    about = {"source": str(recording), "start": 0, "stop": None, "step": 1}
+    (folder / "config.yaml").write_text(dump_yaml(Config(), about))
+    names = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
+    rows = [["ok", *map(str, SIGMAS)]] * (SCANS - 1) + [["lost", *[""] * 6]]
+    (folder / "scans.csv").write_text("\n".join(",".join(row) for row in [["status", *names], *rows]) + "\n")
+    return folder
+
+
+def pose(message: Any) -> FloatArray:
+    """Of a Pose or a Transform."""
+    t = message.position if hasattr(message, "position") else message.translation
+    q = message.orientation if hasattr(message, "orientation") else message.rotation
+    return make_transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
+
+
+def stamp_ns(message: Any) -> int:
+    """Of a header; one library keeps ROS 1's names."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def xyz(cloud: Any) -> FloatArray:
+    raw = np.frombuffer(bytes(cloud.data), np.uint8).reshape(cloud.width, cloud.point_step)
+    assert [field.name for field in cloud.fields[:3]] == ["x", "y", "z"]
+    return raw[:, :12].copy().view("<f4").astype(np.float64)
+
+
+def read_with_rosbags(bag: Path) -> dict[str, list[tuple[int, Any]]]:
+    messages = defaultdict(list)
+    with AnyReader([bag]) as reader:
+        for connection, recorded_ns, data in reader.messages():
+            messages[connection.topic].append((recorded_ns, reader.deserialize(data, connection.msgtype)))
+    return messages
+
+
+def read_with_mcap(bag: Path) -> dict[str, list[tuple[int, Any]]]:
+    pytest.importorskip("mcap_ros2")
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    messages = defaultdict(list)
+    with bag.open("rb") as file:
+        for _, channel, message, decoded in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            messages[channel.topic].append((message.log_time, decoded))
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("slam.mcap", read_with_rosbags),
+        ("slam.mcap", read_with_mcap),
+        ("slam.bag", read_with_rosbags),
+        ("slam.db3", read_with_rosbags),
+        ("slam", read_with_rosbags),
+    ],
+)
+def test_poses_and_points_come_back(run: Path, landmarks: FloatArray, tmp_path: Path, name: str, read: Any) -> None:
+    done = lidarslam("export-bag", run, "--out", tmp_path / name)
+    assert done.exit_code == 0, done.output
+    messages = read(tmp_path / name)
+    scans = read_run_scans(run)
+    stamps_ns = [round(stamp * 1e9) for stamp in scans.trajectory.stamps]
+    assert sorted(messages) == ["/map_points", "/odometry", "/path", "/points", "/tf"]
+    for topic in ("/odometry", "/points"):
+        assert [stamp_ns(message) for _, message in messages[topic]] == stamps_ns
+        assert [recorded for recorded, _ in messages[topic]] == stamps_ns
+    for number, (_, odometry) in enumerate(messages["/odometry"]):
+        T = scans.trajectory.T_world_lidar[number]
+        assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "lidar")
+        np.testing.assert_allclose(pose(odometry.pose.pose), T, atol=1e-9)
+        map_to_odom, odom_to_lidar = messages["/tf"][number][1].transforms
+        assert (map_to_odom.header.frame_id, map_to_odom.child_frame_id) == ("map", "odom")
+        assert (odom_to_lidar.header.frame_id, odom_to_lidar.child_frame_id) == ("odom", "lidar")
+        np.testing.assert_allclose(pose(map_to_odom.transform) @ pose(odom_to_lidar.transform), T, atol=1e-9)
+        np.testing.assert_allclose(pose(odom_to_lidar.transform), scans.odometry.T_world_lidar[number], atol=1e-9)
+        points = xyz(messages["/points"][number][1])
+        error = np.abs(transform_points(T, points) - landmarks).max()
+        assert error < 1e-4 if number < SCANS - 1 else error > 0.1  # a lost scan has no motion to be deskewed with
+    path = messages["/path"][0][1]
+    np.testing.assert_allclose([pose(each.pose) for each in path.poses], scans.trajectory.T_world_lidar, atol=1e-9)
+    np.testing.assert_allclose(xyz(messages["/map_points"][0][1]), landmarks, atol=1e-5)
+
+
+def test_covariance_and_velocity_are_in_the_frames_of_ros(run: Path, tmp_path: Path) -> None:
+    lidarslam("export-bag", run, "--out", tmp_path / "slam.mcap", "--no-clouds")
+    messages = read_with_rosbags(tmp_path / "slam.mcap")
+    assert "/points" not in messages
+    odometry = [message for _, message in messages["/odometry"]]
+    R = pose(odometry[3].pose.pose)[:3, :3]
+    covariance = odometry[3].pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(R.T @ covariance[:3, :3] @ R, np.diag(SIGMAS[3:]) ** 2, atol=1e-9)
+    np.testing.assert_allclose(R.T @ covariance[3:, 3:] @ R, np.diag(SIGMAS[:3]) ** 2, atol=1e-9)
+    assert not odometry[-1].pose.covariance.any()
+    twist = odometry[3].twist.twist
+    found = [twist.angular.x, twist.angular.y, twist.angular.z, twist.linear.x, twist.linear.y, twist.linear.z]
+    np.testing.assert_allclose(found, VELOCITY, atol=1e-6)
+
+
+def test_path_and_map_are_latched(run: Path, tmp_path: Path) -> None:
+    for name in ("slam.mcap", "slam.bag"):
+        lidarslam("export-bag", run, "--out", tmp_path / name, "--no-clouds")
+    with AnyReader([tmp_path / "slam.mcap"]) as reader:
+        durable = {c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections}
+    assert durable == dict.fromkeys(("/path", "/map_points"), "TRANSIENT_LOCAL") | dict.fromkeys(
+        ("/tf", "/odometry"), "VOLATILE"
+    )
+    with AnyReader([tmp_path / "slam.bag"]) as reader:
+        assert {c.topic for c in reader.connections if c.ext.latching} == {"/path", "/map_points"}
+
+
+def test_the_bag_is_a_recording(run: Path, landmarks: FloatArray, tmp_path: Path) -> None:
+    lidarslam("export-bag", run, "--out", tmp_path / "slam.mcap")
+    scans = list(open_recording(tmp_path / "slam.mcap", ReaderConfig(topic="/points")).scans())
+    trajectory = read_run_scans(run).trajectory
+    assert [scan.stamp for scan in scans] == trajectory.stamps.tolist()
+    for scan, T in zip(scans[:-1], trajectory.T_world_lidar, strict=False):
+        assert scan.time_offsets is None
+        np.testing.assert_allclose(transform_points(T, scan.points), landmarks, atol=1e-4)
+        np.testing.assert_array_equal(scan.intensities, np.arange(len(landmarks)))
+        np.testing.assert_array_equal(scan.rings, np.arange(len(landmarks)) % 16)
+
+
+def test_what_is_in_the_way(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "slam.mcap"
+    out.write_text("mine")
+    refused = lidarslam("export-bag", run, "--out", out)
+    assert (refused.exit_code, out.read_text()) == (1, "mine")
+    assert lidarslam("export-bag", run, "--out", out, "--overwrite").exit_code == 0
+    assert lidarslam("export-bag", run, "--out", tmp_path / "slam.zip").exit_code == 2
+    (tmp_path / "recording").rename(tmp_path / "elsewhere")
+    gone = lidarslam("export-bag", run, "--out", tmp_path / "slam.bag")
+    assert gone.exit_code == 1
+    assert "leave them out with --no-clouds" in gone.stderr
+    assert not list(tmp_path.glob(".partial*"))
+    assert lidarslam("export-bag", run, "--out", tmp_path / "slam.bag", "--no-clouds").exit_code == 0

@@ -1,0 +1,143 @@
+"""A run placed in UTM by the NavSatFix of its bag."""
+
+import json
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from rosbags.rosbag1 import Writer
+
+from lidarslam.cli import main
+from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.core.geometry import FloatArray, exp, make_transform
+from lidarslam.core.scan import PointAttributes
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum, write_tum
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.storage.exports.ros_messages import POINT_CLOUD2, TF_MESSAGE, RosMessages, nanoseconds
+
+pyproj = pytest.importorskip("pyproj")
+
+ANTENNA = np.array([-0.5, 0.2, 1.0])
+PLACE = (-33.8568, 151.2153, 25.0)  # Sydney, zone 56 south
+FIRST_STAMP = 1_700_000_000.0
+SCANS = 120
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def truth() -> FloatArray:
+    """Poses in UTM of a curve of 110 m, heading south-east at first."""
+    motion = exp(np.multiply.outer(np.arange(SCANS) * 0.1, [0.0, 0.0, 0.12, 9.0, 0.0, 0.1]))
+    east, north = pyproj.Transformer.from_crs(4326, 32756, always_xy=True).transform(PLACE[1], PLACE[0])
+    return make_transform(exp([0.0, 0.0, -0.8, 0.0, 0.0, 0.0])[:3, :3], [east, north, PLACE[2]]) @ motion
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, truth: FloatArray) -> Path:
+    """A run without error, its recording a bag whose antenna is not at the LiDAR and has no fix at first."""
+    folder = tmp_path_factory.mktemp("geo")
+    stamps = FIRST_STAMP + 0.1 * np.arange(SCANS)
+    scale = pyproj.Proj(32756).get_factors(PLACE[1], PLACE[0]).meridional_scale
+    T = np.linalg.inv(truth[0]) @ truth
+    T[:, :3, 3] /= scale
+    write_bag(folder / "drive.bag", stamps, truth)
+    out = folder / "run"
+    out.mkdir()
+    write_tum(out / "trajectory.tum", Trajectory(stamps, T))
+    write_cloud(out / "map.ply", PointCloud(T[:, :3, 3] + [0.0, 5.0, 0.0], np.tile([0.0, 1.0, 0.0], (SCANS, 1))))
+    (out / "config.yaml").write_text(dump_yaml(Config(), {"source": str(folder / "drive.bag")}))
+    return out
+
+
+def write_bag(path: Path, stamps: FloatArray, T_utm_lidar: FloatArray) -> None:
+    messages = RosMessages(ros2=False)
+    types = messages.store.types
+    antenna = T_utm_lidar[:, :3, :3] @ ANTENNA + T_utm_lidar[:, :3, 3]
+    longitude, latitude = pyproj.Transformer.from_crs(32756, 4326, always_xy=True).transform(*antenna[:, :2].T)
+    with Writer(path) as bag:
+        topics = {"/points": POINT_CLOUD2, "/fix": "sensor_msgs/msg/NavSatFix", "/tf_static": TF_MESSAGE}
+        opened = {name: bag.add_connection(name, kind, typestore=messages.store) for name, kind in topics.items()}
+        fixed = messages.transforms(stamps[0], ("lidar", "gps", make_transform(np.eye(3), ANTENNA)))
+        bag.write(opened["/tf_static"], nanoseconds(stamps[0]), messages.serialize(fixed))
+        for n, stamp in enumerate(stamps):
+            ns = nanoseconds(stamp)
+            cloud = messages.cloud(stamp, "lidar", np.eye(3) + n, PointAttributes())
+            bag.write(opened["/points"], ns, messages.serialize(cloud))
+            header = messages.cloud(stamp, "gps", np.eye(3), PointAttributes()).header
+            status = types["sensor_msgs/msg/NavSatStatus"](status=-1 if n < 5 else 0, service=1)
+            at = (0.0, 0.0, 0.0) if n < 5 else (latitude[n], longitude[n], antenna[n, 2])
+            fix = types["sensor_msgs/msg/NavSatFix"](header, status, *at, np.diag([0.01, 0.01, 0.04]).ravel(), 2)
+            bag.write(opened["/fix"], ns, messages.serialize(fix))
+
+
+def test_trajectory_and_map_are_in_utm(run: Path, truth: FloatArray, tmp_path: Path) -> None:
+    import laspy
+
+    done = lidarslam("export-geo", run, "--out", tmp_path / "utm")
+    assert done.exit_code == 0, done.output
+    assert "WGS 84 / UTM zone 56S, EPSG:32756" in done.stdout
+    written = read_tum(tmp_path / "utm" / "trajectory_utm.tum")
+    np.testing.assert_allclose(written.positions, truth[:, :3, 3], atol=0.02)
+    about = json.loads((tmp_path / "utm" / "georeference.json").read_text())
+    assert about["residual_rms_m"] < 0.01
+    assert about["gnss_positions"] == SCANS - 5
+    assert about["lidar_antenna_m"] == pytest.approx(ANTENNA)
+    las = laspy.read(tmp_path / "utm" / "map.laz")
+    crs = las.header.parse_crs()
+    assert crs is not None
+    assert crs.to_epsg() == 32756
+    np.testing.assert_allclose(las.xyz, truth[:, :3, 3] + truth[0, :3, :3] @ [0.0, 5.0, 0.0], atol=0.02)
+    normals = np.column_stack([las[name] for name in ("NormalX", "NormalY", "NormalZ")])
+    np.testing.assert_allclose(normals, np.tile(truth[0, :3, 1], (SCANS, 1)), atol=1e-3)
+
+
+def test_the_path_for_maps_on_the_web(run: Path, tmp_path: Path) -> None:
+    lidarslam("export-geo", run, "--out", tmp_path)
+    (feature,) = json.loads((tmp_path / "trajectory.geojson").read_text())["features"]
+    first = feature["geometry"]["coordinates"][0]
+    assert first[2] == pytest.approx(PLACE[2], abs=0.02)
+    assert first[:2] == pytest.approx([PLACE[1], PLACE[0]], abs=1e-6)
+    assert len(feature["properties"]["times"]) == len(feature["geometry"]["coordinates"]) == SCANS
+    line = ElementTree.parse(tmp_path / "trajectory.kml").find(".//{http://www.opengis.net/kml/2.2}coordinates")
+    assert line is not None
+    points = [[float(number) for number in point.split(",")] for point in str(line.text).split()]
+    np.testing.assert_allclose(points, np.array(feature["geometry"]["coordinates"])[:, :2], atol=1e-9)
+
+
+def test_what_cannot_be_placed_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert lidarslam("export-geo", run, "--out", tmp_path / "utm").exit_code == 0
+    again = lidarslam("export-geo", run, "--out", tmp_path / "utm")
+    assert (again.exit_code, "--overwrite" in again.stderr) == (1, True)
+    short = tmp_path / "short"
+    short.mkdir()
+    (short / "config.yaml").write_text((run / "config.yaml").read_text())
+    write_tum(short / "trajectory.tum", read_tum(run / "trajectory.tum").select(slice(0, 12)))
+    refused = lidarslam("export-geo", short, "--out", tmp_path / "other")
+    assert refused.exit_code == 1
+    assert "too short to determine the heading" in refused.stderr
+    assert not (tmp_path / "other").exists()
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    absent = lidarslam("export-geo", run, "--out", tmp_path / "other")
+    assert (absent.exit_code, "pip install 'lidarslam[geo]'" in absent.stderr) == (1, True)
+
+
+def test_a_recording_without_gnss(run: Path, tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    np.save(scans / "0.npy", np.ones((10, 3)))
+    (run / "config.yaml").rename(tmp_path / "config.yaml")
+    try:
+        (run / "config.yaml").write_text(dump_yaml(Config(), {"source": str(scans)}))
+        refused = lidarslam("export-geo", run, "--out", tmp_path / "utm")
+    finally:
+        (tmp_path / "config.yaml").rename(run / "config.yaml")
+    assert refused.exit_code == 1
+    assert "has no GNSS positions" in refused.stderr

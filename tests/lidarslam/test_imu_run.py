@@ -1,0 +1,146 @@
+"""`lidarslam run` with a recording's IMU: whether it helps, what it needs, and that it changes nothing unasked."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from scipy.spatial.transform import Rotation
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import read_tum, write_tum
+from lidarslam.simulation.sensors.imu import MEMS_IMU, sample_imu
+
+SCANS = 20
+MODEL = replace(MEMS_IMU, T_lidar_imu=make_transform(exp([0.2, -0.1, 1.4, 0.0, 0.0, 0.0])[:3, :3], [0.05, 0.0, -0.1]))
+FAST = ("--no-report", "--set", "mapping.keypoints=800", "--set", "global_map.voxel_size_m=0.2")
+
+
+def shaken(times: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) at times (N,): a loop through the room, shaken within each sweep and turned about all axes."""
+    t = np.asarray(times, dtype=np.float64)
+    turns = np.stack(
+        [
+            0.2 * np.sin(4.1 * t) + 0.03 * np.sin(29 * t),
+            0.2 * np.sin(5.3 * t),
+            0.4 * np.sin(2 * t) + 0.06 * np.sin(23 * t),
+        ],
+        axis=-1,
+    )
+    places = np.stack([2.0 * np.sin(0.9 * t) - 1.0, 0.8 * np.cos(1.1 * t), 0.1 * np.sin(3.0 * t)], axis=-1)
+    return make_transform(Rotation.from_rotvec(turns).as_matrix(), places)
+
+
+def record(folder: Path, room: Any, scans: int = SCANS, mounting: bool = True, step: int = 1) -> Path:
+    """Sweeps of a shaken sensor with its IMU's samples and the truth."""
+    folder.mkdir()
+    stamps = 0.1 * step * np.arange(1, scans // step + 1)
+    few = replace(room, points=4000)
+    for index, stamp in enumerate(stamps):
+        scan = few.sweep(shaken, float(stamp))
+        table = np.empty(len(scan), dtype=[("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8")])
+        table["x"], table["y"], table["z"] = scan.points.T
+        table["time"] = scan.time_offsets
+        np.save(folder / f"{index:06d}.npy", table)
+    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", Trajectory(stamps, shaken(stamps)))
+    imu = sample_imu(MODEL, shaken, 0.0, float(stamps[-1]) + 0.2, seed=5)
+    rows = np.column_stack([imu.stamps, imu.angular_velocities, imu.accelerations])
+    header = "T_lidar_imu: " + " ".join(map(str, MODEL.T_lidar_imu[:3].ravel()))
+    np.savetxt(folder / "imu.csv", rows, delimiter=",", header=header if mounting else "")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
+    return record(tmp_path_factory.mktemp("imu") / "room", room)
+
+
+@pytest.fixture(name="run")
+def _run(tmp_path: Path) -> Callable[..., tuple[Result, Path]]:
+    def run(source: Path, *arguments: str, name: str = "run") -> tuple[Result, Path]:
+        out = tmp_path / name
+        return CliRunner().invoke(main, ["run", str(source), "--out", str(out), *FAST, *arguments]), out
+
+    return run
+
+
+def rotation_error_deg(out: Path, source: Path) -> float:
+    """RMS error of the motions' rotations."""
+    found, true = (read_tum(path).relative_motions() for path in (out / "trajectory.tum", source / "ground_truth.tum"))
+    return float(np.rad2deg(np.sqrt((rotation_angle(inverse(found) @ true) ** 2).mean())))
+
+
+def test_shaken_sweeps_are_straightened(recording: Path, run: Any) -> None:
+    errors = {}
+    for method in ("constant-velocity", "imu"):
+        result, out = run(recording, "--odometry", method, name=method)
+        assert result.exit_code == 0, result.output
+        errors[method] = rotation_error_deg(out, recording)
+        metrics = json.loads((out / "metrics.json").read_text())
+        assert metrics["association"]["matched"] == SCANS
+    assert 5.0 * errors["imu"] < errors["constant-velocity"]
+    assert errors["imu"] < 0.15
+
+
+def test_an_imu_that_nobody_asks_for_changes_nothing(recording: Path, run: Any, tmp_path: Path) -> None:
+    bare = tmp_path / "room"
+    bare.mkdir()
+    for file in recording.iterdir():
+        if file.name != "imu.csv":
+            (bare / file.name).symlink_to(file)
+    texts = []
+    for source, name in ((recording, "with"), (bare, "without")):
+        result, out = run(source, "--odometry", "constant-velocity", "--stop", "8", name=name)
+        assert result.exit_code == 0, result.output
+        texts.append([(out / file).read_bytes() for file in ("trajectory.tum", "map.ply", "odometry.tum")])
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("method", ["imu", "learned+imu"])
+def test_a_recording_without_an_imu_is_refused_in_one_line(method: str, run: Any, small_recording: Path) -> None:
+    result, out = run(small_recording, "--odometry", method)
+    assert result.exit_code == 1
+    assert f"has no IMU, for --odometry {method}; choose --odometry learned" in result.output
+    assert not out.exists()
+
+
+def test_an_imu_needs_a_map(recording: Path, run: Any) -> None:
+    result, _ = run(recording, "--odometry", "imu", "--no-mapping")
+    assert result.exit_code == 1
+    assert "the IMU takes part in scan-to-map registration" in result.output
+
+
+def test_the_mounting_is_found_where_the_recording_has_none(
+    tmp_path: Path, room: Any, run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lidarslam.run.inertial._EVERY", 110)
+    source = record(tmp_path / "room", room, scans=115, mounting=False)
+    result, out = run(source, "--odometry", "imu", "--stop", "115")
+    assert result.exit_code == 0, result.output
+    assert rotation_error_deg(out, source) < 0.2
+
+
+def test_an_unknown_mounting_is_not_guessed_but_may_be_given(tmp_path: Path, room: Any, run: Any) -> None:
+    source = record(tmp_path / "room", room, scans=20, mounting=False)
+    result, _ = run(source, "--odometry", "imu", name="guess")
+    assert result.exit_code == 1
+    assert "does not say how its IMU is mounted, and its turns do not show it (too few scans)" in result.output
+    angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
+    result, out = run(source, "--odometry", "imu", "--set", f"odometry.imu_rotation_deg={angles}", name="given")
+    assert result.exit_code == 0, result.output
+    assert rotation_error_deg(out, source) < 0.2
+
+
+def test_a_programs_own_loop_has_no_imu() -> None:
+    import lidarslam
+    from lidarslam.core.errors import ConfigError
+
+    with pytest.raises(ConfigError, match=r"odometry.method=imu needs the IMU of a recording"):
+        lidarslam.Slam({"odometry.method": "imu"})

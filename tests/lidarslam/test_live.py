@@ -1,0 +1,345 @@
+"""`lidarslam live` with a real publisher in another process, over the loopback interface."""
+
+import itertools
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import exp, inverse, log, make_transform
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.pipeline.estimates import Localised, SweepMotion
+from lidarslam.run.live.clouds import CloudDecoder
+from lidarslam.run.live.discovery import find_topic
+from lidarslam.run.live.incoming import IncomingQueue, Received
+from lidarslam.run.live.messages import TRANSFORMS_TYPE, serialize_transform
+from lidarslam.run.live.publishing import PosePublisher, chain
+from lidarslam.run.live.statistics import LiveStatistics, count_missing
+
+LIDARSLAM = [sys.executable, "-m", "lidarslam"]
+PLAY = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "play_bag.py")]
+SCANS = 12
+STORE = get_typestore(Stores.ROS2_JAZZY)
+# Neither other tests nor a robot on the network are met here.
+LOOPBACK = (
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces></General>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='localhost'/></Peers></Discovery>"
+    "</Domain></CycloneDDS>"
+)
+_DOMAINS = itertools.count(1 + os.getpid() % 200)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of an office, as a bag."""
+    folder = tmp_path_factory.mktemp("live") / "office"
+    options = ["--scans", str(SCANS), "--sensor", "vlp-16", "--format", "mcap"]
+    subprocess.run([*LIDARSLAM, "simulate", "-o", str(folder), *options], check=True, capture_output=True)
+    return folder
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A DDS domain of its own."""
+    pytest.importorskip("cyclonedds")
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    return next(_DOMAINS)
+
+
+@pytest.fixture
+def started() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
+    """Starts processes that end with the test."""
+    running: list[subprocess.Popen[str]] = []
+
+    def start(*command: str) -> "subprocess.Popen[str]":
+        pipe = subprocess.PIPE
+        running.append(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True))
+        return running[-1]
+
+    yield start
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def read_stamps(messages: list[bytes]) -> list[int]:
+    """Of serialised messages that begin with a header."""
+    return [
+        seconds * 10**9 + nanoseconds for seconds, nanoseconds in (struct.unpack_from("<iI", m, 4) for m in messages)
+    ]
+
+
+def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
+    bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
+) -> None:
+    """With constant velocity a run knows no more of a scan than a live one: the poses are the same, bit for bit."""
+    from lidarslam.run.live.dds import DdsNode, PublishedTopic
+
+    method = ["--odometry", "constant-velocity", "--no-report"]
+    live, ran = tmp_path / "live", tmp_path / "ran"
+    node = DdsNode(domain)
+    odometry = node.subscribe(PublishedTopic("/lidarslam/odometry", "nav_msgs/msg/Odometry", True))
+    transforms = node.subscribe(PublishedTopic("/tf", TRANSFORMS_TYPE, True))
+    options = ["--domain", str(domain), "--scans", str(SCANS), "--queue", str(SCANS)]
+    lidarslam = started(*LIDARSLAM, "live", *options, "-o", str(live), *method)
+    started(*PLAY, str(bag), "--domain", str(domain), "--topic", "/points", "--reliable", "--linger", "60")
+    found: dict[int, list[bytes]] = {0: [], 1: []}
+    while lidarslam.poll() is None:
+        for kept, topic in zip(found.values(), (odometry, transforms), strict=True):
+            kept += [message.raw for message in topic.take(0.1)]
+    output, errors = lidarslam.communicate()
+    assert lidarslam.returncode == 0, errors
+    assert f"{SCANS} messages received, 0 missing between their stamps, 0 dropped" in output
+    assert "latency from the arrival of a scan to its pose: median" in output
+    subprocess.run([*LIDARSLAM, "run", str(bag), "-o", str(ran), *method], check=True, capture_output=True)
+    for name in ("trajectory.tum", "odometry.tum", "map.ply"):
+        assert (live / name).read_bytes() == (ran / name).read_bytes(), name
+    trajectory = read_tum(live / "trajectory.tum")
+    stamps = np.round(1e9 * trajectory.stamps)
+    np.testing.assert_allclose(read_stamps(found[0]), stamps, atol=1e3)
+    for raw, pose in zip(found[0], trajectory.T_world_lidar, strict=True):
+        message = STORE.deserialize_cdr(raw, "nav_msgs/msg/Odometry")
+        assert (message.header.frame_id, message.child_frame_id) == ("odom", "velodyne")
+        position = message.pose.pose.position
+        np.testing.assert_allclose([position.x, position.y, position.z], pose[:3, 3], atol=1e-8)
+    sent = [STORE.deserialize_cdr(raw, TRANSFORMS_TYPE).transforms[0] for raw in found[1]]
+    assert [one.child_frame_id for one in sent] == ["velodyne"] * SCANS
+    np.testing.assert_allclose([one.transform.translation.x for one in sent], trajectory.positions[:, 0], atol=1e-8)
+
+
+def test_interrupted_it_writes_what_came(
+    bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
+) -> None:
+    """The poses until then are those of the robot, whose static transforms were published before."""
+    from lidarslam.run.live.dds import DdsNode, PublishedTopic
+
+    out, T_base_lidar = tmp_path / "live", make_transform(np.diag([-1.0, -1.0, 1.0]), [1.0, 0.0, 2.0])
+    node = DdsNode(domain)
+    static = node.publisher("/tf_static", TRANSFORMS_TYPE, is_kept=True)
+    static.publish(serialize_transform(0, "base_link", "velodyne", T_base_lidar))
+    odometry = node.subscribe(PublishedTopic("/lidarslam/odometry", "nav_msgs/msg/Odometry", True))
+    options = ["--domain", str(domain), "--topic", "points", "--base-frame", "base_link", "-o", str(out)]
+    lidarslam = started(*LIDARSLAM, "live", *options, "--odometry", "constant-velocity", "--rerun", "save")
+    started(*PLAY, str(bag), "--domain", str(domain), "--topic", "/points", "--reliable", "--linger", "60")
+    found: list[bytes] = []
+    while len(found) < 3 and lidarslam.poll() is None:
+        found += [message.raw for message in odometry.take(0.1)]
+    lidarslam.send_signal(signal.SIGINT)
+    output, errors = lidarslam.communicate(timeout=240)
+    assert lidarslam.returncode == 0, errors
+    assert f"written to {out}" in output
+    assert all(
+        (out / name).is_file() for name in ("map.ply", "summary.json", "scans.csv", "report.html", "recording.rrd")
+    )
+    T_world_lidar = read_tum(out / "trajectory.tum").T_world_lidar
+    last = STORE.deserialize_cdr(found[-1], "nav_msgs/msg/Odometry")
+    assert last.child_frame_id == "base_link"
+    position = last.pose.pose.position
+    expected = (T_base_lidar @ T_world_lidar[len(found) - 1] @ inverse(T_base_lidar))[:3, 3]
+    np.testing.assert_allclose([position.x, position.y, position.z], expected, atol=1e-8)
+
+
+def message_at(stamp_s: float, frame_id: str = "lidar") -> bytes:
+    """A serialised cloud of 200 points, with times from 0 to 0.1 s in nanoseconds."""
+    types = STORE.types
+    fields = [
+        types["sensor_msgs/msg/PointField"](name=name, offset=4 * column, datatype=6 if name == "t" else 7, count=1)
+        for column, name in enumerate("xyzt")
+    ]
+    table = np.zeros(200, np.dtype([("xyz", "<f4", 3), ("t", "<u4")]))
+    table["xyz"] = np.random.default_rng(0).uniform(1.0, 5.0, (200, 3))
+    table["t"] = np.linspace(0.0, 1e8, 200)
+    stamp_ns = round(1e9 * stamp_s)
+    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    cloud = types["sensor_msgs/msg/PointCloud2"](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id),
+        height=1,
+        width=200,
+        fields=fields,
+        is_bigendian=False,
+        point_step=16,
+        row_step=3200,
+        data=np.frombuffer(table.tobytes(), np.uint8),
+        is_dense=True,
+    )
+    return bytes(STORE.serialize_cdr(cloud, "sensor_msgs/msg/PointCloud2"))
+
+
+def test_point_times_are_inferred_from_the_first_cloud() -> None:
+    live = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(1000.5, "os"), 0)
+    assert live is not None
+    assert (live.stamp_ns, live.frame_id, live.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
+    np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
+
+
+def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() -> None:
+    faults = Faults()
+    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
+    messages = [message_at(100.0), message_at(99.0), message_at(100.1, "rear"), message_at(100.2)[:200], b"\0\1"]
+    scans = [decoder.scan(raw, 0) for raw in [*messages, message_at(100.3)]]
+    assert [scan is not None for scan in scans] == [True, False, False, False, False, True]
+    assert faults.left_out == 4
+    assert "not after" in faults.warnings()[0]
+    assert "another sensor" in faults.warnings()[1]
+
+
+def test_headers_without_stamps_have_the_time_of_publication() -> None:
+    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults())
+    scans = [decoder.scan(message_at(0.0), published_ns) for published_ns in (10**18, 10**18 + 10**8)]
+    assert [scan.stamp_ns for scan in scans if scan is not None] == [10**18, 10**18 + 10**8]
+
+
+def test_a_full_queue_drops_every_second_message_rather_than_a_stretch() -> None:
+    batches = iter([[Received(bytes([n]), 10 * n) for n in range(1, 17)]])
+    queue = IncomingQueue(lambda _: next(batches, []), longest=8)
+    with queue:
+        while not next(batches, True) or queue.dropped < 8:
+            time.sleep(0.001)
+    taken = [message.published_ns for message in iter(lambda: queue.take(0.0), None)]
+    assert len(taken) == 8
+    assert taken[-1] == 160
+    assert np.diff([0, *taken]).max() <= 30
+
+
+def test_an_error_of_receiving_is_raised_where_messages_are_taken() -> None:
+    def receive(_: float) -> list[Received]:
+        raise InputError("gone")
+
+    with IncomingQueue(receive, 2) as queue, pytest.raises(InputError, match="gone"):
+        while queue.take(1.0) is None:
+            pass
+
+
+def test_missing_scans_are_counted_by_the_gaps_between_stamps() -> None:
+    stamps = 1e9 + 0.1 * np.arange(50) + 0.005 * np.random.default_rng(0).standard_normal(50)
+    assert count_missing(stamps) == 0
+    assert count_missing(np.delete(stamps, [7, 20, 21, 22])) == 4
+    assert count_missing(stamps[:1]) == 0
+    late = stamps + np.where(np.arange(50) == 30, 0.08, 0.0)  # which is not missing
+    assert count_missing(late) == 0
+
+
+def test_latency_counts_from_arrival_and_from_stamps_of_the_same_clock() -> None:
+    now, statistics = time.time(), LiveStatistics()
+    statistics.arrived(now - 0.2, now - 0.1)
+    statistics.registered(now - 0.2, now - 0.1)
+    counts = statistics.counts(dropped=0)
+    assert counts.from_arrival is not None
+    assert counts.from_stamp is not None
+    assert 100.0 <= counts.from_arrival.median_ms < counts.from_stamp.median_ms
+    assert not counts.warnings()
+    other = LiveStatistics()
+    other.registered(5.0, now)
+    assert other.counts(dropped=3).from_stamp is None
+    assert "3 scans dropped" in other.counts(dropped=3).warnings()[0]
+
+
+class Topic:
+    """A topic that is published."""
+
+    def __init__(self, name: str, message_type: str = "sensor_msgs/msg/PointCloud2") -> None:
+        self.name, self.message_type = name, message_type
+
+
+def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lidarslam.run.live.discovery._SETTLED_S", 0.0)
+    clouds = Topic("/points")
+    seen = iter([[], [Topic("/scan", "sensor_msgs/msg/LaserScan")], [clouds]])
+    assert find_topic(lambda: next(seen, [clouds]), None, 0) is clouds
+    with pytest.raises(InputError, match="clouds are published on /a, /b; choose one with --topic"):
+        find_topic(lambda: [Topic("/a"), Topic("/b")], None, 0)
+    with pytest.raises(InputError, match="/scan: holds sensor_msgs/msg/LaserScan"):
+        find_topic(lambda: [Topic("/scan", "sensor_msgs/msg/LaserScan")], "/scan", 0)
+
+
+def test_while_it_waits_it_says_what_it_sees(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr("lidarslam.run.live.discovery._PATIENCE_S", 0.0)
+    seen = iter([[Topic("/rear")], [Topic("/rear")], [Topic("/rear"), Topic("/front")]])
+    assert find_topic(lambda: next(seen), "/front", 3).name == "/front"
+    assert caplog.messages == ["waiting for /front in domain 3; clouds are published on /rear"]
+
+
+def localised(T: np.ndarray, status: Status = Status.OK) -> Localised:
+    """A pose with a covariance, and a velocity."""
+    velocity = np.array([0.0, 0.0, 0.5, 2.0, 0.0, 0.0])
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-4
+    motion = SweepMotion(velocity, velocity)
+    return Localised(T, T, covariance, motion, status, "", True, 9, 0.01, 0.9, (), {})
+
+
+def test_the_pose_of_the_body_follows_from_that_of_the_lidar() -> None:
+    """A body that turns about itself: its LiDAR, one metre ahead, moves sideways, and the body does not."""
+    T_body_lidar = make_transform(np.eye(3), [1.0, 0.0, 0.0])
+    turn = exp(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0]))
+    sent: list[bytes] = []
+    publisher = PosePublisher(sent.append, sent.append, "odom", "base_link", T_body_lidar)
+    T_world_lidar = inverse(T_body_lidar) @ turn @ T_body_lidar
+    publisher.publish(1_500_000_000, localised(T_world_lidar))
+    odometry = STORE.deserialize_cdr(sent[0], "nav_msgs/msg/Odometry")
+    position, turned = odometry.pose.pose.position, odometry.pose.pose.orientation
+    np.testing.assert_allclose([position.x, position.y, position.z], 0.0, atol=1e-12)
+    np.testing.assert_allclose([turned.z, turned.w], [np.sin(0.15), np.cos(0.15)])
+    assert (odometry.header.stamp.sec, odometry.header.stamp.nanosec) == (1, 500_000_000)
+    linear, angular = odometry.twist.twist.linear, odometry.twist.twist.angular
+    np.testing.assert_allclose([linear.x, linear.y, angular.z], [2.0, -0.5, 0.5], atol=1e-12)
+    transform = STORE.deserialize_cdr(sent[1], TRANSFORMS_TYPE).transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "base_link")
+    publisher.publish(1_600_000_000, localised(turn, Status.LOST))
+    assert len(sent) == 2
+
+
+def test_covariances_are_those_of_errors_along_the_fixed_axes(rng: np.random.Generator) -> None:
+    """Against the spread of poses with random errors in the frame of the body."""
+    T = exp(np.array([0.3, -0.8, 1.2, 4.0, 5.0, 6.0]))
+    given = localised(T)
+    assert given.covariance is not None
+    errors = exp(rng.multivariate_normal(np.zeros(6), given.covariance, 200_000))
+    poses = T @ errors
+    moved = poses[:, :3, 3] - T[:3, 3]
+    turned = log(make_transform(poses[:, :3, :3] @ T[:3, :3].T, np.zeros((len(poses), 3))))[:, :3]
+    sent: list[bytes] = []
+    PosePublisher(sent.append, None, "odom", "lidar", np.eye(4)).publish(0, given)
+    covariance = STORE.deserialize_cdr(sent[0], "nav_msgs/msg/Odometry").pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(covariance, np.cov(np.hstack([moved, turned]).T), atol=5e-6)
+
+
+def test_static_transforms_are_chained_in_both_directions() -> None:
+    a, b = exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])), exp(np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0]))
+    known = [("base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", b)]
+    found = chain(known, "base_link", "os_lidar")
+    assert found is not None
+    np.testing.assert_allclose(found, a @ b @ inverse(b), atol=1e-12)
+    assert chain(known, "base_link", "camera") is None
+
+
+def test_a_transform_survives_its_message() -> None:
+    from lidarslam.run.live.messages import read_transforms
+
+    T = exp(np.array([0.5, -0.4, 0.3, 1.0, 2.0, 3.0]))
+    ((parent, child, read),) = read_transforms(serialize_transform(0, "base_link", "os", T))
+    assert (parent, child) == ("base_link", "os")
+    np.testing.assert_allclose(read, T, atol=1e-12)
+
+
+def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:
+    (tmp_path / "cyclonedds.py").write_text("raise ModuleNotFoundError('hidden', name='cyclonedds')\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run(
+        [*LIDARSLAM, "live", "-o", str(tmp_path / "run")], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == [
+        "lidarslam: cyclonedds is not installed, which live needs; pip install 'lidarslam[live]'"
+    ]

@@ -1,0 +1,175 @@
+"""Occupancy grids of a room whose walls, furniture and slope are known, and as the map server reads them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.mapping.products.ground import find_ground
+from lidarslam.mapping.products.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    GridOptions,
+    OccupancyGrid,
+    occupancy_grid,
+)
+from lidarslam.storage.finished_run import load_map
+
+SLOPE = np.tan(np.deg2rad(10.0))
+SENSOR_M = 1.0
+STEP = 0.05
+
+
+def patch(corner: FloatArray, along: FloatArray, across: FloatArray, spacing: float = 0.04) -> FloatArray:
+    """Points (N, 3) of a parallelogram."""
+    u = np.arange(0.0, 1.0 + 1e-9, spacing / np.linalg.norm(along))
+    v = np.arange(0.0, 1.0 + 1e-9, spacing / np.linalg.norm(across))
+    u, v = (each.ravel() for each in np.meshgrid(u, v))
+    return corner + np.outer(u, along) + np.outer(v, across)
+
+
+def at(x: float, y: float, z: float = 0.0) -> FloatArray:
+    """A point at a height above the floor, which rises along x."""
+    return np.array([x, y, SLOPE * x - SENSOR_M + z])
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points, normals and path of a room of 8 by 6 m on a slope, with a table, a box and a lamp under the ceiling."""
+    x, y, up = np.array([1.0, 0.0, SLOPE]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    level = [
+        patch(at(-2, -3), 8 * x, 6 * y),  # the floor
+        patch(at(-2, -3, 2.5), 8 * x, 6 * y),  # the ceiling
+        patch(at(2, 1, 0.7), x, y),  # a table without legs
+        patch(at(0.0, -2.5, 2.1), 0.5 * x, 0.5 * y),  # a lamp
+    ]
+    walls = [
+        patch(at(-2, -3), 8 * x, 2.5 * up),
+        patch(at(-2, 3), 8 * x, 2.5 * up),
+        patch(at(-2, -3), 6 * y, 2.5 * up),
+        patch(at(6, -3), 6 * y, 2.5 * up),
+        patch(at(4, -2), 0.5 * y, 0.3 * up),  # the face of a box
+    ]
+    points = np.concatenate([*level, *walls])
+    upright = np.arange(len(points)) < sum(map(len, level))
+    normals = np.where(upright[:, None], up, np.array([1.0, 0.0, 0.0]))
+    path = np.array([at(each, 0.0, SENSOR_M) for each in np.linspace(-1.0, 5.0, 61)])
+    return points, normals, path
+
+
+@pytest.fixture(scope="module")
+def grid(room: tuple[FloatArray, FloatArray, FloatArray]) -> OccupancyGrid:
+    found = occupancy_grid(*room, GridOptions(resolution_m=STEP))
+    assert found is not None
+    return found
+
+
+def value(grid: OccupancyGrid, x: float, y: float) -> int:
+    column, row = np.floor((np.array([x, y]) - grid.origin) / grid.resolution_m).astype(int)
+    return int(grid.cells[row, column])
+
+
+def test_the_ground_follows_the_slope(room: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    ground = find_ground(*room)
+    assert ground is not None
+    xy = np.random.default_rng(1).uniform([-1.7, -2.7], [5.7, 2.7], (200, 2))
+    np.testing.assert_allclose(ground.at(xy), SLOPE * xy[:, 0] - SENSOR_M, atol=0.03)
+
+
+def test_walls_are_occupied_to_a_cell(grid: OccupancyGrid) -> None:
+    for along in np.linspace(-1.9, 5.9, 40):
+        assert value(grid, along, -3.0) == OCCUPIED
+        assert value(grid, along, 3.0) == OCCUPIED
+        assert value(grid, along, -3.0 + 1.5 * STEP) == FREE
+        assert value(grid, along, 3.0 + 1.5 * STEP) == UNKNOWN
+    for across in np.linspace(-2.9, 2.9, 30):
+        assert OCCUPIED in (value(grid, 6.0 - 0.01, across), value(grid, 6.0 + 0.01, across))
+        assert OCCUPIED in (value(grid, -2.0 - 0.01, across), value(grid, -2.0 + 0.01, across))
+        assert value(grid, 6.0 - 1.6 * STEP, across) == FREE
+
+
+def test_furniture_and_free_space(grid: OccupancyGrid) -> None:
+    assert value(grid, 2.5, 1.5) == OCCUPIED  # the table, from above
+    assert value(grid, 4.0, -1.75) == OCCUPIED  # the box
+    assert value(grid, 0.25, -2.25) == FREE  # below the lamp
+    assert all(value(grid, x, 0.0) == FREE for x in np.linspace(-1.0, 5.0, 50))
+    free = np.argwhere(grid.cells == FREE)[:, ::-1] * STEP + grid.origin
+    assert free.min(axis=0) == pytest.approx([-2.0, -3.0], abs=2 * STEP)
+    assert free.max(axis=0) == pytest.approx([6.0, 3.0], abs=2 * STEP)
+    assert (grid.cells == FREE).sum() * STEP**2 == pytest.approx(8 * 6 - 1, abs=1.5)
+
+
+def test_what_the_robot_drove_through_is_free(room: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    """Points of those who walked beside the robot are no obstacle on its own path."""
+    points, normals, path = room
+    person = patch(at(1.0, -0.1), np.array([0.0, 0.2, 0.0]), np.array([0.0, 0.0, 1.7]))
+    more = np.concatenate([points, person]), np.concatenate([normals, np.tile([1.0, 0.0, 0.0], (len(person), 1))])
+    grid = occupancy_grid(*more, path, GridOptions(resolution_m=STEP))
+    assert grid is not None
+    assert value(grid, 1.0, 0.0) == FREE
+    aside = occupancy_grid(*more, path + np.array([0.0, 1.0, 0.0]), GridOptions(resolution_m=STEP))
+    assert aside is not None
+    assert value(aside, 1.0, 0.0) == OCCUPIED
+
+
+def test_without_ground_there_is_no_grid(room: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+    points, normals, path = room
+    above = points[:, 2] > SLOPE * points[:, 0]
+    assert occupancy_grid(points[above], normals[above], path, GridOptions()) is None
+
+
+def _read(file: Path) -> tuple[dict[str, object], FloatArray]:
+    """As map_server does, by a parser of our own: occupancy of each pixel, the first row at the top."""
+    about: dict[str, object] = {}
+    for line in file.read_text().splitlines():
+        key, _, text = line.partition(":")
+        about[key] = text.strip()
+    image = (file.parent / str(about["image"])).read_bytes()
+    magic, width, height, most, pixels = _pgm(image)
+    assert (magic, most) == (b"P5", 255)
+    return about, (255.0 - np.frombuffer(pixels, np.uint8).reshape(height, width)) / 255.0
+
+
+def _pgm(image: bytes) -> tuple[bytes, int, int, int, bytes]:
+    words, position = [], 0
+    for _ in range(4):
+        end = min(at for at in (image.find(b" ", position), image.find(b"\n", position)) if at >= 0)
+        words.append(image[position:end])
+        position = end + 1
+    return words[0], int(words[1]), int(words[2]), int(words[3]), image[position:]
+
+
+def test_the_files_mean_the_same_to_the_map_server(
+    room: tuple[FloatArray, FloatArray, FloatArray], tmp_path: Path
+) -> None:
+    points, normals, path = room
+    run, out = tmp_path / "run", tmp_path / "map.yaml"
+    run.mkdir()
+    T = np.array([make_transform(np.eye(3), each) for each in path])
+    write_tum(run / "trajectory.tum", Trajectory(0.1 * np.arange(len(path)), T))
+    write_cloud(run / "map.ply", PointCloud(points, normals))
+    command = ["export-grid", str(run), "--out", str(out)]
+    done = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    cloud = load_map(run)  # in single precision
+    grid = occupancy_grid(cloud.points, cloud.normals, path, GridOptions(resolution_m=STEP))
+    assert grid is not None
+    about, occupancy = _read(out)
+    assert (about["image"], about["mode"], about["negate"]) == ("map.pgm", "trinary", "0")
+    assert float(str(about["resolution"])) == STEP
+    occupied, free = (float(str(about[f"{name}_thresh"])) for name in ("occupied", "free"))
+    meaning = np.select([occupancy > occupied, occupancy < free], [OCCUPIED, FREE], UNKNOWN)[::-1]
+    x, y, yaw = (float(word) for word in str(about["origin"]).strip("[]").split(","))
+    np.testing.assert_allclose([x, y, yaw], [*grid.origin, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(meaning, grid.cells)
+    assert CliRunner().invoke(main, command).exit_code == 1
+    assert CliRunner().invoke(main, [*command, "--overwrite"]).exit_code == 0
+    assert CliRunner().invoke(main, ["export-grid", str(run), "--out", str(tmp_path / "map.png")]).exit_code == 1
