@@ -44,6 +44,9 @@ CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}}
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
     "kiss_icp": ("lidarslam.odometry.methods.kiss*",),
+    "kiss_slam": ("lidarslam.compare.peers.kiss_slam",),
+    "rko_lio": ("lidarslam.compare.peers.rko_lio",),
+    "small_gicp": ("lidarslam.compare.peers.small_gicp",),
     "gtsam": ("lidarslam.mapping.pose_graph.optimizer",),
     "rerun": ("lidarslam.viewer.rerun_*",),
     "click": ("lidarslam.cli", "lidarslam.commands.*"),
@@ -57,7 +60,11 @@ CONFINED = {
     "onnxscript": ("lidarslam.odometry.network.export",),
     "ouster": ("lidarslam.datasets.packets.ouster*",),
     "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
-    "evalio": ("lidarslam.datasets.published.evalio*",),
+    "evalio": (
+        "lidarslam.api.evalio_pipeline",
+        "lidarslam.compare.peers.evalio_pipelines",
+        "lidarslam.datasets.published.evalio*",
+    ),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
     "pyproj": ("lidarslam.exports.projection",),
     "rosbags": (

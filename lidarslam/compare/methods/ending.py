@@ -5,7 +5,7 @@ import signal
 from pathlib import Path
 from typing import Any, cast
 
-from lidarslam.compare.method_process import LOST
+from lidarslam.compare.methods.process import LOST
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.evaluation.comparison.comparison import MethodStatus
 from lidarslam.storage.directory import SUMMARY

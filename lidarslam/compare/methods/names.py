@@ -1,18 +1,27 @@
-"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph]."""
+"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph], or a peer."""
 
 import re
 from dataclasses import dataclass
 from typing import get_args
 
+from lidarslam.compare.peers.registry import PEERS
 from lidarslam.core.errors import ConfigError
 from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import OdometryName
 
 # Name for the user -> name of the odometry in the configuration.
 _BASES = {
-    "learned": "learned", "kiss-icp": "kiss-icp", "constant-velocity": "constant-velocity", "imu": "imu",
-    "learned+imu": "learned+imu", "prior": "external",
-}  # fmt: skip
+    "learned": "learned",
+    "kiss-icp": "kiss-icp",
+    "kiss-icp-no-deskew": "kiss-icp",
+    "constant-velocity": "constant-velocity",
+    "imu": "imu",
+    "learned+imu": "learned+imu",
+    "prior": "external",
+}
+_NO_DESKEW = "kiss-icp-no-deskew"
+# A peer's run: its poses as they are.
+_PEER = ("odometry.method=external", "mapping.method=off", "pose_graph.enabled=false")
 _ONLY_WITH_MAP = {
     "constant-velocity": "only predicts",
     "imu": "measures turns alone",
@@ -22,7 +31,8 @@ _NAME = re.compile(r"(?P<base>[a-z][a-z-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapp
 _MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
 _GRAMMAR = (
     f"{', '.join(_BASES)}; each with +map or +loam, with +graph, or with both as in learned+map+graph;"
-    " and kiss-icp@0.5 for a voxel size of 0.5 m"
+    " kiss-icp@0.5 for a voxel size of 0.5 m; and as they are "
+    f"{', '.join(PEERS)}"
 )
 
 
@@ -32,11 +42,12 @@ class Method:
 
     name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`
     settings: tuple[str, ...]  # of the configuration, `key.path=value`
+    peer: str | None = None  # the peer that estimates the poses, see `lidarslam.compare.peers`
 
     @property
     def needs_prior(self) -> bool:
         """Whether it takes its motions from a given trajectory."""
-        return "odometry.method=external" in self.settings
+        return self.peer is None and "odometry.method=external" in self.settings
 
 
 def parse_method(name: str) -> Method:
@@ -45,6 +56,8 @@ def parse_method(name: str) -> Method:
     Raises:
         ConfigError: no method is called so, or a part of it is not in this version.
     """
+    if name in PEERS:
+        return Method(name, _PEER, name)
     match = _NAME.fullmatch(name)
     if match is None or match["base"] not in _BASES:
         raise ConfigError(f"no method is called {name!r}; there are: {_GRAMMAR}")
@@ -57,13 +70,14 @@ def parse_method(name: str) -> Method:
             " a map"
         )
     voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)
+    deskew = ("odometry.kiss_icp.deskew=false",) if match["base"] == _NO_DESKEW else ()
     pose_graph = str(match["graph"] is not None).lower()
     switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
-    return Method(name, (f"odometry.method={odometry}", *voxel, *switches))
+    return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches))
 
 
 def _voxel_size_m(name: str, match: re.Match[str]) -> float:
-    if match["base"] != "kiss-icp":
+    if _BASES[match["base"]] != "kiss-icp":
         raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
     try:
         size_m = float(match["voxel"])
