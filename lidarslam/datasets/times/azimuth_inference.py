@@ -23,8 +23,8 @@ _NOT_USED = (
     " missing between; none are made from the azimuth."
 )
 _OFFERED = (
-    "The points have no times but are in the order of one turn; whether the sweeps are as measured or motion compensated"
-    " does not show. If they are as measured, --set reader.time_reference=azimuth gives the points times."
+    "The points have no times but are in the order of one turn; whether the sweeps are as measured or motion"
+    " compensated does not show. If they are as measured, --set reader.time_reference=azimuth gives the points times."
 )
 _NO_ORDER = "Times were to follow from the azimuth, but the points are not in the order of one turn."
 _TOO_SLOW = "Times were to follow from the azimuth, but the scans lie farther apart than a sweep lasts."
