@@ -26,7 +26,7 @@ from mapping_accuracy import make_simulation, print_row, without_odometry
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import ScanToMap

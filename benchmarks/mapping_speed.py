@@ -42,15 +42,14 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping import surfel_mapper
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.loam import mapper as loam_mapper
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.mapper import LoamMapper
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.surfels import sampling
-from lidarslam.mapping.tracking import attempts
+from lidarslam.mapping.tracking import attempts, surfel_mapper
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.pipeline.scan_stream import in_order
 
 # Method -> its mapper, and stage -> what is timed for it: the object that holds the function, and its name there.

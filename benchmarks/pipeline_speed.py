@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from mapping_accuracy import make_simulation, print_row
 
-from lidarslam.compare.methods import parse_method
+from lidarslam.compare.methods.names import parse_method
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.registry import open_recording

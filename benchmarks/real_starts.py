@@ -1,7 +1,7 @@
 """Every method from many starts of real recordings: does a run that ends well have the right trajectory?
 
     python benchmarks/real_starts.py 2011_09_26/2011_09_26_drive_0005_sync KITTI/sequences/04
-    python benchmarks/real_starts.py RECORDING --steps 1 2 3 5 --every 20 --methods learned+map CT-ICP --all
+    python benchmarks/real_starts.py RECORDING --steps 1 2 3 5 --every 20 --methods learned+map ct-icp --all
 
 Prints a Markdown table, a row for each recording, method and scan step. A run takes `--scans` scans from each start,
 every `--every`-th scan of the recording; near the end of the recording it takes what is left, if that is half of it.
@@ -30,10 +30,11 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from evalio_peers import PEERS, PeerError, run_peer
 from mapping_accuracy import print_row
+from peers import NAMES, run_peer
 
 from lidarslam.cli import main as lidarslam
+from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.recording import Recording
@@ -50,8 +51,8 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     "constant-velocity+loam": ("--odometry", "constant-velocity", "--mapping", "loam"),
     "KISS-ICP": ("--odometry", "kiss-icp", "--no-mapping"),
 }
-METHODS = (*OPTIONS, *PEERS)
-DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "CT-ICP")
+METHODS = (*OPTIONS, *NAMES)
+DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "ct-icp")
 REFERENCE = "KISS-ICP"
 
 

@@ -2,11 +2,11 @@
 
     python benchmarks/scan_rates.py
     python benchmarks/scan_rates.py RECORDING
-    python benchmarks/scan_rates.py RECORDING --worlds office street --motions car --steps 1 5 --methods CT-ICP
+    python benchmarks/scan_rates.py RECORDING --worlds office street --motions car --steps 1 5 --methods ct-icp
 
 Prints a Markdown table, a row for each recording and step: how far the sensor moves and turns from scan to scan (the
 95th percentile), and of each method the ATE in metres after SE(3) alignment with the scans that were lost and degraded.
-A failed peer is told on standard error, and its cell says so; CT-ICP itself knows no status.
+A failed peer is told on standard error, and its cell says so; ct-icp itself knows no status.
 
 Without recordings, all worlds are simulated. Simulated recordings go straight from the simulator into memory. At n
 times the scan interval every n-th scan is taken, each with all its points. `--scans` is for the single interval; of
@@ -20,7 +20,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from evalio_peers import PEERS, PeerError, run_peer
 from mapping_accuracy import (
     DEFAULT_METHODS,
     METHODS,
@@ -32,7 +31,9 @@ from mapping_accuracy import (
     recordings,
     true_trajectory,
 )
+from peers import NAMES, run_peer
 
+from lidarslam.compare.peers.interface import PeerError
 from lidarslam.core.geometry import rotation_angle
 from lidarslam.simulation.worlds.registry import WORLDS
 
@@ -49,7 +50,7 @@ def result(method: str, recorded: Recorded) -> str:
     try:
         return f"{errors_of(run_peer(method, recorded.scans), recorded).ate_rmse_m:.3f}"
     except PeerError as error:
-        print(error, file=sys.stderr, flush=True)
+        print(f"{method}: {error}", file=sys.stderr, flush=True)
         return "failed"
 
 
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
     add_simulation_arguments(parser, motions=("car", "tracked"))
     parser.add_argument("--steps", nargs="+", type=int, default=[1, 2, 3, 5], help="times the scan interval")
-    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *PEERS], default=[*DEFAULT_METHODS, "CT-ICP"])
+    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *NAMES], default=[*DEFAULT_METHODS, "ct-icp"])
     options = parser.parse_args(arguments)
     if not options.sources and not options.worlds:
         options.worlds = list(WORLDS)

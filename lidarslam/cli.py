@@ -12,22 +12,22 @@ import click
 
 from lidarslam.commands.compare import compare
 from lidarslam.commands.config import config
-from lidarslam.commands.datasets import datasets
 from lidarslam.commands.demo import demo
 from lidarslam.commands.evaluate import evaluate
 from lidarslam.commands.exports.bag import export_bag
 from lidarslam.commands.exports.geo import export_geo
 from lidarslam.commands.exports.grid import export_grid
 from lidarslam.commands.exports.mesh import export_mesh
-from lidarslam.commands.info import info
 from lidarslam.commands.live import live
 from lidarslam.commands.localise import localise
 from lidarslam.commands.merge import merge
 from lidarslam.commands.network.export import export
 from lidarslam.commands.network.train import train
+from lidarslam.commands.recordings.datasets import datasets
+from lidarslam.commands.recordings.info import info
+from lidarslam.commands.recordings.simulate import simulate
 from lidarslam.commands.run import run
 from lidarslam.commands.shared.terminal import EXIT_MENDABLE, note, prepare_log, verbose_option
-from lidarslam.commands.simulate import simulate
 from lidarslam.commands.view import view
 from lidarslam.core.errors import InputError, LidarSlamError
 from lidarslam.run.interruption import ended_like_interrupted

@@ -44,6 +44,9 @@ CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}}
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
     "kiss_icp": ("lidarslam.odometry.methods.kiss*",),
+    "kiss_slam": ("lidarslam.compare.peers.kiss_slam",),
+    "rko_lio": ("lidarslam.compare.peers.rko_lio",),
+    "small_gicp": ("lidarslam.compare.peers.small_gicp",),
     "gtsam": ("lidarslam.mapping.pose_graph.optimizer",),
     "rerun": ("lidarslam.viewer.rerun_*",),
     "click": ("lidarslam.cli", "lidarslam.commands.*"),
@@ -57,16 +60,20 @@ CONFINED = {
     "onnxscript": ("lidarslam.odometry.network.export",),
     "ouster": ("lidarslam.datasets.packets.ouster*",),
     "velodyne_decoder": ("lidarslam.datasets.packets.velodyne*",),
-    "evalio": ("lidarslam.datasets.published.evalio*",),
+    "evalio": (
+        "lidarslam.api.evalio_pipeline",
+        "lidarslam.compare.peers.evalio_pipelines",
+        "lidarslam.datasets.published.evalio*",
+    ),
     "pyarrow": ("lidarslam.datasets.published.argoverse2",),
-    "pyproj": ("lidarslam.storage.exports.projection",),
+    "pyproj": ("lidarslam.exports.projection",),
     "rosbags": (
         "lidarslam.datasets.*",
         "lidarslam.simulation.writers.*",
-        "lidarslam.storage.exports.*",
-        "lidarslam.run.live.*",
+        "lidarslam.exports.*",
+        "lidarslam.run.modes.live.*",
     ),
-    "cyclonedds": ("lidarslam.run.live.dds",),
+    "cyclonedds": ("lidarslam.run.modes.live.dds",),
 }
 HEAVY = {"torch", "open3d", "scipy", "gtsam", "kiss_icp", "rerun", "rosbags", "matplotlib", "numba"}
 MOST_LINES, MOST_ENTRIES = 250, 15
@@ -261,7 +268,8 @@ def size_breaches(modules: Modules) -> list[str]:
     """Files too long to be read at once, and folders with too many entries to be overlooked."""
     long = [f"{module.name} has {module.lines} lines" for module in modules.values() if module.lines > MOST_LINES]
     linked = {f"lidarslam.{package}" for package in LINKED}
-    entries = Counter(name.rpartition(".")[0] for name in modules if "." in name and name not in linked)
+    counted = (name for name in modules if "." in name and name not in {*linked, "lidarslam.__main__"})
+    entries = Counter(name.rpartition(".")[0] for name in counted)
     packages = [module.name for module in modules.values() if module.is_package]
     counts = {name: entries[name] + 1 for name in packages}  # with its __init__
     return long + [f"{name} has {count} entries" for name, count in counts.items() if count > MOST_ENTRIES]

@@ -25,8 +25,8 @@ from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.run.merge.merge import MergeOutcome
-from lidarslam.run.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.modes.merge.merge import MergeOutcome
+from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.summary.summary import WrittenMap
 
 
@@ -248,7 +248,7 @@ def test_merge_exits_as_run_does(
     entries = tuple(MergedRecording(f"room{n}", f"0{n}_room", "room", 5, 1.0, lost, joined or n == 1) for n in (1, 2))
     summary = MergeSummary(entries, 1.0, 100.0, None, WrittenMap(10, 0.1, 0), ())
     outcome = MergeOutcome(summary, (None, None), stopped)
-    monkeypatch.setattr("lidarslam.run.merge.merge.merge", lambda *_: outcome)
+    monkeypatch.setattr("lidarslam.run.modes.merge.merge.merge", lambda *_: outcome)
     assert (
         lidarslam("merge", recording, tmp_path, "--out", tmp_path / "out", "--reader", "scan-folder").exit_code
         == status

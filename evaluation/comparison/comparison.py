@@ -15,7 +15,7 @@ from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, metrics_j
 
 MethodStatus = Literal["ok", "lost", "stopped", "failed", "out of memory", "timed out", "not run"]
 """`lost`: finished, but tracking was lost on some scans. `stopped`: ended early with what there was. The last four:
-no result but the message; `not run`: the comparison was interrupted before."""
+no result but the message; `not run`: the comparison was interrupted before, or something is missing that it needs."""
 
 WHOLE: tuple[MethodStatus, ...] = ("ok", "lost")
 """Statuses of a run that came to the recording's end; of any other, the figures are of a part."""

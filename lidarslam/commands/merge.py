@@ -36,9 +36,9 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     recording a run directory with its poses in the common frame. A recording without a loop closure to the others is
     left out of the common map, and the exit status is 1.
     """
-    from lidarslam.run.merge.merge import merge as execute
-    from lidarslam.run.merge.parts import MergeRequest
-    from lidarslam.run.merge.text import format_merge
+    from lidarslam.run.modes.merge.merge import merge as execute
+    from lidarslam.run.modes.merge.parts import MergeRequest
+    from lidarslam.run.modes.merge.text import format_merge
     from lidarslam.run.progress import show_progress
     from lidarslam.storage.default_places import source_name
 

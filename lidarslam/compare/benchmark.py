@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from lidarslam.compare.methods import Method, parse_method
+from lidarslam.compare.methods.names import Method, parse_method
 from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
@@ -192,6 +192,7 @@ def _method(method: str | BenchmarkMethod) -> Method:
     try:
         if isinstance(method, str):
             return parse_method(method)
-        return Method(method.name, (*parse_method(method.method).settings, *method.set))
+        named = parse_method(method.method)
+        return replace(named, name=method.name, settings=(*named.settings, *method.set))
     except ConfigError as error:
         raise ConfigError(f"{error}; the benchmark's methods can be replaced with --methods") from None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lidarslam.compare.benchmark import fill_request, load_benchmark, make_recordings, require_data
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
-from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison

@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-from lidarslam.compare.method_run import COMMAND, finished_before, run_method
+from lidarslam.compare.methods.process import MethodRun
+from lidarslam.compare.methods.run import COMMAND, finished_before, obstacle, run_method
 from lidarslam.compare.metrics import measure
 from lidarslam.compare.plan import REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
 from lidarslam.compare.request import CompareRequest
@@ -13,7 +14,6 @@ from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.mean_table import mean_table
-from lidarslam.run.request import RunRequest
 from lidarslam.run.summary.machine import machine, versions
 from lidarslam.storage.comparison_folder import COMPARISON
 from lidarslam.storage.directory import RunDirectory
@@ -104,7 +104,7 @@ class _Turns:
         results = []
         for run in planned.runs:
             earlier = finished_before(run) if self.request.reuse and not self.interrupted else None
-            results.append(earlier or self._run(planned.name, run))
+            results.append(earlier or self._run(planned, run))
             self.narrator.tell(format_result(planned.name, results[-1], reused=earlier is not None))
         try:
             return measure(planned, results, with_maps=not self.interrupted)
@@ -112,13 +112,15 @@ class _Turns:
             self.interrupted = True
             return measure(planned, results, with_maps=False)
 
-    def _run(self, recording: str, run: RunRequest) -> MethodResult:
+    def _run(self, planned: PlannedRecording, run: MethodRun) -> MethodResult:
         if self.interrupted:
-            return MethodResult(run.out.name, "not run", _INTERRUPTED)
+            return MethodResult(run.name, "not run", _INTERRUPTED)
+        if (why := obstacle(run, planned.recording)) is not None:
+            return MethodResult(run.name, "not run", why)
         try:
-            with self.narrator.counting(f"{recording} {run.out.name}") as counter:
+            with self.narrator.counting(f"{planned.name} {run.name}") as counter:
                 result, self.interrupted = run_method(run, self.request.limits, counter, self.command)
         except KeyboardInterrupt:  # between two looks at the process
             self.interrupted = True
-            return MethodResult(run.out.name, "not run", _INTERRUPTED)
+            return MethodResult(run.name, "not run", _INTERRUPTED)
         return result

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lidarslam.compare.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
-from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison

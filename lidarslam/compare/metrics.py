@@ -80,7 +80,7 @@ def _measure_maps(planned: PlannedRecording, results: Sequence[MethodResult], no
         return list(results)
     if reference is None:
         return list(results)
-    folders = {run.out.name: run.out for run in planned.runs}
+    folders = {run.name: run.request.out for run in planned.runs}
     is_method = planned.entry.reference in folders  # whose world is not the reference map's
     return [_measure_map(result, folders[result.name], reference, is_method, notes) for result in results]
 

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidarslam.compare.method_run import PROCESS
+from lidarslam.compare.methods.process import MethodRun
+from lidarslam.compare.methods.run import PROCESS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
@@ -28,7 +29,7 @@ class PlannedRecording:
     source: Path
     entry: RecordingEntry
     recording: Recording
-    runs: tuple[RunRequest, ...]
+    runs: tuple[MethodRun, ...]
 
 
 def make_plan(request: CompareRequest) -> tuple[list[PlannedRecording], list[MissingRecording]]:
@@ -69,7 +70,8 @@ def _plan_recording(request: CompareRequest, entry: RecordingEntry, source: Path
         config = load_config(request.config_file, [*settings, *method.settings])
         folder = request.out / name / method.name
         prior = entry.prior if method.needs_prior else None
-        runs.append(RunRequest(source, folder, config, entry.start, entry.stop, entry.step, prior))
+        run = RunRequest(source, folder, config, entry.start, entry.stop, entry.step, prior)
+        runs.append(MethodRun(run, method.peer))
     return PlannedRecording(name, source, entry, recording, tuple(runs))
 
 
@@ -92,7 +94,7 @@ def _check_folder(request: CompareRequest, planned: list[PlannedRecording]) -> N
         raise OutputError(f"{out}: holds a run; name another directory for the comparison")
     if request.overwrite or request.reuse:
         return
-    folders = [run.out for recording in planned for run in recording.runs]
+    folders = [run.request.out for recording in planned for run in recording.runs]
     marks = [out / COMPARISON, *(folder / name for folder in folders for name in (PROCESS, files.CONFIG))]
     found = next((mark for mark in marks if mark.exists()), None)
     if found is not None:

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lidarslam.compare.methods import Method
+from lidarslam.compare.methods.names import Method
 from lidarslam.compare.supervised import Limits
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 

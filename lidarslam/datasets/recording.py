@@ -64,8 +64,8 @@ class RecordingInfo:
     topics: tuple[Topic, ...] = ()  # of a bag, all of them; `topic` is the one that is read
     fields: tuple[PointField, ...] = ()  # of the points as stored
     notes: tuple[str, ...] = ()  # further facts for the user, one sentence each
-    rate_is_assumed: bool = False  # the scans have no stamps, so that stamps and duration follow from `reader.rate_hz`
     imu: ImuSummary | None = None
+    rate_is_assumed: bool = False  # the scans have no stamps, so that stamps and duration follow from `reader.rate_hz`
 
     @property
     def first_stamp(self) -> float:

@@ -12,8 +12,8 @@ from lidarslam.core.state.stateful import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion

@@ -59,8 +59,8 @@ def _alignment() -> None:
 def _surfels() -> None:
     from lidarslam.mapping.config import MappingConfig
     from lidarslam.mapping.motion.prediction import Prior
-    from lidarslam.mapping.surfel_mapper import SurfelMapper
     from lidarslam.mapping.surfels.grid import SurfelGrid
+    from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
     mapper = SurfelMapper(MappingConfig())
     for scan in made_up_scans():

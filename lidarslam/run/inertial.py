@@ -15,7 +15,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.inertial.mounting import Mounting, MountingError, Turns, find_mounting
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
 logger = logging.getLogger(__name__)
 

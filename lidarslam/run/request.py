@@ -9,6 +9,7 @@ from typing import Any
 
 from lidarslam.config.settings import Config
 from lidarslam.core.plain_text import count
+from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.mapping.config import MapFormat
 from lidarslam.viewer.viewer import RerunMode
 
@@ -57,7 +58,7 @@ def describe_run(request: RunRequest) -> dict[str, Any]:
     """The section of config.yaml about what was run."""
     return {
         "version": version("lidarslam"),
-        "source": str(request.source.resolve()),
+        "source": str(resolved(request.source)),
         "start": request.start,
         "stop": request.stop,
         "step": request.step,

@@ -12,9 +12,8 @@ from lidarslam.core.state.stateful import Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import STAGES, ScanResult
+from lidarslam.storage.directory import SIGMAS
 
-# Standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
-SIGMAS = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
 COLUMNS = (
     "index",
     "stamp",

@@ -6,7 +6,7 @@ from itertools import count
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
-from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio
+from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio, resolved
 from lidarslam.datasets.registry import takes_sequence
 from lidarslam.storage.directory import TRAJECTORY_TUM
 from lidarslam.storage.unfinished import About
@@ -29,7 +29,7 @@ def source_name(source: Path, sequence: str | None = None) -> str:
 
     Of a folder with several sequences, followed by the one that is read; of evalio's, with that of the data set.
     """
-    source = source.resolve()
+    source = resolved(source)
     if is_of_evalio(source):
         return full_name(source).replace("/", "_")
     name = _TIMED.sub("", source.name if source.is_dir() else source.stem) or "recording"
@@ -66,7 +66,7 @@ def _is_of(run: Path, source: Path, sequence: str | None) -> bool:
         return False
     reader = about.description.get("reader")
     same_sequence = not isinstance(reader, dict) or reader.get("sequence") == sequence
-    return about.description.get("source") == str(source.resolve()) and same_sequence
+    return about.description.get("source") == str(resolved(source)) and same_sequence
 
 
 def _standing(run: Path) -> str | None:

@@ -49,6 +49,9 @@ FILES = (
     TRAJECTORY_PNG,
 )
 
+# Columns of scans.csv: standard deviations of the pose about the axes of the LiDAR and along them, radians and metres.
+SIGMAS = ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_x", "sigma_y", "sigma_z")
+
 # The checkpoint of a run that is at work or was stopped, see `lidarslam.storage.unfinished`.
 UNFINISHED = "unfinished"
 ABOUT = f"{UNFINISHED}/run.json"

@@ -10,7 +10,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.training.preparation import PreparedRecording
 
 

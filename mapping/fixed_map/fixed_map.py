@@ -9,7 +9,7 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 
-# Least edge of a surfel cell in spacings of the map's points. With fewer points in a cell and its neighbours normals are
+# Least edge of a surfel cell in spacings of the map's points. With fewer points in and around a cell normals are
 # uncertain: at 1.7, roll was found to be degenerate in an office.
 _CELLS_PER_SPACING = 3.5
 _SAMPLES = 2000
@@ -78,7 +78,7 @@ def _vertical(normals: FloatArray) -> FloatArray:
 
 
 def _parts(xy: FloatArray, edge_m: float, margin_m: float) -> list[NDArray[np.bool_]]:
-    """Which of the points (M, 2) are in each square of a grid, or within a margin of it; squares without any left out."""
+    """Which of the points (M, 2) are in each square of a grid or within a margin of it; none of empty squares."""
     low = xy.min(axis=0)
     extent = xy.max(axis=0) - low
     counts = np.maximum(1, np.ceil(extent / edge_m)).astype(int)

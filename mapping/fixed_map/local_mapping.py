@@ -7,9 +7,9 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER
 
 # Scans until the first search of the whole map, growth of the intervals, and the longest; and between nearby searches.

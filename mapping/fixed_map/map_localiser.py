@@ -16,7 +16,8 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.fixed_map.local_mapping import LocalMapping
-from lidarslam.mapping.fixed_map.place_search import Place, PlaceSearch, Regions, Search
+from lidarslam.mapping.fixed_map.place_search import Place, PlaceSearch, Search
+from lidarslam.mapping.fixed_map.regions import Regions
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
 from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
 from lidarslam.mapping.tracking.fit import Fit

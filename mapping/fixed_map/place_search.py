@@ -11,6 +11,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle, transform_points
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
+from lidarslam.mapping.fixed_map.regions import Regions
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.registration import Registration, register
@@ -22,12 +23,13 @@ from lidarslam.mapping.tracking.start_poses import best_starts, positions_around
 
 # Places around a supposed one that are tried: how far, in cells, and turned by how much.
 _NEAR_CELLS, _NEAR_YAW_DEG = 6.0, 20.0
-# Radius of the view from above and of the points that are registered, in median ranges; places that are tried.
-_RANGES, _PLACES = 3.0, 24
+# Radius of the view from above and of the points that are registered, in median ranges; places that are
+# tried, and how many of one heading.
+_RANGES, _PLACES, _PEAKS = 3.0, 32, 8
 # Points that are registered first, and the share of the best quality above which all points are.
-_FEW_POINTS, _LIKELY = 500, 0.7
+_FEW_POINTS, _LIKELY = 500, 0.5
 # Of these, that are registered.
-_PROMISING = 12
+_PROMISING = 16
 # A region of the map serves several places, farther than what the scans reach by so many times that; so many are kept.
 _SPARE, _REGIONS = 1.5, 8
 # Other scans that must fit, and what they may be off from where the recording's own motion puts them.
@@ -38,8 +40,9 @@ _ROUGH, _CHAINED = (np.deg2rad(20.0), 5.0), (np.deg2rad(3.0), 0.5)
 _STILL = 1e-3
 # What scans need, on average: inlier ratio, share of inliers among all points, directional support.
 _LEAST_RATIO, _LEAST_SHARE, _LEAST_SUPPORT = 0.8, 0.45, 0.6
-# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it.
-_RIVAL = 1.0 / 1.25
+# Places of lower quality than this share of the best one's are no rivals, nor those within cells and an angle of it. At
+# 0.8 a wrong place in a row of equal houses was taken.
+_RIVAL = 0.6
 _SAME_CELLS, _SAME_RAD = 4.0, np.deg2rad(20.0)
 
 
@@ -125,7 +128,7 @@ class PlaceSearch:
         starts: list[FloatArray] = []
         for view in self._map.views(cell_m):
             T = make_transform(view.R_level_world.T @ R_level_lidar, np.zeros(3))
-            starts.extend(view.find(points, T, reach_m, _PLACES))
+            starts.extend(view.find(points, T, reach_m, _PLACES, _PEAKS))
         return self.among(scans, starts)
 
     def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Search:
@@ -153,7 +156,7 @@ class PlaceSearch:
         return _decided(places)
 
     def _places(
-        self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float], regions: "Regions"
+        self, scan: KeptScan, starts: Sequence[FloatArray], sigmas: tuple[float, float], regions: Regions
     ) -> list[Place]:
         """The different places that a scan is registered at from poses (4, 4), by descending quality."""
         places: list[Place] = []
@@ -189,7 +192,7 @@ class PlaceSearch:
             starts.append(positions_around(T, up, _NEAR_CELLS * cell_m, 0.5 * _NEAR_CELLS * cell_m))
         return self.among(scans, list(best_starts(latest.keypoints, np.concatenate(starts), region)))
 
-    def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: "Regions") -> Place:
+    def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: Regions) -> Place:
         """A place with the fits of the other scans; none where one is off from where the motion puts it."""
         fits, last, T_map_last = list(place.fits), kept[0], place.T_map_lidar
         for scan in kept[1:]:
@@ -204,7 +207,7 @@ class PlaceSearch:
         return replace(place, fits=tuple(fits))
 
     def _register(
-        self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float], regions: "Regions"
+        self, scan: KeptScan, start: FloatArray, sigmas: tuple[float, float], regions: Regions
     ) -> Place | None:
         surfel_map = regions.around(start[:3, 3])
         points = scan.keypoints
@@ -237,28 +240,3 @@ def _is_off(start: FloatArray, found: FloatArray, motion: FloatArray, cell_m: fl
     off, way_m = inverse(start) @ found, float(np.linalg.norm(motion[:3, 3]))
     far = np.linalg.norm(off[:3, 3]) > _MOST_SHIFT_CELLS * cell_m + _MOST_SHIFT_SHARE * way_m
     return bool(far or rotation_angle(off) > _MOST_TURN)
-
-
-class Regions:
-    """Regions of the map as surfels.
-
-    Args:
-        fixed_map: the map.
-        cell_m: edge of the surfel cells.
-        reach_m: how far around a position a region must reach.
-        spare_m: how much farther it reaches, so that it serves other positions too.
-        kept: how many are kept.
-    """
-
-    def __init__(self, fixed_map: FixedMap, cell_m: float, reach_m: float, spare_m: float, kept: int = 1) -> None:
-        self._map, self.cell_m, self._reach_m, self._spare_m, self._kept = fixed_map, cell_m, reach_m, spare_m, kept
-        self._drawn: list[tuple[FloatArray, SurfelMap]] = []
-
-    def around(self, position: FloatArray) -> SurfelMap:
-        """A region with all that is within reach of a position (3,)."""
-        for centre, region in self._drawn:
-            if np.linalg.norm(centre - position) < self._spare_m:
-                return region
-        region = self._map.region(position, self._reach_m + self._spare_m, self.cell_m)
-        self._drawn = [*self._drawn, (position.copy(), region)][-self._kept :]
-        return region

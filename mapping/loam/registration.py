@@ -6,8 +6,13 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, orthonormalize, transform_points
-from lidarslam.mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
-from lidarslam.mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
+from lidarslam.mapping.least_squares.gauss_newton import (
+    NormalEquations,
+    gauss_newton,
+    geman_mcclure,
+    point_to_plane_jacobian,
+)
 from lidarslam.mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from lidarslam.mapping.loam.features import Features
 from lidarslam.mapping.motion.prediction import MotionState

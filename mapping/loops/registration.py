@@ -10,7 +10,12 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
-from lidarslam.mapping.gauss_newton import NormalEquations, gauss_newton, geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.least_squares.gauss_newton import (
+    NormalEquations,
+    gauss_newton,
+    geman_mcclure,
+    point_to_plane_jacobian,
+)
 from lidarslam.mapping.loops.sparse_submap import LINE, SparseSubmap
 
 # Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
-from lidarslam.mapping.degeneracy import find_degeneracy
-from lidarslam.mapping.gauss_newton import NormalEquations
+from lidarslam.mapping.least_squares.degeneracy import find_degeneracy
+from lidarslam.mapping.least_squares.gauss_newton import NormalEquations
 from lidarslam.mapping.loops.registration import (
     CORRELATION,
     GUESS_SIGMAS,

@@ -11,8 +11,8 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from lidarslam.mapping.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
-from lidarslam.mapping.gauss_newton import geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
+from lidarslam.mapping.least_squares.gauss_newton import geman_mcclure, point_to_plane_jacobian
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.surfels.sampling import MIN_CORRESPONDENCES

@@ -15,7 +15,7 @@ from lidarslam.core.geometry import FloatArray, make_transform, skew
 from lidarslam.core.thinning import one_per_cell
 
 _YAWS = 72
-# Correlation peaks that are kept for each yaw, and their least distance, in cells and radians.
+# Correlation peaks that are kept for each yaw as a rule, and their least distance, in cells and radians.
 _PEAKS = 3
 _APART = 3.0
 _APART_RAD = np.deg2rad(12.0)
@@ -51,7 +51,9 @@ class BirdsEyeMap:
         corner = level[:, :2].min(axis=0) if len(level) else np.zeros(2)
         return cls(R_level_world, level, corner, cell_m, _columns(level, corner, cell_m))
 
-    def find(self, points: FloatArray, T_world_lidar: FloatArray, reach_m: float, most: int) -> FloatArray:
+    def find(
+        self, points: FloatArray, T_world_lidar: FloatArray, reach_m: float, most: int, peaks_per_yaw: int = _PEAKS
+    ) -> FloatArray:
         """Poses (K, 4, 4) of a scan by descending correlation, with the roll and pitch of a given pose.
 
         Args:
@@ -59,6 +61,7 @@ class BirdsEyeMap:
             T_world_lidar: (4, 4), of which only the rotation counts.
             reach_m: radius of the scan's image.
             most: largest K.
+            peaks_per_yaw: correlation peaks that are kept for each yaw; more where places are alike.
         """
         level = points @ (self.R_level_world @ T_world_lidar[:3, :3]).T
         level = level[np.einsum("ij,ij->i", level[:, :2], level[:, :2]) < reach_m**2]
@@ -73,7 +76,10 @@ class BirdsEyeMap:
             if norm == 0.0:
                 return np.empty((0, 4, 4))
             correlation = irfft2(spectrum * np.conj(rfft2(image, s=(size, size))), s=(size, size)) / norm
-            peaks += [(score, yaw, self._position(shift, size, reach_m)) for score, shift in _peaks(correlation)]
+            peaks += [
+                (score, yaw, self._position(shift, size, reach_m))
+                for score, shift in _peaks(correlation, peaks_per_yaw)
+            ]
         chosen = _apart(sorted(peaks, key=lambda peak: -peak[0]), _APART * self.cell_m, most)
         return np.array([self.pose_at(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
 
@@ -138,12 +144,12 @@ def _image(level: FloatArray, reach_m: float, cell_m: float) -> FloatArray:
     return image
 
 
-def _peaks(correlation: FloatArray) -> list[tuple[float, NDArray[np.intp]]]:
+def _peaks(correlation: FloatArray, count: int) -> list[tuple[float, NDArray[np.intp]]]:
     """The highest few values that are apart, each with its cell (2,)."""
     found = []
     size, reach = len(correlation), int(_APART)
     around = np.arange(-reach, reach + 1)
-    for _ in range(_PEAKS):
+    for _ in range(count):
         i, j = np.unravel_index(int(correlation.argmax()), correlation.shape)
         found.append((float(correlation[i, j]), np.array([i, j], dtype=np.intp)))
         correlation[np.ix_((i + around) % size, (j + around) % size)] = -np.inf

@@ -101,7 +101,7 @@ class KissOdometry:
             T_map_lidar, points_used = self._worker.register(scan.points, offsets)
         except (EOFError, OSError):
             return self._predict(scan.stamp, self._bury_worker())
-        last, self._last = self._last, _TimedPose(self._pose_time(scan.stamp, offsets), T_map_lidar)
+        last, self._last = self._last, _TimedPose(self._pose_time(scan, offsets), T_map_lidar)
         self._registered += 1
         if last is None:
             return self._begin(_TimedPose(scan.stamp, T_map_lidar))
@@ -127,17 +127,16 @@ class KissOdometry:
             return np.empty(0)
         return scan.time_offsets
 
-    def _pose_time(self, stamp: float, offsets: FloatArray) -> float:
+    def _pose_time(self, scan: Scan, offsets: FloatArray) -> float:
         """The instant of KISS-ICP's next pose.
 
         It moves every point to the end of the sweep with the motion before. The first two scans come before any
-        motion is known and stay smeared over the sweep: what is registered then is the sweep's middle.
+        motion is known and stay smeared over the sweep, as all do without deskewing: what is registered then is the
+        sweep's middle.
         """
-        if not len(offsets):
-            return stamp
-        if self._registered < 2:
-            return stamp + 0.5 * float(offsets.min() + offsets.max())
-        return stamp + float(offsets.max())
+        if self._registered < 2 or not len(offsets):
+            return scan.stamp + scan.middle_offset_s
+        return scan.stamp + float(offsets.max())
 
     def _motion(self, last: _TimedPose, pose: _TimedPose, stamp: float) -> FloatArray:
         """T_prev_curr between the last two stamps, at constant velocity between the child's last two poses."""

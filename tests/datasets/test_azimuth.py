@@ -29,7 +29,12 @@ def sweep(first_s, compensated=False, direction=-1.0, start=2.2, speed=SPEED, tu
     if compensated:
         heading_0, position_0 = _pose(np.full(len(times), first_s + 0.5 * PERIOD_S), speed, turn_rate)
         points = _turned(_turned(points, heading) + position - position_0, -heading_0)
-    chosen = np.argsort(ring, kind="stable") if order == "rings" else np.flatnonzero(column % 7 != 2)
+    orders = {
+        "firing": np.arange(len(ring)),
+        "rings": np.argsort(ring, kind="stable"),
+        "none": np.random.default_rng(0).permutation(len(ring)),
+    }
+    chosen = orders[order][column[orders[order]] % 7 != 2]
     return points[chosen], times[chosen], ring[chosen]
 
 
@@ -86,13 +91,14 @@ def test_places_without_a_return_have_no_time():
     assert np.isfinite(found[2::5]).all()
 
 
-def test_a_recording_as_measured_gets_times(tmp_path):
-    recording = open_recording(record(tmp_path / "raw"))
+@pytest.mark.parametrize("order", ["firing", "rings"])
+def test_a_recording_as_measured_gets_times(tmp_path, order):
+    recording = open_recording(record(tmp_path / "raw", order=order))
     info = recording.describe()
     assert (info.point_time.field, info.point_time.unit, info.point_time.reference) == ("azimuth", "s", "relative")
     assert any("follow from the azimuth" in note for note in info.notes)
     assert recording.warnings == ()
-    _, times, _ = sweep(0.0)
+    _, times, _ = sweep(0.0, order=order)
     for scan in recording.scans(0, None, 7):
         np.testing.assert_allclose(scan.time_offsets, times - times.min(), atol=2 * PERIOD_S / COLUMNS)
 
@@ -103,8 +109,9 @@ def test_a_recording_as_measured_gets_times(tmp_path):
         {"compensated": True},
         {"every": 2},
         {"every": 3, "stamps": False},
-        {"order": "rings"},
         {"order": "rings", "compensated": True},
+        {"order": "rings", "rings": False},
+        {"order": "none"},
     ],
     ids=str,
 )
@@ -126,8 +133,8 @@ def test_at_rest_times_are_offered(tmp_path):
 
 def test_times_that_cannot_be_had_are_a_warning(tmp_path):
     asked = ReaderConfig(time_reference="azimuth")
-    ring_by_ring = open_recording(record(tmp_path / "rings", order="rings"), asked)
-    assert any("not in the order" in said for said in ring_by_ring.warnings)
+    shuffled = open_recording(record(tmp_path / "rings", order="none"), asked)
+    assert any("not in the order" in said for said in shuffled.warnings)
     every_fifth = open_recording(record(tmp_path / "fifth", every=5), asked)
     assert any("farther apart" in said for said in every_fifth.warnings)
 

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.compare.benchmark import Benchmark, fill_request, load_benchmark
-from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest
 from lidarslam.core.errors import ConfigError
 from lidarslam.simulation.motion.carriers import CARRIERS

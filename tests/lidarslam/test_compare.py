@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
 from lidarslam.compare.comparison import CompareOutcome, Counter, Narrator, compare
-from lidarslam.compare.methods import parse_methods
+from lidarslam.compare.methods.names import parse_methods
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison
@@ -43,7 +43,7 @@ if name == "kiss-icp@4": raise RuntimeError("no such thing")
 if name == "kiss-icp@5": raise MemoryError
 if name == "kiss-icp@6": os.kill(os.getpid(), 9)
 if name == "kiss-icp@7": print("lidarslam: the recording is damaged", file=sys.stderr); sys.exit(1)
-os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.method_process", *sys.argv[1:]])
+os.execv(sys.executable, [sys.executable, "-m", "lidarslam.compare.methods.process", *sys.argv[1:]])
 """
 
 

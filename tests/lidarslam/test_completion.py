@@ -21,7 +21,7 @@ def completed(line: str, shell: type[ShellComplete] = BashComplete) -> list[str]
         ("run --res", ["plain --resume"]),
         ("run --odometry k", ["plain kiss-icp"]),
         ("run --mapping ", ["plain surfels", "plain loam", "plain off"]),
-        ("run x --reader kitti", ["plain kitti-odometry", "plain kitti-raw"]),
+        ("run x --reader kitti", ["plain kitti-odometry", "plain kitti-360", "plain kitti-raw"]),
         ("simulate --world t", ["plain tunnel", "plain terrace"]),
         ("simulate --sensor hdl-3", ["plain hdl-32e"]),
         ("simulate --motion l", ["plain legged"]),

@@ -9,7 +9,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
+from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import default_places
 from lidarslam.storage.default_places import latest_run, new_place, source_name, unfinished_run
 from lidarslam.storage.unfinished import About, Unfinished
@@ -206,3 +208,13 @@ def test_results_are_named_after_sequence_and_data_set() -> None:
     assert source_name(Path("disk/area/MathildaAVE"), "MathildaAVE") == "MathildaAVE"
     assert source_name(Path("disk/site.bag"), "04") == "site"
     assert source_name(Path("evalio_data/hilti_2022/basement_2")) == "hilti_2022_basement_2"
+
+
+def test_a_link_to_a_sequence_of_evalio_keeps_its_name() -> None:
+    Path("disk/Hilti").mkdir(parents=True)
+    Path("evalio_data").mkdir()
+    link = Path("evalio_data/hilti_2022")
+    link.symlink_to(Path("disk/Hilti").absolute())
+    assert source_name(link / "basement_2") == "hilti_2022_basement_2"
+    described = describe_run(RunRequest(link / "basement_2", Path("run"), Config()))
+    assert described["source"] == str(Path("evalio_data/hilti_2022/basement_2").absolute())

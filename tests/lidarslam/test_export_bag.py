@@ -18,9 +18,9 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
+from lidarslam.exports.run_scans import read_run_scans
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.storage.exports.run_scans import read_run_scans
 
 SCANS = 6
 FIRST_STAMP = 1_700_000_000.123456789

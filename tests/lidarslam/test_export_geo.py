@@ -16,9 +16,9 @@ from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
+from lidarslam.exports.ros_messages import POINT_CLOUD2, TF_MESSAGE, RosMessages, nanoseconds
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.storage.exports.ros_messages import POINT_CLOUD2, TF_MESSAGE, RosMessages, nanoseconds
 
 pyproj = pytest.importorskip("pyproj")
 

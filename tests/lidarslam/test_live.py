@@ -20,13 +20,15 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
+from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.pipeline.estimates import Localised, SweepMotion
-from lidarslam.run.live.clouds import CloudDecoder
-from lidarslam.run.live.discovery import find_topic
-from lidarslam.run.live.incoming import IncomingQueue, Received
-from lidarslam.run.live.messages import TRANSFORMS_TYPE, serialize_transform
-from lidarslam.run.live.publishing import PosePublisher, chain
-from lidarslam.run.live.statistics import LiveStatistics, count_missing
+from lidarslam.run.modes.live.clouds import CloudDecoder
+from lidarslam.run.modes.live.discovery import find_topic
+from lidarslam.run.modes.live.incoming import IncomingQueue, Received
+from lidarslam.run.modes.live.messages import serialize_transform
+from lidarslam.run.modes.live.publishing import PosePublisher
+from lidarslam.run.modes.live.statistics import LiveStatistics, count_missing
 
 LIDARSLAM = [sys.executable, "-m", "lidarslam"]
 PLAY = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "play_bag.py")]
@@ -85,7 +87,7 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     """With constant velocity a run knows no more of a scan than a live one: the poses are the same, bit for bit."""
-    from lidarslam.run.live.dds import DdsNode, PublishedTopic
+    from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
 
     method = ["--odometry", "constant-velocity", "--no-report"]
     live, ran = tmp_path / "live", tmp_path / "ran"
@@ -123,7 +125,7 @@ def test_interrupted_it_writes_what_came(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
     """The poses until then are those of the robot, whose static transforms were published before."""
-    from lidarslam.run.live.dds import DdsNode, PublishedTopic
+    from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
 
     out, T_base_lidar = tmp_path / "live", make_transform(np.diag([-1.0, -1.0, 1.0]), [1.0, 0.0, 2.0])
     node = DdsNode(domain)
@@ -254,7 +256,7 @@ class Topic:
 
 
 def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lidarslam.run.live.discovery._SETTLED_S", 0.0)
+    monkeypatch.setattr("lidarslam.run.modes.live.discovery._SETTLED_S", 0.0)
     clouds = Topic("/points")
     seen = iter([[], [Topic("/scan", "sensor_msgs/msg/LaserScan")], [clouds]])
     assert find_topic(lambda: next(seen, [clouds]), None, 0) is clouds
@@ -265,7 +267,7 @@ def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatc
 
 
 def test_while_it_waits_it_says_what_it_sees(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr("lidarslam.run.live.discovery._PATIENCE_S", 0.0)
+    monkeypatch.setattr("lidarslam.run.modes.live.discovery._PATIENCE_S", 0.0)
     seen = iter([[Topic("/rear")], [Topic("/rear")], [Topic("/rear"), Topic("/front")]])
     assert find_topic(lambda: next(seen), "/front", 3).name == "/front"
     assert caplog.messages == ["waiting for /front in domain 3; clouds are published on /rear"]
@@ -317,20 +319,14 @@ def test_covariances_are_those_of_errors_along_the_fixed_axes(rng: np.random.Gen
 
 def test_static_transforms_are_chained_in_both_directions() -> None:
     a, b = exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])), exp(np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0]))
-    known = [("base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", b)]
-    found = chain(known, "base_link", "os_lidar")
+    edges: Edges = {}
+    for parent, child, T in (("/base_link", "mast", a), ("os_lidar", "os_sensor", b), ("mast", "os_sensor", a)):
+        add_edges(edges, serialize_transform(0, parent, child, T), ros2=True)
+    add_edges(edges, b"damaged", ros2=True)
+    found = chain(edges, "base_link", "os_lidar")
     assert found is not None
-    np.testing.assert_allclose(found, a @ b @ inverse(b), atol=1e-12)
-    assert chain(known, "base_link", "camera") is None
-
-
-def test_a_transform_survives_its_message() -> None:
-    from lidarslam.run.live.messages import read_transforms
-
-    T = exp(np.array([0.5, -0.4, 0.3, 1.0, 2.0, 3.0]))
-    ((parent, child, read),) = read_transforms(serialize_transform(0, "base_link", "os", T))
-    assert (parent, child) == ("base_link", "os")
-    np.testing.assert_allclose(read, T, atol=1e-12)
+    np.testing.assert_allclose(found, a @ a @ inverse(b), atol=1e-12)
+    assert chain(edges, "base_link", "camera") is None
 
 
 def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:

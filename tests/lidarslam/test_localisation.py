@@ -15,7 +15,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.loam.mapper import LoamMapper
-from lidarslam.mapping.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion, Odometry
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.constant_velocity import ConstantVelocity

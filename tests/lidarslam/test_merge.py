@@ -21,9 +21,9 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.run.merge.merge import MergeOutcome, merge
-from lidarslam.run.merge.parts import MergeRequest
-from lidarslam.run.merge.text import format_merge
+from lidarslam.run.modes.merge.merge import MergeOutcome, merge
+from lidarslam.run.modes.merge.parts import MergeRequest
+from lidarslam.run.modes.merge.text import format_merge
 from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion
@@ -281,7 +281,7 @@ def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path
 
 KILLED_MERGE = """
 import os, signal, sys
-import lidarslam.run.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph, odometry.methods.kiss
+import lidarslam.run.modes.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph, odometry.methods.kiss
 from lidarslam.cli import main
 
 count = 0

@@ -13,8 +13,8 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import MappingConfig, TrackingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
 Path = Callable[[FloatArray], FloatArray]
 VELOCITY = np.array([0.0, 0.01, 0.3, 0.8, 0.05, 0.0])  # of the drive

@@ -15,8 +15,8 @@ from lidarslam.mapping.global_map import global_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.motion.prediction import OdometryNoise, Prior, ProcessNoise
 from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
-from lidarslam.mapping.surfel_mapper import SurfelMapper
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
 ThroughDisk = Callable[[State], Saved]
 CONFIG = MappingConfig(keypoints=600)

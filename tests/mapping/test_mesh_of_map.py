@@ -13,7 +13,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.mapping.products.mesh import reconstruct
+from lidarslam.mapping.global_map.products.mesh import reconstruct
 
 RADIUS_M = 3.0
 

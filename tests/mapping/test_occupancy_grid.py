@@ -12,8 +12,8 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import write_tum
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.mapping.products.ground import find_ground
-from lidarslam.mapping.products.occupancy_grid import (
+from lidarslam.mapping.global_map.products.ground import find_ground
+from lidarslam.mapping.global_map.products.occupancy_grid import (
     FREE,
     OCCUPIED,
     UNKNOWN,

@@ -33,10 +33,10 @@ def export_bag(run: Path, out: Path, clouds: bool, frame: str, overwrite: bool) 
 
     RUN is a run directory. The bag opens in Foxglove and RViz, and plays with ros2 bag.
     """
+    from lidarslam.exports.bag import SUFFIXES, export_bag
+    from lidarslam.exports.new_file import require_new
+    from lidarslam.exports.run_scans import read_run_scans
     from lidarslam.run.progress import show_count
-    from lidarslam.storage.exports.bag import SUFFIXES, export_bag
-    from lidarslam.storage.exports.new_file import require_new
-    from lidarslam.storage.exports.run_scans import read_run_scans
 
     if out.suffix not in SUFFIXES:
         raise click.UsageError(f"--out {out}: expected a file .mcap, .db3 or .bag, or a folder without a suffix")

@@ -18,7 +18,7 @@ def export_geo(run: Path, out: Path, overwrite: bool) -> None:
     RUN is a run directory of a KITTI raw drive, or of a bag with sensor_msgs/NavSatFix. The trajectory is aligned with
     the GNSS track as a rigid body; its shape stays.
     """
-    from lidarslam.storage.exports.geo import export_geo, georeference
+    from lidarslam.exports.geo import export_geo, georeference
 
     for line in export_geo(georeference(run), out, overwrite):
         say(line)

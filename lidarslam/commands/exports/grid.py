@@ -50,9 +50,9 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, overwrite: boo
 
     RUN is a run directory. Obstacles are points between two heights above the local ground.
     """
-    from lidarslam.storage.exports.grid import export_grid
-    from lidarslam.storage.exports.grid_files import require_yaml
-    from lidarslam.storage.exports.new_file import require_new
+    from lidarslam.exports.grid import export_grid
+    from lidarslam.exports.grid_files import require_yaml
+    from lidarslam.exports.new_file import require_new
 
     require_yaml(out)
     for file in (out, out.with_suffix(".pgm")):

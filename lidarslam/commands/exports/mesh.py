@@ -20,8 +20,8 @@ def export_mesh(run: Path, out: Path, cell_m: float | None, overwrite: bool) -> 
 
     RUN is a run directory. Poisson reconstruction, without the surface where the map has no points.
     """
-    from lidarslam.storage.exports.mesh import SUFFIXES, export_mesh
-    from lidarslam.storage.exports.new_file import require_new
+    from lidarslam.exports.mesh import SUFFIXES, export_mesh
+    from lidarslam.exports.new_file import require_new
 
     if out.suffix not in SUFFIXES:
         raise click.UsageError(f"--out {out}: expected a file {', '.join(SUFFIXES)}")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lidarslam.compare.assessment.error_cloud import check_error_files, write_errors
+from lidarslam.compare.assessment.evo_files import write_evo_files
 from lidarslam.compare.assessment.inputs import Estimate, Poses, pair, read_estimate, read_reference, recording_truth
 from lidarslam.compare.assessment.map_evaluation import MapEvaluation, MapOptions, evaluate_map
 from lidarslam.compare.assessment.reference_map import find_reference_map, load_reference_map
@@ -37,6 +38,7 @@ class EvaluateRequest:
     errors_clip_m: float = DEFAULT_CLIP_M  # distance of the brightest colour
     out: Path | None = None  # file for the figures; None: metrics.json of the run, and nothing of a bare trajectory
     needs_reference: bool = True  # whether it is an error that there is no reference
+    evo: Path | None = None  # folder for the errors as files of evo; None: nowhere
     write: bool = True  # whether the figures are written
     report: bool = False  # whether the page of the run is drawn again, with the errors; not if the figures go elsewhere
 
@@ -92,6 +94,8 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
         entropy = map_entropy(estimate.map_points())
     out = request.out or (None if estimate.run is None or not request.write else estimate.run / files.METRICS)
     written = [*([] if out is None else [out]), *request.errors]
+    if request.evo is not None:
+        written += _write_evo(request.evo, request.run, metrics)
     label = None if reference is None else reference.label
     evaluation = Evaluation(estimate, label, metrics, compared, entropy, notes, written)
     if out is not None:
@@ -102,6 +106,12 @@ def evaluate(request: EvaluateRequest) -> Evaluation:
     if request.report and estimate.run is not None and request.out is None:
         _draw_report(request, estimate.run, evaluation, trajectory if in_camera else None)
     return evaluation
+
+
+def _write_evo(folder: Path, run: Path | Trajectory, metrics: TrajectoryMetrics | None) -> list[Path]:
+    if metrics is None:
+        raise InputError("--evo saves the errors of a trajectory, and there is no reference for it")
+    return write_evo_files(folder, "estimate" if isinstance(run, Trajectory) else run.resolve().stem, metrics)
 
 
 def _draw_report(request: EvaluateRequest, run: Path, evaluation: Evaluation, compared: Trajectory | None) -> None:

@@ -130,7 +130,9 @@ CATALOGUE: tuple[DataSet, ...] = (
         "--sequence NAME",
     ),
     # The IMU of Boreas is published without gravity.
-    _of_evalio("boreas", "Boreas", "Velodyne VLS-128", _GNSS, f"{_PYBOREAS}/DATA_REFERENCE.md", imu=False),
+    _of_evalio(
+        "boreas", "Boreas", "Velodyne VLS-128", _GNSS, f"{_PYBOREAS}/DATA_REFERENCE.md", False, "written sample"
+    ),
     _of_evalio("boreas_rt", "Boreas Road Trip", "Velodyne VLS-128", _GNSS, f"{_PYBOREAS}/DATA_RT_REFERENCE.md"),
     _of_evalio(
         "botanic_garden", "BotanicGarden", "Velodyne VLP-16", _SURVEY, "https://github.com/robot-pesg/BotanicGarden"
@@ -142,9 +144,17 @@ CATALOGUE: tuple[DataSet, ...] = (
         "Ouster OS0-128",
         "total station, positions alone",
         "https://projects.asl.ethz.ch/datasets/enwide",
+        tried="written sample",
     ),
     _of_evalio("fomo", "FoMo", "RoboSense Ruby Plus", "GNSS, positions alone", "https://fomo.norlab.ulaval.ca/"),
-    _of_evalio("helipr", "HeLiPR", "Ouster OS2-128", _GNSS, "https://sites.google.com/view/heliprdataset/"),
+    _of_evalio(
+        "helipr",
+        "HeLiPR",
+        "Ouster OS2-128",
+        _GNSS,
+        "https://sites.google.com/view/heliprdataset/",
+        tried="written sample",
+    ),
     _of_evalio(
         "hilti_2022",
         "Hilti SLAM Challenge 2022",
@@ -153,7 +163,14 @@ CATALOGUE: tuple[DataSet, ...] = (
         "https://hilti-challenge.com/dataset-2022.html",
         tried="written sample",
     ),
-    _of_evalio("multi_campus", "MCD", "Ouster OS1-128, OS1-64", _SURVEY, "https://mcdviral.github.io/"),
+    _of_evalio(
+        "multi_campus",
+        "MCD",
+        "Ouster OS1-128, OS1-64",
+        _SURVEY,
+        "https://mcdviral.github.io/",
+        tried="written sample",
+    ),
     _of_evalio("newer_college_2020", "Newer College 2020", "Ouster OS1-64", _SURVEY, f"{_OXFORD}/stereo-cam/"),
     _of_evalio(
         "newer_college_2021",

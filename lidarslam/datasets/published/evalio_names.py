@@ -33,6 +33,12 @@ def is_of_evalio(source: Path) -> bool:
     return data_set in DATA_SETS or (bool(os.environ.get("EVALIO_CUSTOM")) and data_set in sequences())
 
 
+def resolved(source: Path) -> Path:
+    """The absolute path; links are resolved, but for one that would hide DATASET/SEQUENCE."""
+    path = source.resolve()
+    return source.absolute() if is_of_evalio(source) and not is_of_evalio(path) else path
+
+
 def full_name(source: Path) -> str:
     """DATASET/SEQUENCE of a folder."""
     return f"{source.absolute().parent.name}/{source.name}"

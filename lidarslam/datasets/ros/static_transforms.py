@@ -1,4 +1,4 @@
-"""Fixed transforms between the frames of a bag, from its messages tf2_msgs/TFMessage on /tf_static."""
+"""Fixed transforms between frames, from the messages tf2_msgs/TFMessage on /tf_static, of a bag or others."""
 
 from contextlib import suppress
 from typing import Any
@@ -18,7 +18,26 @@ Edges = dict[str, dict[str, FloatArray]]
 
 def static_transform(bag: BagFile, target: str, source: str) -> FloatArray | None:
     """T_target_source (4, 4) along the chain of fixed transforms between two frames; None where there is no chain."""
-    edges = _edges(bag)
+    edges: Edges = {}
+    for topic in bag.topics:
+        if topic.message_type == TRANSFORMS_TYPE and topic.name.split("/")[-1] == _TOPIC:
+            for message in bag.messages(topic):
+                add_edges(edges, message.raw, bag.ros2)
+    return chain(edges, target, source)
+
+
+def add_edges(edges: Edges, raw: bytes, ros2: bool) -> None:
+    """Add the transforms of a serialised message, as far as it is sound."""
+    with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
+        for stamped in deserialize(raw, TRANSFORMS_TYPE, ros2).transforms:
+            parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+            T_parent_child = _matrix(stamped.transform)
+            edges.setdefault(parent, {})[child] = T_parent_child
+            edges.setdefault(child, {})[parent] = inverse(T_parent_child)
+
+
+def chain(edges: Edges, target: str, source: str) -> FloatArray | None:
+    """T_target_source (4, 4) along the edges; None where they do not connect the two."""
     reached = {_name(target): np.eye(4)}
     waiting = [_name(target)]
     while waiting:
@@ -28,21 +47,6 @@ def static_transform(bag: BagFile, target: str, source: str) -> FloatArray | Non
                 reached[other] = reached[frame] @ T_frame_other
                 waiting.append(other)
     return reached.get(_name(source))
-
-
-def _edges(bag: BagFile) -> Edges:
-    edges: Edges = {}
-    for topic in bag.topics:
-        if topic.message_type != TRANSFORMS_TYPE or topic.name.split("/")[-1] != _TOPIC:
-            continue
-        for message in bag.messages(topic):
-            with suppress(Exception):  # damaged bytes make rosbags raise nearly anything; the others stand
-                for stamped in deserialize(message.raw, TRANSFORMS_TYPE, bag.ros2).transforms:
-                    parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
-                    T_parent_child = _matrix(stamped.transform)
-                    edges.setdefault(parent, {})[child] = T_parent_child
-                    edges.setdefault(child, {})[parent] = inverse(T_parent_child)
-    return edges
 
 
 def _name(frame_id: str) -> str:

@@ -17,6 +17,9 @@ _BLOCKS, _FEWEST_IN_BLOCK = 180, 8
 # Length of a block's mean direction: 1 where all its points have one azimuth; 0.95 is about +-18 degrees.
 _CONCENTRATED, _SHARE = 0.95, 0.95
 _TURN_DEG = (340.0, 385.0)
+# Ring by ring: how much of a turn may lack returns, the part of the points that lies in whole rings, and that of the
+# points before what is taken for the start.
+_MISSING_DEG, _SHARE_IN_RINGS, _FIRST = 60.0, 0.7, 1e-3
 # Lasers of one firing differ in azimuth by at most this.
 _WIDEST_FIRING_DEG = 12.0
 # Of the seam: its width at the end and at the start of a sweep, the largest angle between two points that are
@@ -45,11 +48,19 @@ class SweepOrder:
 def turned_angles(points: FloatArray, rings: NDArray[np.generic] | None = None) -> FloatArray | None:
     """Angle in degrees by which the sensor had turned since the first point, for returns (N, 3) in their stored order.
 
-    The mean azimuth of blocks of consecutive points has to run round the circle once, in either direction. Rings
-    remove the constant angles between the lasers of one firing.
+    The points stand in the order of firing, or, where there are rings, ring by ring with each in this order.
 
     Returns:
-        (N,) from 0; None where the points are not in the order of firing of one turn.
+        (N,) from 0; None where the points are in another order, or not of one turn.
+    """
+    turned = _one_after_the_other(points, rings)
+    return _ring_by_ring(points, rings) if turned is None and rings is not None else turned
+
+
+def _one_after_the_other(points: FloatArray, rings: NDArray[np.generic] | None) -> FloatArray | None:
+    """The mean azimuth of blocks of consecutive points has to run round the circle once, in either direction.
+
+    Rings remove the constant angles between the lasers of one firing.
     """
     if len(points) < _BLOCKS * _FEWEST_IN_BLOCK:
         return None
@@ -69,6 +80,38 @@ def turned_angles(points: FloatArray, rings: NDArray[np.generic] | None = None) 
         aside[rings == ring] -= np.median(aside[rings == ring])
     turned = along + np.clip(aside, -_WIDEST_FIRING_DEG, _WIDEST_FIRING_DEG)
     return np.asarray(turned - turned[: edges[1]].min()).clip(min=0.0)
+
+
+def _ring_by_ring(points: FloatArray, rings: NDArray[np.generic]) -> FloatArray | None:
+    """The azimuth has to run round the circle once in almost every ring, in one direction and from one start."""
+    if len(points) < _BLOCKS * _FEWEST_IN_BLOCK:
+        return None
+    azimuths = np.arctan2(points[:, 1], points[:, 0])
+    paths = {ring: np.degrees(np.unwrap(azimuths[rings == ring])) for ring in np.unique(rings)}
+    direction = np.sign(sum(float(path[-1] - path[0]) for path in paths.values()))
+    paths = {ring: direction * path for ring, path in paths.items()}
+    full = [path for path in paths.values() if _is_turn(path)]
+    if not full or sum(len(path) for path in full) < _SHARE_IN_RINGS * len(points):
+        return None
+    start = float(np.median([_nearest_turn(path[0], full[0][0]) for path in full]))
+    turned = np.empty(len(points))
+    for ring, path in paths.items():
+        # The middle decides which turn it is: returns at the start may be missing.
+        turned[rings == ring] = path + 360.0 * np.round((start + 180.0 - np.median(path)) / 360.0)
+    turned -= np.quantile(turned, _FIRST)
+    is_one = np.mean(turned < _TURN_DEG[1]) >= _SHARE
+    return turned.clip(min=0.0, max=_TURN_DEG[1]) if is_one else None
+
+
+def _is_turn(path: FloatArray) -> bool:
+    """Whether a ring's azimuth, unwrapped in the direction of turning, runs round the circle once."""
+    is_even = len(path) > 1 and float(np.mean(np.diff(path) > 0.0)) >= _SHARE
+    return is_even and _TURN_DEG[0] - _MISSING_DEG < path[-1] - path[0] < _TURN_DEG[1]
+
+
+def _nearest_turn(angle: float, reference: float) -> float:
+    """The angle plus whole turns that is nearest to the reference."""
+    return float(angle + 360.0 * np.round((reference - angle) / 360.0))
 
 
 def offsets_from_order(points: FloatArray, rings: NDArray[np.generic] | None, period_s: float) -> FloatArray | None:

@@ -17,16 +17,16 @@ _LONGEST_SWEEP_S = 0.25
 # Pairs of consecutive scans that are compared, spread over the recording.
 _PAIRS = 40
 
-_USED = "The points have no times but are in the order of firing, so their times follow from the azimuth."
+_USED = "The points are in the order of one turn, and their times follow from the azimuth."
 _NOT_USED = (
     "The points have no times, and the seams of the sweeps are closed as in motion compensated ones, or sweeps are"
     " missing between; none are made from the azimuth."
 )
 _OFFERED = (
-    "The points have no times but are in the order of firing; whether the sweeps are as measured or motion compensated"
+    "The points have no times but are in the order of one turn; whether sweeps are as measured or motion compensated"
     " does not show. If they are as measured, --set reader.time_reference=azimuth gives the points times."
 )
-_NO_ORDER = "Times were to follow from the azimuth, but the points are not in the order of firing of one turn."
+_NO_ORDER = "Times were to follow from the azimuth, but the points are not in the order of one turn."
 _TOO_SLOW = "Times were to follow from the azimuth, but the scans lie farther apart than a sweep lasts."
 
 

@@ -1,4 +1,4 @@
-"""evalio's own readers over files written in the layouts of Hilti 2022, Newer College 2021 and Oxford Spires."""
+"""evalio's own readers over bags and truth written in the layouts of some of its data sets."""
 
 import os
 import subprocess
@@ -160,6 +160,48 @@ def test_newer_college_2021(
     T_truth_lidar = make_transform(np.eye(3), R.T @ shift)
     assert recording.ground_truth.stamps == pytest.approx([1640000000.5])
     np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], T @ T_truth_lidar, atol=1e-5)
+
+
+def test_enwide_has_true_positions_alone(
+    evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]
+) -> None:
+    folder = evalio_data / "enwide" / "field_d"
+    folder.mkdir(parents=True)
+    kit = make_bag_kit("bag")
+    kit.folder = folder
+    sweep = make_sweep("ouster", START_NS, height=16, width=50)
+    clouds = [(START_NS, kit.cloud(sweep.records, START_NS))]
+    imu, _ = _imu_messages(kit, 3)
+    kit.write({"/ouster/points": clouds, "/ouster/imu": imu}, name="2023-08-09-19-25-45-field_d")
+    (folder / "gt-field_d.csv").write_text("".join(f"{1640000000 + k}.0 {k} 0 0 0 0 0 1\n" for k in range(3)))
+    recording = open_recording(folder)
+    (scan,) = recording.scans()
+    np.testing.assert_allclose(scan.points, sweep.points, atol=1e-6)
+    assert recording.ground_truth.length_m == pytest.approx(2.0)
+    assert "The truth has positions alone" in recording.describe().notes[-1]
+
+
+def test_mcd_stamps_the_end_of_a_sweep(
+    evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]
+) -> None:
+    """The LiDAR and the IMU are in a bag each."""
+    folder = evalio_data / "multi_campus" / "ntu_day_01"
+    folder.mkdir(parents=True)
+    kit = make_bag_kit("bag")
+    kit.folder = folder
+    sweep = make_sweep("ouster", START_NS, height=16, width=50)
+    clouds = [(START_NS, kit.cloud(sweep.records, START_NS + PERIOD_NS))]
+    imu, content = _imu_messages(kit, 3)
+    kit.write({"/os_cloud_node/points": clouds}, name="ntu_day_01_os1_128")
+    kit.write({"/vn100/imu": imu}, name="ntu_day_01_vn100")
+    rows = "".join(f"{k},{1640000000 + k}.0,{k},0,0,0,0,0,1\n" for k in range(3))
+    (folder / "pose_inW.csv").write_text(f"num,t,x,y,z,qx,qy,qz,qw\n{rows}")
+    recording = open_recording(folder)
+    (scan,) = recording.scans()
+    assert scan.stamp == pytest.approx(START_NS * 1e-9, abs=1e-6)
+    np.testing.assert_allclose(scan.time_offsets, sweep.offsets, atol=1e-9)
+    np.testing.assert_allclose(recording.imu.accelerations, content[:, 3:])
+    assert recording.ground_truth.length_m == pytest.approx(2.0)
 
 
 def test_oxford_spires(evalio_data: Path, make_bag_kit: Callable[[str], Any], make_sweep: Callable[..., Any]) -> None:

@@ -1,0 +1,102 @@
+"""Methods of a comparison as the command line names them: BASE[@VOXEL][+map|+loam][+graph], or a peer."""
+
+import re
+from dataclasses import dataclass
+from typing import get_args
+
+from lidarslam.compare.peers.registry import PEERS
+from lidarslam.core.errors import ConfigError
+from lidarslam.mapping.config import MappingName
+from lidarslam.odometry.config import OdometryName
+
+# Name for the user -> name of the odometry in the configuration.
+_BASES = {
+    "learned": "learned",
+    "kiss-icp": "kiss-icp",
+    "kiss-icp-no-deskew": "kiss-icp",
+    "constant-velocity": "constant-velocity",
+    "imu": "imu",
+    "learned+imu": "learned+imu",
+    "prior": "external",
+}
+_NO_DESKEW = "kiss-icp-no-deskew"
+# A peer's run: its poses as they are.
+_PEER = ("odometry.method=external", "mapping.method=off", "pose_graph.enabled=false")
+_ONLY_WITH_MAP = {
+    "constant-velocity": "only predicts",
+    "imu": "measures turns alone",
+    "learned+imu": "the IMU takes part in scan-to-map registration",
+}
+_NAME = re.compile(r"(?P<base>[a-z][a-z-]*(\+imu)?)(@(?P<voxel>[^+@]+))?(?P<mapping>\+map|\+loam)?(?P<graph>\+graph)?")
+_MAPPINGS: dict[str | None, MappingName] = {"+map": "surfels", "+loam": "loam", None: "off"}
+_GRAMMAR = (
+    f"{', '.join(_BASES)}; each with +map or +loam, with +graph, or with both as in learned+map+graph;"
+    " kiss-icp@0.5 for a voxel size of 0.5 m; and as they are "
+    f"{', '.join(PEERS)}"
+)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method of a comparison."""
+
+    name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`
+    settings: tuple[str, ...]  # of the configuration, `key.path=value`
+    peer: str | None = None  # the peer that estimates the poses, see `lidarslam.compare.peers`
+
+    @property
+    def needs_prior(self) -> bool:
+        """Whether it takes its motions from a given trajectory."""
+        return self.peer is None and "odometry.method=external" in self.settings
+
+
+def parse_method(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        ConfigError: no method is called so, or a part of it is not in this version.
+    """
+    if name in PEERS:
+        return Method(name, _PEER, name)
+    match = _NAME.fullmatch(name)
+    if match is None or match["base"] not in _BASES:
+        raise ConfigError(f"no method is called {name!r}; there are: {_GRAMMAR}")
+    odometry = _BASES[match["base"]]
+    if odometry not in get_args(OdometryName):
+        raise ConfigError(f"{name}: the {match['base']} odometry is not part of this version")
+    if odometry in _ONLY_WITH_MAP and not match["mapping"]:
+        raise ConfigError(
+            f"{name}: {_ONLY_WITH_MAP[odometry]}; compare {odometry}+map or {odometry}+loam, which correct it against"
+            " a map"
+        )
+    voxel = () if match["voxel"] is None else (f"odometry.kiss_icp.voxel_size_m={_voxel_size_m(name, match)!r}",)
+    deskew = ("odometry.kiss_icp.deskew=false",) if match["base"] == _NO_DESKEW else ()
+    pose_graph = str(match["graph"] is not None).lower()
+    switches = (f"mapping.method={_MAPPINGS[match['mapping']]}", f"pose_graph.enabled={pose_graph}")
+    return Method(name, (f"odometry.method={odometry}", *voxel, *deskew, *switches))
+
+
+def _voxel_size_m(name: str, match: re.Match[str]) -> float:
+    if _BASES[match["base"]] != "kiss-icp":
+        raise ConfigError(f"{name}: only kiss-icp takes a voxel size, as in kiss-icp@0.5")
+    try:
+        size_m = float(match["voxel"])
+    except ValueError:
+        size_m = 0.0
+    if not 0.0 < size_m < float("inf"):
+        raise ConfigError(f"{name}: expected a voxel size in metres, as in kiss-icp@0.5, got {match['voxel']!r}")
+    return size_m
+
+
+def parse_methods(names: str) -> tuple[Method, ...]:
+    """The methods of a list with commas.
+
+    Raises:
+        ConfigError: one of them does not exist, one is named twice, or there is none.
+    """
+    chosen = [name.strip() for name in names.split(",") if name.strip()]
+    if not chosen:
+        raise ConfigError(f"no method is named; there are: {_GRAMMAR}")
+    if len(set(chosen)) < len(chosen):
+        raise ConfigError(f"a method is named twice in {names!r}; name each once")
+    return tuple(parse_method(name) for name in chosen)

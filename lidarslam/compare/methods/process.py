@@ -1,0 +1,70 @@
+"""One method of a comparison in a process of its own: a run that reports its progress.
+
+The arguments are the folder to stand in, the peer's name or nothing, and the request as JSON. After every scan a line
+goes to standard output: its number from 1, and how many there are. Libraries' output goes to standard error. The exit
+status is that of `lidarslam run`.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.run import execute_peer
+from lidarslam.core.errors import LidarSlamError
+from lidarslam.run.request import RunRequest
+from lidarslam.run.results import RunOutcome
+from lidarslam.run.run import execute
+
+STOPPED, LOST = 1, 3
+_REQUEST = TypeAdapter(RunRequest)
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """One method on one recording."""
+
+    request: RunRequest  # into the directory with the method's name
+    peer: str | None = None  # the peer that estimates the poses
+
+    @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.request.out.name
+
+
+def encode(run: MethodRun) -> tuple[str, str, str]:
+    """The arguments; the run overwrites, and saves no state and draws no page, which would count as its time."""
+    request = replace(run.request, overwrite=True, resumable=False, report=False)
+    return str(Path.cwd()), run.peer or "", _REQUEST.dump_json(request).decode()
+
+
+def main() -> int:
+    """Run; the exit status."""
+    folder, peer, request = sys.argv[1:]
+    os.chdir(folder)
+    with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as progress:
+        os.dup2(2, 1)
+        try:
+            outcome = _run(_REQUEST.validate_json(request), peer, lambda *counted: print(*counted, file=progress))
+        except LidarSlamError as error:
+            print(f"lidarslam: {error}", file=sys.stderr)
+            return STOPPED
+    if outcome.stopped is not None:
+        print(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", file=sys.stderr)
+        return STOPPED
+    return LOST if outcome.summary.went_astray else 0
+
+
+def _run(request: RunRequest, peer: str, progress: Callable[[int, int], None]) -> RunOutcome:
+    if peer:
+        return execute_peer(request, PEERS[peer], progress)
+    return execute(request, lambda number, total, _: progress(number, total))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

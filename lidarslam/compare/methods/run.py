@@ -1,0 +1,102 @@
+"""One method on one recording: a run in a process of its own, and its result however it ended."""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from lidarslam.compare.methods.ending import judge
+from lidarslam.compare.methods.process import MethodRun, encode
+from lidarslam.compare.peers.registry import PEERS
+from lidarslam.compare.peers.run import describe_peer
+from lidarslam.compare.supervised import Limits, supervise
+from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.config.yaml_text import read_yaml
+from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
+from lidarslam.core.files import remove_partial_files
+from lidarslam.datasets.recording import Recording
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult
+from lidarslam.run.request import describe_run
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.viewer.page.run_result import with_run
+
+# Beside a run's own files: how its process went, and its standard error.
+PROCESS, LOG = "process.json", "process.log"
+_RECORDED = ("status", "message", "wall_s", "peak_rss_mb")
+
+COMMAND = (sys.executable, "-m", "lidarslam.compare.methods.process")
+# The process starts here, so that no package in the user's folder is found first.
+_ROOT = Path(__file__).resolve().parents[3]
+
+
+def obstacle(run: MethodRun, recording: Recording) -> str | None:
+    """Why a method cannot run on a recording; None where nothing is in its way."""
+    if run.peer is None:
+        return None
+    try:
+        PEERS[run.peer].require(lambda: recording.imu is not None)
+    except LidarSlamError as error:
+        return str(error)
+    return None
+
+
+def run_method(
+    run: MethodRun, limits: Limits, progress: Callable[[int, int], None], command: Sequence[str] = COMMAND
+) -> tuple[MethodResult, bool]:
+    """Run a method to any end; its result, and whether it was interrupted with Ctrl-C.
+
+    Args:
+        run: into the directory with the method's name; an earlier run of a comparison there is replaced.
+        limits: of memory and time.
+        progress: called after every scan with its number from 1 and how many there are.
+        command: the process, with the encoded request as its last arguments.
+    """
+    folder = run.request.out
+    if (folder / LOG).is_file():  # of an earlier comparison
+        for name in (*files.FILES, PROCESS):
+            (folder / name).unlink(missing_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def see(line: str) -> None:
+        words = line.split()
+        if len(words) == 2 and all(word.isdecimal() for word in words):
+            progress(int(words[0]), int(words[1]))
+
+    ending = supervise([*command, *encode(run)], folder / LOG, limits, see, _ROOT)
+    remove_partial_files(folder)
+    status, message = judge(ending, folder, folder / LOG, limits)
+    result = MethodResult(folder.name, status, message, wall_s=ending.wall_s, peak_rss_mb=ending.peak_rss_mb)
+    RunDirectory(folder).write_json(PROCESS, {name: getattr(result, name) for name in _RECORDED})
+    return _collect(run, result), ending.cause == "interrupt"
+
+
+def finished_before(run: MethodRun) -> MethodResult | None:
+    """The result of an earlier run of the same request, if it came to its end.
+
+    The same are the source, its scans, the prior, the program's version and the configuration; the content of the
+    source and the prior is not looked at. Of a peer, its version counts too.
+    """
+    try:
+        folder = run.request.out
+        result = MethodResult(run.name, **json.loads((folder / PROCESS).read_text(encoding="utf-8")))
+        tree = read_yaml(folder / files.CONFIG)
+        was_run = tree.pop(files.RUN_SECTION)
+        is_same = Config.model_validate(tree) == run.request.config
+        described = describe_run(run.request) if run.peer is None else describe_peer(run.request, PEERS[run.peer])
+        is_same = is_same and all(was_run.get(key) == value for key, value in described.items())
+    except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    return _collect(run, result) if is_same and result.status in WHOLE else None
+
+
+def _collect(run: MethodRun, result: MethodResult) -> MethodResult:
+    """The result with the content of its run directory; a damaged one counts as a failure."""
+    result = replace(result, settings=dump_yaml(run.request.config))
+    if result.status not in (*WHOLE, "stopped"):
+        return result
+    try:
+        return replace(with_run(result, run.request.out), run=f"{run.request.out.parent.name}/{run.name}")
+    except (InputError, OSError) as error:
+        return replace(result, status="failed", message=f"its run directory cannot be read: {error}")

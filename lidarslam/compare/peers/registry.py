@@ -1,0 +1,84 @@
+"""The peers by name; their libraries are loaded on use."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+
+from lidarslam.compare.peers.interface import Estimator, PeerError, Sweep
+from lidarslam.core.imu import ImuSamples
+
+EXTRA = "pip install 'lidarslam[peers]'"
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another program on the same scans."""
+
+    name: str  # in `--methods`
+    library: str  # the module that it needs
+    package: str  # that holds it
+    make: Callable[[Sweep, ImuSamples | None], Estimator]  # from the first sweep with points
+    needs_imu: bool = False
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether its library is there."""
+        return importlib.util.find_spec(self.library) is not None
+
+    @property
+    def version(self) -> str:
+        """Package and version, such as `evalio 0.6.1`."""
+        return f"{self.package} {version(self.package)}"
+
+    def require(self, has_imu: Callable[[], bool]) -> None:
+        """Refuse where it cannot run.
+
+        Raises:
+            PeerError: its library is not installed, or it needs an IMU and there is none.
+        """
+        if not self.is_installed:
+            raise PeerError(f"runs with {self.package}, which is not installed: {EXTRA}")
+        if self.needs_imu and not has_imu():
+            raise PeerError("needs an IMU, and the recording has none")
+
+
+def _evalio(name: str) -> Callable[[Sweep, ImuSamples | None], Estimator]:
+    def make(first: Sweep, imu: ImuSamples | None) -> Estimator:
+        from lidarslam.compare.peers.evalio_pipelines import PIPELINES, EvalioEstimator
+
+        return EvalioEstimator(PIPELINES[name], first, imu)
+
+    return make
+
+
+def _small_gicp(_: Sweep, __: ImuSamples | None) -> Estimator:
+    from lidarslam.compare.peers.small_gicp import SmallGicpEstimator
+
+    return SmallGicpEstimator()
+
+
+def _kiss_slam(_: Sweep, __: ImuSamples | None) -> Estimator:
+    from lidarslam.compare.peers.kiss_slam import KissSlamEstimator
+
+    return KissSlamEstimator()
+
+
+def _rko_lio(_: Sweep, imu: ImuSamples | None) -> Estimator:
+    from lidarslam.compare.peers.rko_lio import RkoLioEstimator
+
+    assert imu is not None
+    return RkoLioEstimator(imu)
+
+
+_ALL = (
+    *(
+        Peer(name, "evalio", "evalio", _evalio(name))
+        for name in ("kiss-icp-evalio", "genz-icp", "mad-icp", "ct-icp", "loam-evalio", "form")
+    ),
+    *(Peer(name, "evalio", "evalio", _evalio(name), needs_imu=True) for name in ("lio-sam", "dlio")),
+    Peer("kiss-slam", "kiss_slam", "kiss-slam", _kiss_slam),
+    Peer("small-gicp", "small_gicp", "small_gicp", _small_gicp),
+    Peer("rko-lio", "rko_lio", "rko_lio", _rko_lio, needs_imu=True),
+)
+PEERS = {peer.name: peer for peer in _ALL}

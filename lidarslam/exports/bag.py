@@ -1,0 +1,181 @@
+"""A run as a bag of ROS 2 or ROS 1."""
+
+import sqlite3
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+
+from lidarslam.core.files import cannot_write, make_directory
+from lidarslam.core.geometry import inverse
+from lidarslam.core.scan import PointAttributes, Scan
+from lidarslam.exports import ros_messages as ros
+from lidarslam.exports.run_scans import RunScans
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.storage.finished_run import load_map
+
+# REP 105.
+_MAP_FRAME, _ODOM_FRAME = "map", "odom"
+_ODOMETRY_TOPIC, _TF_TOPIC, _PATH_TOPIC, _CLOUD_TOPIC, _MAP_TOPIC = (
+    "/odometry",
+    "/tf",
+    "/path",
+    "/points",
+    "/map_points",
+)
+_LATCHED = (_PATH_TOPIC, _MAP_TOPIC)
+# Of one file; without a suffix, a rosbag2 folder.
+SUFFIXES = (".mcap", ".db3", ".bag", "")
+# The newest version that ROS 2 Humble reads; for a lone .db3 the oldest with types and metadata in the file.
+_VERSION: Literal[8] = 8
+_LONE_SQLITE_VERSION: Literal[9] = 9
+_LONGEST = QosTime(9223372036, 854775807)  # as ROS 2 writes infinity
+
+
+@dataclass(frozen=True)
+class WrittenBag:
+    """A bag as it was written."""
+
+    path: Path
+    messages: dict[str, int]  # topic -> how many
+
+
+def export_bag(
+    run: RunScans, out: Path, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
+) -> WrittenBag:
+    """Write odometry, tf, path and map of a run, and its deskewed clouds.
+
+    Args:
+        run: the scans.
+        out: the file; its suffix is one of `SUFFIXES`, and none gives a folder.
+        lidar_frame: name of the frame of the LiDAR.
+        with_clouds: whether the recording is read again for the clouds.
+        count: called with the number of scans done, and of all.
+
+    Raises:
+        InputError: the map or the recording cannot be read.
+        OutputError: the bag cannot be written.
+    """
+    make_directory(out.parent)
+    try:
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=".partial-") as folder:
+            place = Path(folder) / (out.name if out.suffix == ".bag" else out.stem)
+            writer = _writer(place, out.suffix)
+            with writer:
+                messages = _write(_Topics(writer), run, lidar_frame, with_clouds, count)
+            made = place / f"{place.name}{out.suffix}" if out.suffix in (".mcap", ".db3") else place
+            made.replace(out)
+    except (OSError, sqlite3.Error) as error:
+        raise cannot_write(out, error) from error
+    return WrittenBag(out, messages)
+
+
+def _writer(place: Path, suffix: str) -> Rosbag1Writer | Rosbag2Writer:
+    if suffix == ".bag":
+        return Rosbag1Writer(place)
+    if suffix == ".db3":
+        return Rosbag2Writer(place, version=_LONE_SQLITE_VERSION, storage_plugin=StoragePlugin.SQLITE3)
+    return Rosbag2Writer(place, version=_VERSION, storage_plugin=StoragePlugin.MCAP)
+
+
+def _write(
+    topics: "_Topics", run: RunScans, lidar_frame: str, with_clouds: bool, count: Callable[[int, int], None]
+) -> dict[str, int]:
+    """Everything, in the order of time; the whole path and the map come with the first stamp."""
+    messages, trajectory = topics.messages, run.trajectory
+    first = float(trajectory.stamps[0])
+    topics.write(_PATH_TOPIC, first, messages.path(trajectory.stamps, _MAP_FRAME, trajectory.T_world_lidar))
+    cloud = load_map(run.run)
+    if len(cloud):
+        topics.write(_MAP_TOPIC, first, _map_message(messages, first, cloud))
+    written = 0
+    if with_clouds:
+        for index, scan in run.deskewed():
+            for number in range(written, index + 1):
+                _write_pose(topics, run, number, lidar_frame)
+            written = index + 1
+            topics.write(_CLOUD_TOPIC, scan.stamp, _scan_message(messages, scan, lidar_frame))
+            count(written, len(trajectory))
+    for number in range(written, len(trajectory)):
+        _write_pose(topics, run, number, lidar_frame)
+    count(len(trajectory), len(trajectory))
+    return topics.counts
+
+
+def _write_pose(topics: "_Topics", run: RunScans, number: int, lidar_frame: str) -> None:
+    """Transforms and odometry of one scan; map -> odom is the correction of the odometry by mapping and graph."""
+    stamp = float(run.trajectory.stamps[number])
+    T_map_lidar, T_odom_lidar = run.trajectory.T_world_lidar[number], run.odometry.T_world_lidar[number]
+    corrected = (_MAP_FRAME, _ODOM_FRAME, T_map_lidar @ inverse(T_odom_lidar))
+    topics.write(
+        _TF_TOPIC, stamp, topics.messages.transforms(stamp, corrected, (_ODOM_FRAME, lidar_frame, T_odom_lidar))
+    )
+    known = run.known_velocities(number)
+    velocity = np.mean(known, axis=0) if known else np.zeros(6)
+    frames = (_MAP_FRAME, lidar_frame)
+    message = topics.messages.odometry(stamp, frames, T_map_lidar, run.sigmas[number], velocity)
+    topics.write(_ODOMETRY_TOPIC, stamp, message)
+
+
+def _scan_message(messages: ros.RosMessages, scan: Scan, lidar_frame: str) -> Any:
+    attributes = PointAttributes(intensity=scan.intensities, rgb=scan.colours, ring=scan.rings)
+    return messages.cloud(scan.stamp, lidar_frame, scan.points, attributes)
+
+
+def _map_message(messages: ros.RosMessages, stamp: float, cloud: PointCloud) -> Any:
+    return messages.cloud(stamp, _MAP_FRAME, cloud.points, cloud.attributes.only(("intensity", "rgb")))
+
+
+class _Topics:
+    """The topics of a bag, opened with their first message."""
+
+    def __init__(self, bag: Rosbag1Writer | Rosbag2Writer) -> None:
+        self._bag = bag
+        self.messages = ros.RosMessages(ros2=isinstance(bag, Rosbag2Writer))
+        self._connections: dict[str, Any] = {}
+        self.counts: dict[str, int] = {}
+
+    def write(self, topic: str, stamp: float, message: Any) -> None:
+        """Write a message, recorded at its stamp."""
+        if topic not in self._connections:
+            self._connections[topic] = self._open(topic, message.__msgtype__)
+        data = self.messages.serialize(message)
+        self._bag.write(self._connections[topic], ros.nanoseconds(stamp), data)
+        self.counts[topic] = self.counts.get(topic, 0) + 1
+
+    def _open(self, topic: str, message_type: str) -> Any:
+        store = self.messages.store
+        if isinstance(self._bag, Rosbag1Writer):
+            latching = int(topic in _LATCHED)
+            return self._bag.add_connection(topic, message_type, typestore=store, latching=latching)
+        qos = _qos(latched=topic in _LATCHED)
+        return self._bag.add_connection(topic, message_type, typestore=store, offered_qos_profiles=[qos])
+
+
+def _qos(latched: bool) -> Qos:
+    """Reliable; latched, a subscriber that comes later gets the last message too."""
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if latched else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        deadline=_LONGEST,
+        lifespan=_LONGEST,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_LONGEST,
+        avoid_ros_namespace_conventions=False,
+    )

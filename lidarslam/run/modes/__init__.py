@@ -1,0 +1,1 @@
+"""Other ways to run: a running robot, a given map, several recordings."""

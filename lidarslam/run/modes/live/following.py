@@ -1,0 +1,150 @@
+"""A robot is followed: each of its clouds becomes a scan, a pose, and a message to the robot."""
+
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
+from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
+from lidarslam.run.modes.live.clouds import CloudDecoder
+from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
+from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
+from lidarslam.run.modes.live.messages import ODOMETRY_TYPE
+from lidarslam.run.modes.live.publishing import PosePublisher
+from lidarslam.run.modes.live.request import LiveRequest
+from lidarslam.run.modes.live.session import LiveSession
+from lidarslam.run.modes.live.statistics import LiveCounts, LiveStatistics
+
+logger = logging.getLogger(__name__)
+
+ODOMETRY_TOPIC, TF_TOPIC, TF_STATIC_TOPIC = "/lidarslam/odometry", "/tf", "/tf_static"
+_POLL_S, _SHOWN_EVERY_S = 0.2, 1.0
+# Reports without a message after which the user is told.
+_SILENT = 5
+_SILENCE = "no scan came for some seconds; waiting on, Ctrl-C ends the run and writes its results"
+_NOTHING = (
+    "the topic is published, but nothing comes; waiting on. Publisher and this program may see each other without being"
+    " able to reach each other (firewall, container, network interface), or the publisher is idle"
+)
+# A static transform is sent again to whoever subscribes; discovery of its publisher takes a while.
+_STATIC_WITHIN_S = 5.0
+
+
+class Follower:
+    """Takes the clouds of a topic through a session, and publishes their poses.
+
+    Args:
+        request: what is followed, and until when.
+        node: where topics are subscribed to and published.
+        session: registers the scans.
+        decoder: makes scans of messages.
+    """
+
+    def __init__(self, request: LiveRequest, node: DdsNode, session: LiveSession, decoder: CloudDecoder) -> None:
+        self._request, self._session, self._decoder = request, session, decoder
+        self._statistics = LiveStatistics()
+        self._publish_odometry = node.publisher(ODOMETRY_TOPIC, ODOMETRY_TYPE).publish
+        self._publish_tf = node.publisher(TF_TOPIC, TRANSFORMS_TYPE).publish if request.publish_tf else None
+        self._static = None
+        if request.base_frame is not None:
+            self._static = node.subscribe(PublishedTopic(TF_STATIC_TOPIC, TRANSFORMS_TYPE, True), is_kept=True)
+        self._poses: PosePublisher | None = None
+        self._received = self._silent = 0  # messages until the last report, and reports without any more
+
+    def follow(self, incoming: IncomingQueue, show: Callable[[str], None]) -> tuple[LiveCounts, bool]:
+        """Register what comes, until the request or Ctrl-C ends it; what waits then is registered too.
+
+        Registration has a thread of its own, so that Ctrl-C falls between two scans.
+
+        Returns:
+            What became of the scans, and whether it was Ctrl-C.
+        """
+        is_interrupted = False
+        with incoming, ThreadPoolExecutor(1, thread_name_prefix="register") as worker:
+            registering = worker.submit(self._register_all, incoming)
+            try:
+                while not _is_done(registering):
+                    self._report(self._statistics.counts(incoming.dropped), show)
+            except KeyboardInterrupt:
+                is_interrupted = True
+            incoming.end()
+            registering.result()
+        return self._statistics.counts(incoming.dropped), is_interrupted
+
+    def _report(self, counts: LiveCounts, show: Callable[[str], None]) -> None:
+        """Show the counts; that nothing comes, or nothing more, is logged, once each time."""
+        show(counts.line())
+        self._silent = self._silent + 1 if counts.received == self._received else 0
+        self._received = counts.received
+        if self._silent == _SILENT:
+            logger.warning(_SILENCE if counts.received else _NOTHING)
+
+    def on_arrival(self, message: Arrived) -> None:
+        """Count a message."""
+        with suppress(ValueError):  # damaged, which is counted when it is decoded
+            stamp_ns, _ = read_header(message.raw, ros2=True)
+            self._statistics.arrived((stamp_ns or message.published_ns) / 10**9, message.arrived_s)
+
+    def _register_all(self, incoming: IncomingQueue) -> None:
+        begin, registered = None, 0
+        while True:
+            message = incoming.take(_POLL_S)
+            if message is None:
+                if incoming.is_ended:
+                    return
+                continue
+            begin = message.arrived_s if begin is None else begin
+            registered += self._register(message)
+            if registered == self._request.scans or _is_over(self._request.duration_s, message.arrived_s - begin):
+                return
+
+    def _register(self, message: Arrived) -> bool:
+        """The pose of a message's scan; whether there is one."""
+        started = time.perf_counter()
+        live = self._decoder.scan(message.raw, message.published_ns)
+        if live is None:
+            return False
+        if self._poses is None:
+            self._poses = self._pose_publisher(live.frame_id)
+        localised = self._session.register(live.scan, started)
+        self._poses.publish(live.stamp_ns, localised)
+        self._statistics.registered(live.scan.stamp, message.arrived_s)
+        return True
+
+    def _pose_publisher(self, lidar_frame: str) -> PosePublisher:
+        """Once the frame of the LiDAR is known."""
+        body = self._request.base_frame or lidar_frame
+        T_body_lidar = np.eye(4) if self._request.base_frame is None else self._static_transform(body, lidar_frame)
+        return PosePublisher(self._publish_odometry, self._publish_tf, self._request.odom_frame, body, T_body_lidar)
+
+    def _static_transform(self, base: str, lidar: str) -> FloatArray:
+        """The pose (4, 4) of the LiDAR on the robot.
+
+        Raises:
+            InputError: no static transforms connect the two.
+        """
+        edges: Edges = {}
+        begin = time.monotonic()
+        while self._static is not None and time.monotonic() - begin < _STATIC_WITHIN_S:
+            for message in self._static.take(_POLL_S):
+                add_edges(edges, message.raw, ros2=True)
+            if (T_base_lidar := chain(edges, base, lidar)) is not None:
+                return T_base_lidar
+        raise InputError(
+            f"{TF_STATIC_TOPIC} does not connect --base-frame {base} with {lidar}, the frame of the clouds; its frames:"
+            f" {', '.join(sorted(edges)) or 'none'}"
+        )
+
+
+def _is_done(future: "Future[None]") -> bool:
+    return bool(wait([future], timeout=_SHOWN_EVERY_S).done)
+
+
+def _is_over(limit_s: float | None, passed_s: float) -> bool:
+    return limit_s is not None and passed_s >= limit_s

@@ -1,0 +1,142 @@
+"""Rate, latency and losses of a live run."""
+
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.plain_text import count
+
+# A stamp farther from this machine's clock is the reading of another one.
+_SAME_CLOCK_S = 60.0
+_RATE_OVER_S = 5.0
+# An interval that is longer than so many usual ones has room for scans that are missing.
+_GAP_INTERVALS = 1.5
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Median and 99th percentile, milliseconds."""
+
+    median_ms: float
+    p99_ms: float
+
+    @classmethod
+    def of(cls, seconds: list[float]) -> "Latency | None":
+        """Of these latencies; None without any."""
+        if not seconds:
+            return None
+        median, p99 = 1e3 * np.quantile(seconds, [0.5, 0.99])
+        return cls(float(median), float(p99))
+
+    def __str__(self) -> str:
+        return f"median {self.median_ms:.0f} ms, p99 {self.p99_ms:.0f} ms"
+
+
+@dataclass(frozen=True)
+class LiveCounts:
+    """What became of the scans that were published."""
+
+    received: int  # messages that came
+    missing: int  # that did not come, by the gaps between the stamps of those that did
+    dropped: int  # that came and waited too long for registration
+    registered: int
+    rate_hz: float  # of the messages that came in the last seconds
+    # from_arrival, from_stamp: until the pose was published; from_stamp is None where the stamps are of another clock
+    from_arrival: Latency | None
+    from_stamp: Latency | None
+
+    def line(self) -> str:
+        """A line for the time of the run."""
+        latency = "" if self.from_arrival is None else f", {self.from_arrival.median_ms:.0f} ms"
+        p99 = "" if self.from_arrival is None else f" (p99 {self.from_arrival.p99_ms:.0f})"
+        lost = f"{self.missing} missing, {self.dropped} dropped"
+        return f"{count(self.registered, 'scan')}, {self.rate_hz:.1f} Hz{latency}{p99}, {lost}"
+
+    def text(self) -> str:
+        """Lines for its end."""
+        lines = [
+            f"{count(self.received, 'message')} received, {self.missing} missing between their stamps,"
+            f" {self.dropped} dropped because registration was behind"
+        ]
+        if self.from_arrival is not None:
+            lines.append(f"latency from the arrival of a scan to its pose: {self.from_arrival}")
+        if self.from_stamp is not None:
+            lines.append(f"latency from the stamp of a scan to its pose: {self.from_stamp}")
+        return "\n".join(lines)
+
+    def warnings(self) -> list[str]:
+        """Sentences about losses."""
+        found = []
+        if self.missing:
+            found.append(
+                f"{count(self.missing, 'scan')} missing between the stamps of those received: the network or the"
+                " publisher lost them; net.core.rmem_max bounds what the network may hold"
+            )
+        if self.dropped:
+            found.append(
+                f"{count(self.dropped, 'scan')} dropped: registration was slower than the sensor; leave it more of the"
+                " processor, or take --odometry constant-velocity"
+            )
+        return found
+
+
+class LiveStatistics:
+    """Counts scans; may be called from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._stamps: list[float] = []
+        self._arrivals: list[float] = []
+        self._from_arrival: list[float] = []
+        self._from_stamp: list[float] = []
+        self._registered = 0
+
+    def arrived(self, stamp_s: float, arrived_s: float) -> None:
+        """A message came."""
+        with self._lock:
+            self._stamps.append(stamp_s)
+            self._arrivals.append(arrived_s)
+
+    def registered(self, stamp_s: float, arrived_s: float) -> None:
+        """The pose of a scan is out."""
+        now = time.time()
+        with self._lock:
+            self._registered += 1
+            self._from_arrival.append(now - arrived_s)
+            if abs(now - stamp_s) < _SAME_CLOCK_S:
+                self._from_stamp.append(now - stamp_s)
+
+    def counts(self, dropped: int) -> LiveCounts:
+        """Up to now; the queue dropped so many."""
+        with self._lock:
+            arrivals = np.array(self._arrivals)
+            return LiveCounts(
+                received=len(arrivals),
+                missing=count_missing(np.array(self._stamps)),
+                dropped=dropped,
+                registered=self._registered,
+                rate_hz=_rate(arrivals),
+                from_arrival=Latency.of(self._from_arrival),
+                from_stamp=Latency.of(self._from_stamp) if 2 * len(self._from_stamp) > self._registered else None,
+            )
+
+
+def count_missing(stamps: FloatArray) -> int:
+    """How many scans have room in the gaps between stamps (N,), seconds, by their median interval.
+
+    No more than have room in the whole time: a stamp that is late by an interval is followed by a shorter one.
+    """
+    steps = np.diff(np.unique(stamps))
+    if not len(steps):
+        return 0
+    intervals = steps / np.median(steps)
+    in_gaps = np.round(intervals[intervals > _GAP_INTERVALS] - 1.0).sum()
+    return int(min(in_gaps, max(0.0, np.round(intervals.sum()) - len(intervals))))
+
+
+def _rate(arrivals: FloatArray) -> float:
+    recent = arrivals[arrivals > time.time() - _RATE_OVER_S]
+    return float((len(recent) - 1) / np.ptp(recent)) if len(recent) > 1 and np.ptp(recent) > 0.0 else 0.0

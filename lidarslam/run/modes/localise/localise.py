@@ -1,0 +1,180 @@
+"""Localisation of a recording in a finished map: from a source and a map to a run directory in the map's frame."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarslam.config.settings import dump_yaml
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory_io import format_tum
+from lidarslam.datasets.intake import choose_scans
+from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
+from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
+from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.run.interruption import Interruptions
+from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
+from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
+from lidarslam.run.request import log_choices
+from lidarslam.run.results import DrawnMap, RunOutcome, write_results
+from lidarslam.run.run import open_odometry, require_apart, viewing
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary.summary import WrittenMap, summarise
+from lidarslam.run.tracking import Progress, Tracked, track
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.viewer.rerun_program import require_window
+from lidarslam.viewer.web_page import WebPage
+
+_AFTERWARDS = "placed afterwards: the recording's own map leads from here to the place that was found"
+_REVOKED = "a place was found here, but later scans did not confirm it"
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """When and how a recording was found; scans are numbered from 0."""
+
+    found: int | None  # the scan that was found first; None: never
+    confirmed: int | None  # the scan that confirmed it
+    after_s: float | None  # time from the first scan to that
+    inlier_ratio: float | None  # mean of the scans that it was found with
+    tracked: int  # scans that were registered to the map
+    placed_afterwards: int  # scans before the first place that follow from it
+    times_found: int  # more than once where it was lost on the way
+    refused: tuple[tuple[int, str], ...]  # scan and reason of every search without a place
+
+    def to_json(self) -> dict[str, Any]:
+        """The section of summary.json, but for the map."""
+        refused = [{"scan": scan, "reason": reason} for scan, reason in self.refused]
+        return {
+            "found": self.found is not None,
+            "found_scan": self.found,
+            "confirmed_scan": self.confirmed,
+            "confirmed_after_s": self.after_s,
+            "found_inlier_ratio": self.inlier_ratio,
+            "times_found": self.times_found,
+            "tracked_scans": self.tracked,
+            "placed_afterwards": self.placed_afterwards,
+            "searches_refused": refused,
+        }
+
+
+@dataclass(frozen=True)
+class LocaliseOutcome:
+    """A localisation that was written."""
+
+    run: RunOutcome  # summary, and metrics where there is ground truth
+    localisation: Localisation
+
+
+def execute(
+    request: LocaliseRequest,
+    progress: Progress,
+    phase: Callable[[str], None] = lambda _: None,
+    page: WebPage | None = None,
+) -> LocaliseOutcome:
+    """Localise, and write the run directory; the map is only read.
+
+    Args:
+        request: what is localised, and where.
+        progress: called after every scan.
+        phase: called with a few words on what goes on before the first scan and after the last.
+        page: shows it in browsers, with `rerun="web"`.
+
+    Raises:
+        LidarSlamError: the source, the map, the configuration or the output directory is not usable.
+    """
+    run = request.run
+    require_apart(run.out, run.source)
+    require_apart(run.out, request.map)
+    if run.rerun == "spawn":
+        require_window("serve a browser with --rerun web, or write a file with --rerun save")
+    phase("reading the map")
+    cloud, fixed_map = read_map(request)
+    recording = open_recording(run.source, run.config.reader)
+    chosen = choose_scans(recording, run.source, run.start, run.stop, run.step)
+    log_choices(run, chosen, len(recording))
+    guess = None if request.guess is None else (*request.guess[:2], float(np.deg2rad(request.guess[2])))
+    with Interruptions() as interruptions:
+        with ExitStack() as stack:
+            compiling = stack.enter_context(CompileAhead(parts_of(run.config)))
+            phase("loading the odometry")
+            odometry = open_odometry(run.config, run.prior)
+            stack.callback(odometry.close)
+            directory = stack.enter_context(RunDirectory.create(run.out, run.overwrite))
+            log, localiser = ScanLog(), MapLocaliser(run.config.mapping, fixed_map, guess)
+            with viewing(run.rerun, run.config.viewer, recording.name, directory, log, page) as viewer:
+                viewer.show_final_map(cloud.points)
+                compiling.wait_for_first_scan(phase)
+                phase("searching for the place")
+                tracked = track(
+                    run, recording, chosen, odometry, log, None, PlacedViewer(viewer), progress,
+                    localiser=ScanToMap(localiser),
+                )  # fmt: skip
+            interruptions.protect_results()
+            phase("writing the results")
+            outcome = _write(request, directory, tracked, localiser)
+        if run.report and outcome.localisation.found is not None:
+            from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+            phase("drawing the report")
+            leave_report(run.out, Accuracy(outcome.run.metrics))
+    return outcome
+
+
+def _write(
+    request: LocaliseRequest, directory: RunDirectory, tracked: Tracked, localiser: MapLocaliser
+) -> LocaliseOutcome:
+    """Write what is known by now; a recording that was never found has no trajectory in the map."""
+    log, config, described = tracked.log, request.run.config, request.describe()
+    _correct(log, localiser)
+    found = _localisation(log, localiser)
+    section = {"localisation": {"map": described["map"], **found.to_json()}}
+    if found.found is not None:
+        run = write_results(directory, config, described, tracked, None, DrawnMap(None, None))
+        directory.write_json(files.SUMMARY, run.summary.to_json() | section)
+        return LocaliseOutcome(run, found)
+    directory.write_text(files.CONFIG, dump_yaml(config, described))
+    directory.write_text(files.SCANS_CSV, log.format_csv())
+    directory.write_text(files.ODOMETRY_TUM, format_tum(log.odometry))
+    log.warnings.extend(tracked.faults.warnings())
+    summary = summarise(log, WrittenMap(0, None, 0), 0)
+    directory.write_json(files.SUMMARY, summary.to_json() | section)
+    return LocaliseOutcome(RunOutcome(summary, None, tracked.stopped), found)
+
+
+def _correct(log: ScanLog, localiser: MapLocaliser) -> None:
+    """Enter what later scans have shown of earlier ones."""
+    scans = range(len(log))
+    poses = log.trajectory.T_world_lidar.copy()
+    for number, T_map_lidar in localiser.corrections.items():
+        if number in scans:
+            poses[number] = T_map_lidar
+    log.correct(poses)
+    log.mark([number for number in localiser.placed_afterwards if number in scans], Status.DEGRADED, _AFTERWARDS)
+    for found in localiser.found:
+        waited = range(found.scan, found.confirmed)
+        log.mark([number for number in waited if log.messages[number].endswith(NOT_CONFIRMED)], Status.OK, "")
+    log.mark([number for number in localiser.unconfirmed() if number in scans], Status.LOST, _REVOKED)
+
+
+def _localisation(log: ScanLog, localiser: MapLocaliser) -> Localisation:
+    refused = tuple(localiser.refusals)
+    if not localiser.found:
+        return Localisation(None, None, None, None, 0, 0, 0, refused)
+    first = localiser.found[0]
+    lost, afterwards = log.statuses.count(Status.LOST), len(localiser.placed_afterwards)
+    return Localisation(
+        found=first.scan,
+        confirmed=first.confirmed,
+        after_s=float(log.stamps[first.confirmed] - log.stamps[0]),
+        inlier_ratio=float(np.mean([fit.inlier_ratio or 0.0 for fit in first.fits])),
+        tracked=len(log) - lost - afterwards,
+        placed_afterwards=afterwards,
+        times_found=len(localiser.found),
+        refused=refused,
+    )

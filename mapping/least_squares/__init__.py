@@ -1,0 +1,1 @@
+"""Gauss-Newton steps and their degenerate directions."""

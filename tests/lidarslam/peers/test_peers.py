@@ -1,0 +1,170 @@
+"""Peers in a comparison: poses at the scans' stamps, rows for those that cannot run."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarslam.cli import main
+from lidarslam.compare.methods.names import parse_method
+from lidarslam.compare.peers.estimation import estimate, is_covered
+from lidarslam.compare.peers.interface import PeerError, Poses, Sweep
+from lidarslam.compare.peers.registry import PEERS
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.core.trajectory_io import write_tum
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+
+SWEEP_S = 0.1
+
+
+def _at(seconds: float) -> FloatArray:
+    """A motion whose speed and turn rate change."""
+    return exp(np.array([0.0, 0.0, 0.3, 1.0, 0.2, 0.0]) * seconds * (1.0 + seconds))
+
+
+class _Exact:
+    """A peer without errors, whose poses belong to the ends of the sweeps."""
+
+    def __init__(self) -> None:
+        self.samples: list[int] = []
+        self.instants: list[float] = []
+        self.ends_at_samples: list[int] = []
+
+    def add_imu(self, _: ImuSamples, number: int) -> None:
+        self.samples.append(number)
+
+    def load(self, sweep: Sweep) -> Callable[[], None]:
+        return lambda: (self.instants.append(sweep.end), self.ends_at_samples.append(len(self.samples)))[0]
+
+    def finish(self) -> Poses:
+        return Poses(np.array(self.instants), np.array([_at(instant) for instant in self.instants]))
+
+
+def _scans(count: int, empty: tuple[int, ...] = ()) -> list[Scan]:
+    points, offsets = np.random.default_rng(0).uniform(1.0, 9.0, (50, 3)), np.linspace(0.0, SWEEP_S, 50)
+    sizes = [0 if number in empty else 50 for number in range(count)]
+    return [Scan(points[:size], SWEEP_S * n, offsets[:size]) for n, size in enumerate(sizes)]
+
+
+def _peer(exact: _Exact, needs_imu: bool = False) -> "replace":
+    return replace(PEERS["small-gicp"], library="numpy", make=lambda *_: exact, needs_imu=needs_imu)
+
+
+def test_poses_are_interpolated_at_the_stamps_and_an_empty_scan_is_not_registered() -> None:
+    found = estimate(_peer(_Exact()), _scans(8, empty=(3,)))
+    np.testing.assert_allclose(found.trajectory.stamps, SWEEP_S * np.arange(8))
+    expected = np.array([_at(stamp) for stamp in found.trajectory.stamps])
+    np.testing.assert_allclose(found.trajectory.T_world_lidar[1:, :3, 3], expected[1:, :3, 3], atol=0.01)
+    assert len(found.register_ms) == 7
+
+
+def test_samples_of_the_imu_come_before_the_end_of_each_sweep_once_and_in_order() -> None:
+    exact = _Exact()
+    stamps = np.arange(-5, 100) * 0.01 + 0.005
+    samples = ImuSamples(stamps, np.zeros((105, 3)), np.zeros((105, 3)))
+    estimate(_peer(exact, needs_imu=True), _scans(4), samples)
+    assert exact.samples == list(range(45))
+    assert exact.ends_at_samples == [15, 25, 35, 45]
+
+
+def test_scans_in_a_gap_or_far_outside_the_poses_have_none() -> None:
+    instants = np.array([0.0, 3.0, 3.1, 3.2, 3.3])
+    stamps = np.array([-1.0, 0.0, 1.5, 2.9, 3.0, 3.35, 3.5, 4.0])
+    np.testing.assert_array_equal(is_covered(instants, stamps), [False, False, False, False, True, True, True, False])
+
+
+def test_poses_that_are_none_are_an_error() -> None:
+    exact = _Exact()
+    exact.finish = lambda: Poses(np.arange(2.0), np.full((2, 4, 4), np.nan))  # type: ignore[method-assign]
+    with pytest.raises(PeerError, match="not finite"):
+        estimate(_peer(exact), _scans(3))
+
+
+def test_ct_icps_poses_stand_at_the_starts_but_for_the_first_and_the_second() -> None:
+    pytest.importorskip("evalio", reason="needs the extra peers")
+    from lidarslam.compare.peers.evalio_pipelines import elastic_instants
+
+    starts = np.array([1.0, 1.1, 1.2, 1.3])
+    rows, instants = elastic_instants(starts, starts + 0.05, starts + 0.1)
+    assert rows.tolist() == [0, 2, 3]
+    np.testing.assert_allclose(instants, [1.05, 1.2, 1.3])
+    rows, instants = elastic_instants(starts, starts, starts)
+    assert rows.tolist() == [1, 2, 3, 4]
+    np.testing.assert_allclose(instants, starts)
+
+
+def _swaying(time: FloatArray) -> FloatArray:
+    """A motion to and fro, which an error of half a sweep in the instants cannot hide in."""
+    time = np.asarray(time)[..., None]
+    still = np.zeros_like(time)
+    return exp(
+        np.concatenate(
+            [still, still, 0.2 * np.sin(3.0 * time), 0.6 * np.sin(2.5 * time), 0.3 * np.cos(3.5 * time), still], axis=-1
+        )
+    )
+
+
+# Feature-based pipelines want rings, which the room does not have.
+@pytest.mark.parametrize("name", ["kiss-icp-evalio", "genz-icp", "mad-icp", "ct-icp", "kiss-slam", "small-gicp"])
+def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: Any) -> None:
+    pytest.importorskip(PEERS[name].library, reason="needs the extra peers")
+    stamps = SWEEP_S * np.arange(1, 26)
+    found = estimate(PEERS[name], (room.sweep(_swaying, float(stamp)) for stamp in stamps)).trajectory
+
+    def error_m(shift_s: float) -> float:
+        truth = Trajectory(found.stamps, _swaying(found.stamps + shift_s))
+        return evaluate_trajectory(found, truth).errors.ate_rmse_m
+
+    assert error_m(0.0) < min(error_m(-0.5 * SWEEP_S), error_m(0.5 * SWEEP_S))
+
+
+@pytest.fixture
+def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
+    folder = tmp_path / "room"
+    folder.mkdir()
+    for index, scan in enumerate(room_scans[:6]):
+        np.save(folder / f"{index:06d}.npy", scan.points)
+    np.savetxt(folder / "timestamps.txt", room_truth.stamps[:6], fmt="%.9f")
+    write_tum(folder / "ground_truth.tum", room_truth)
+    return folder
+
+
+def test_a_peer_is_a_row_with_a_map_and_one_that_cannot_run_is_a_row_too(recording: Path, tmp_path: Path) -> None:
+    pytest.importorskip("small_gicp", reason="needs the extra peers")
+    out = tmp_path / "compared"
+    arguments = ["compare", str(recording), "-o", str(out), "--methods", "small-gicp,rko-lio"]
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    methods = json.loads((out / "comparison.json").read_text())["methods"]
+    assert methods["small-gicp"]["status"] == "ok"
+    assert methods["small-gicp"]["metrics"]["trajectory"]["ate_rmse_m"] < 0.1
+    assert methods["rko-lio"]["status"] == "not run"
+    assert "IMU" in methods["rko-lio"]["message"] or "not installed" in methods["rko-lio"]["message"]
+    run = out / "room" / "small-gicp"
+    assert (run / "map.ply").is_file()
+    assert "peer: small_gicp" in (run / "config.yaml").read_text()
+    assert json.loads((run / "summary.json").read_text())["scans"] == 6
+    again = CliRunner().invoke(main, [*arguments, "--reuse"], catch_exceptions=False)
+    assert "small-gicp: ok" in again.output
+    assert "in an earlier comparison" in again.output
+
+
+def test_what_is_not_installed_names_the_extra() -> None:
+    with pytest.raises(PeerError, match=r"pip install 'lidarslam\[peers\]'"):
+        estimate(replace(PEERS["small-gicp"], library="no_such_library"), _scans(3))
+
+
+def test_a_method_can_be_a_peer_but_takes_no_mapping() -> None:
+    assert parse_method("ct-icp").peer == "ct-icp"
+    assert not parse_method("ct-icp").needs_prior
+    assert "odometry.kiss_icp.deskew=false" in parse_method("kiss-icp-no-deskew").settings
+    with pytest.raises(Exception, match="no method is called"):
+        parse_method("ct-icp+map")

@@ -1,0 +1,101 @@
+"""`lidarslam localise`: a recording of a room found in the map of a run, and one of another room refused."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.trajectory_io import read_tum
+from lidarslam.storage.finished_run import load_run
+
+Drive = Callable[[FloatArray], FloatArray]
+SCANS, FIRST = 34, 8
+WITHOUT_ODOMETRY = ["--odometry", "constant-velocity"]
+
+
+def record(folder: Path, room: Any, drive: Drive) -> Path:
+    """Scans as .npy files, with times and stamps."""
+    folder.mkdir()
+    stamps = 0.1 * np.arange(1, SCANS + 1)
+    for index, stamp in enumerate(stamps):
+        scan = room.sweep(drive, float(stamp))
+        rows = np.empty(len(scan.points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("time", "f8")])
+        rows["x"], rows["y"], rows["z"] = scan.points.T
+        rows["time"] = scan.time_offsets
+        np.save(folder / f"{index:06d}.npy", rows)
+    np.savetxt(folder / "timestamps.txt", stamps, fmt="%.9f")
+    return folder
+
+
+def call(*words: str | Path) -> Result:
+    """The command line."""
+    return CliRunner().invoke(main, [*map(str, words), *WITHOUT_ODOMETRY])
+
+
+@pytest.fixture(scope="module")
+def room(room: Any) -> Any:
+    """A room that does not look alike after half a turn."""
+    return type(room)(pillars=(*room.pillars, (5.3, 3.3, 1.5), (-1.0, -4.0, 0.9)))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, room: Any, drive: Drive) -> Path:
+    """Of the room."""
+    return record(tmp_path_factory.mktemp("recordings") / "room", room, drive)
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory, recording: Path) -> Path:
+    """A run of it."""
+    out = tmp_path_factory.mktemp("runs") / "mapped"
+    assert call("run", recording, "-o", out, "--no-report").exit_code == 0
+    return out
+
+
+def test_poses_are_in_the_frame_of_the_map(tmp_path: Path, recording: Path, mapped: Path, drive: Drive) -> None:
+    before, out = (mapped / "map.ply").read_bytes(), tmp_path / "again"
+    result = call("localise", recording, "--map", mapped, "-o", out, "--start", str(FIRST))
+    assert result.exit_code == 0, result.output
+    assert "found at scan" in result.output
+    assert (mapped / "map.ply").read_bytes() == before
+    trajectory, summary = read_tum(out / "trajectory.tum"), json.loads((out / "summary.json").read_text())
+    stamps = 0.1 * np.arange(FIRST + 1, SCANS + 1)
+    truth = inverse(drive(np.array([0.1]))[0]) @ drive(stamps)
+    assert np.linalg.norm((inverse(truth) @ trajectory.T_world_lidar)[:, :3, 3], axis=1).max() < 0.1
+    found = summary["localisation"]
+    assert found["found"]
+    assert Path(found["map"]) == mapped.resolve()
+    assert found["placed_afterwards"] == found["found_scan"]
+    assert summary["lost_scans"] == 0
+    assert {"report.html", "map.png", "scans.csv", "config.yaml"} <= {path.name for path in out.iterdir()}
+    run = load_run(out)
+    assert run.frame_of == mapped.resolve()
+    assert len(run.map_points) == len(load_run(mapped).map_points)
+
+
+def test_a_recording_of_another_place_is_refused(tmp_path: Path, room: Any, drive: Drive, mapped: Path) -> None:
+    other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
+    elsewhere, out = record(tmp_path / "elsewhere", other, drive), tmp_path / "out"
+    result = call("localise", elsewhere, "--map", mapped, "-o", out)
+    assert result.exit_code == 1
+    assert "not found in" in result.output
+    assert not (out / "trajectory.tum").exists()
+    found = json.loads((out / "summary.json").read_text())["localisation"]
+    assert not found["found"]
+    assert found["searches_refused"]
+
+
+def test_what_is_no_map_is_refused_before_anything_is_written(tmp_path: Path, recording: Path, mapped: Path) -> None:
+    out = tmp_path / "out"
+    result = call("localise", recording, "--map", recording, "-o", out)
+    assert result.exit_code == 1
+    result = call("localise", recording, "--map", mapped, "-o", out, "--set", "mapping.method=off")
+    assert result.exit_code == 1
+    assert "surfels" in result.output
+    assert not out.exists()
