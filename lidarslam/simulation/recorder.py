@@ -63,7 +63,7 @@ class Simulation:
     T_body_lidar: FloatArray  # (4, 4) how the sensor is mounted
     scan_count: int
     seed: int = 0  # of the noise
-    imu_model: ImuModel = MEMS_IMU
+    imu_model: ImuModel = MEMS_IMU  # of the IMU on the LiDAR
 
     @property
     def name(self) -> str:

@@ -356,6 +356,18 @@ def test_real_drives(real_data, name, scans, poses):
 
 
 @pytest.mark.real_data
+@pytest.mark.parametrize("name", ["0005", "0009"])
+def test_real_angular_velocities_are_those_of_the_poses(real_data, name):
+    recording = _drive(real_data, name)
+    imu, truth = recording.imu, recording.ground_truth
+    turns = log(inverse(imu.T_lidar_imu) @ truth.relative_motions() @ imu.T_lidar_imu)[:, :3]
+    measured = 0.5 * (imu.angular_velocities[1:] + imu.angular_velocities[:-1]) * np.diff(imu.stamps)[:, None]
+    assert np.rad2deg(np.std(turns - measured, axis=0)).max() < 0.1  # a tenth of the turns about z
+    assert np.rad2deg(np.std(turns, axis=0)[2]) > 0.5
+    assert np.median(imu.accelerations[:, 2]) == pytest.approx(9.81, abs=0.2)
+
+
+@pytest.mark.real_data
 def test_own_oxts_stamps_go_with_the_speed_better_than_those_of_the_scans(real_data):
     recording = _drive(real_data, "0005")
     truth = recording.ground_truth
