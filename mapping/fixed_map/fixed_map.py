@@ -65,7 +65,7 @@ def _spacing_m(points: FloatArray) -> float:
         return 0.0
     sample = points[:: max(1, len(points) // _SAMPLES)]
     distances, _ = cKDTree(points, balanced_tree=False, compact_nodes=False).query(sample, k=2)
-    return float(np.median(distances[:, 1]))
+    return float(np.median(np.asarray(distances)[:, 1]))
 
 
 def _vertical(normals: FloatArray) -> FloatArray:
