@@ -21,7 +21,7 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.scan_files import scan_indices
 from lidarslam.datasets.published import evalio_names
-from lidarslam.datasets.recording import PointField, Recording, RecordingInfo
+from lidarslam.datasets.recording import ImuSummary, PointField, Recording, RecordingInfo
 from lidarslam.datasets.times.point_time import PointTimeModel
 from lidarslam.datasets.times.stamps import increasing_rows
 
@@ -122,6 +122,21 @@ class EvalioRecording:
         kept = increasing_rows(stamps)
         return ImuSamples(stamps[kept], table[kept, 1:4], table[kept, 4:7], inverse(self._T_imu_lidar))
 
+    def _imu_summary(self) -> ImuSummary | None:
+        """By the index of bags; else by the samples."""
+        from evalio.datasets import RosbagIter
+
+        parameters = self._sequence.imu_params()
+        if not np.any(parameters.gravity):
+            return None
+        with self._reading("the IMU"):
+            iterator = self._sequence.data_iter()
+            if isinstance(iterator, RosbagIter):
+                number = sum(one.msgcount for one in iterator.connections_imu)
+            else:
+                number = sum(1 for _ in iterator.imu_iter())
+        return ImuSummary(f"{parameters.brand} {parameters.model}", number, float(parameters.rate), True)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """Truth without orientations."""
@@ -166,6 +181,7 @@ class EvalioRecording:
             last_stamp=first.stamp + (len(self) - 1) / lidar.rate,
             ground_truth=self._folder if self.ground_truth is not None else None,
             point_time=None if first.time_offsets is None else PointTimeModel("t", "ns", "relative"),
+            imu=self._imu_summary(),
             fields=tuple(PointField(name, kind) for name, kind in _FIELDS),
             notes=(
                 f"{self._sequence.full_name} by evalio, {lidar.brand} {lidar.model}; stamps at the start of a sweep.",

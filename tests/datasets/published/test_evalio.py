@@ -16,6 +16,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.recording import ImuSummary
 from lidarslam.datasets.registry import choose_reader, is_recording, open_recording
 
 START_NS = 1_640_000_000 * 10**9
@@ -128,6 +129,7 @@ def test_the_description_names_data_set_and_sensor(hilti: SimpleNamespace) -> No
     assert (info.scans, info.reader, info.ground_truth) == (3, "evalio", hilti.folder)
     assert info.rate_hz == pytest.approx(10.0)
     assert "hilti_2022/basement_2 by evalio, Hesai PandarXT-32" in info.notes[0]
+    assert info.imu == ImuSummary("Bosch BMI085", 100, 400.0, has_extrinsic=True)
 
 
 def test_newer_college_2021(
