@@ -23,13 +23,8 @@ _NOT_USED = (
     " missing between; none are made from the azimuth."
 )
 _OFFERED = (
-<<<<<<< HEAD
-    "The points have no times but are in the order of one turn; whether sweeps are as measured or motion compensated"
-    " does not show. If they are as measured, --set reader.time_reference=azimuth gives the points times."
-=======
     "The points have no times but are in the order of one turn; whether the sweeps are as measured or motion"
     " compensated does not show. If they are as measured, --set reader.time_reference=azimuth gives the points times."
->>>>>>> h/sensors
 )
 _NO_ORDER = "Times were to follow from the azimuth, but the points are not in the order of one turn."
 _TOO_SLOW = "Times were to follow from the azimuth, but the scans lie farther apart than a sweep lasts."
