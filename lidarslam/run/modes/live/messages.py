@@ -13,7 +13,6 @@ from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-_LIVOX_PACKAGES = ("livox_ros_driver2", "livox_interfaces")  # the drivers of ROS 2
 # Rotation first, as poses have their errors here, to translation first, as ROS has them.
 _ROS_ORDER = (3, 4, 5, 0, 1, 2)
 
@@ -22,9 +21,10 @@ _ROS_ORDER = (3, 4, 5, 0, 1, 2)
 def message_types() -> Typestore:
     """The definitions of all message types in use."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for package in _LIVOX_PACKAGES:
-        store.register(get_types_from_msg(livox.CUSTOM_POINT_DEFINITION, f"{package}/msg/CustomPoint"))
-        store.register(get_types_from_msg(livox.CUSTOM_MESSAGE_DEFINITION, f"{package}/msg/CustomMsg"))
+    for message_type in livox.CUSTOM_MESSAGE_TYPES:
+        point_type = message_type.replace("CustomMsg", "CustomPoint")
+        store.register(get_types_from_msg(livox.CUSTOM_POINT_DEFINITION, point_type))
+        store.register(get_types_from_msg(livox.CUSTOM_MESSAGE_DEFINITION, message_type))
     return store
 
 
