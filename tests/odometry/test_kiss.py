@@ -11,9 +11,10 @@ import pytest
 from kiss_icp.config import load_config
 from kiss_icp.kiss_icp import KissICP
 
-from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
+from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory, chain
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.odometry.config import KissConfig
 from lidarslam.odometry.methods.kiss import KissOdometry
 
@@ -137,3 +138,19 @@ def test_a_folder_that_looks_like_ours_does_not_get_in_the_way(
     odometry = KissOdometry(INDOOR)
     assert odometry.estimate(room_scans[0]).failure is None
     odometry.close()
+
+
+def test_without_deskewing_every_pose_belongs_to_the_middle_of_its_sweep(room: Any) -> None:
+    def to_and_fro(time: FloatArray) -> FloatArray:
+        return np.asarray(exp(np.multiply.outer(np.sin(3.0 * np.asarray(time)), [0.0, 0.0, 0.2, 0.5, 0.0, 0.0])))
+
+    stamps = 0.1 * np.arange(1, 16)
+    odometry = KissOdometry(INDOOR.model_copy(update={"deskew": False}))
+    motions = [odometry.estimate(room.sweep(to_and_fro, float(stamp), stamp_at=0.0)).T_prev_curr for stamp in stamps]
+    odometry.close()
+    found = Trajectory(stamps, chain(np.eye(4), np.array(motions[1:])))
+    at_start, at_middle = (
+        evaluate_trajectory(found, Trajectory(stamps, to_and_fro(stamps + later))).errors.ate_rmse_m
+        for later in (0.0, 0.05)
+    )
+    assert at_start < 0.7 * at_middle
