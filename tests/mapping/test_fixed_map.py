@@ -128,7 +128,7 @@ def test_of_two_places_that_fit_alike_none_is_taken_unless_one_is_guessed(room: 
 def test_a_place_that_later_scans_contradict_is_given_up(room: Any, room_map: FixedMap) -> None:
     other = type(room)(half_size=(9.0, 3.0, 1.6), pillars=((5.0, 0.5, 0.5), (-1.0, -1.0, 0.3)))
     localiser = MapLocaliser(MappingConfig(), room_map)
-    mapped = localise(localiser, [*scan_along(room, 15), *scan_along(other, 24)[15:]])
+    mapped = localise(localiser, [*scan_along(room, 8), *scan_along(other, 20)[8:]])
     first = next(number for number, one in enumerate(mapped) if one.status is not Status.LOST)
     assert not localiser.found
     assert first in localiser.unconfirmed()
