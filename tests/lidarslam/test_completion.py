@@ -17,7 +17,7 @@ def completed(line: str, shell: type[ShellComplete] = BashComplete) -> list[str]
     ("line", "expected"),
     [
         ("ru", ["plain run"]),
-        ("e", ["plain evaluate", "plain export"]),
+        ("ev", ["plain evaluate"]),
         ("run --res", ["plain --resume"]),
         ("run --odometry k", ["plain kiss-icp"]),
         ("run --mapping ", ["plain surfels", "plain loam", "plain off"]),
