@@ -6,7 +6,7 @@
 
 Prints a Markdown table, a row for each recording and step: how far the sensor moves and turns from scan to scan (the
 95th percentile), and of each method the ATE in metres after SE(3) alignment with the scans that were lost and degraded.
-A failed peer is told on standard error, and its cell says so; ct-icp itself knows no status.
+A failed peer is reported on standard error and in its cell; ct-icp itself has no status.
 
 Without recordings, all worlds are simulated. Simulated recordings go straight from the simulator into memory. At n
 times the scan interval every n-th scan is taken, each with all its points. `--scans` is for the single interval; of

@@ -44,7 +44,7 @@ def open_inertial(config: Config, recording: Recording, chosen: range) -> Inerti
 
     Raises:
         ConfigError: the recording has no IMU.
-        InputError: its samples are damaged, or nobody says how it is mounted and its turns do not show it.
+        InputError: its samples are damaged, or its extrinsic rotation is neither known nor observable.
     """
     samples = imu_samples(config, recording)
     if samples is None:
@@ -84,7 +84,7 @@ def _found(config: Config, recording: Recording, chosen: range, samples: ImuSamp
                 reason = str(error)
     if mounting is None:
         raise InputError(
-            f"{recording.name}: does not say how its IMU is mounted, and its turns do not show it ({reason}); give its"
+            f"{recording.name}: the extrinsic rotation of its IMU is not recorded, and not observable ({reason}); give its"
             f" roll, pitch and yaw with --set odometry.imu_rotation_deg=[R,P,Y], or {_INSTEAD}"
         )
     logger.info("the IMU's mounting was found to %.2f degrees", np.rad2deg(mounting.sigma))

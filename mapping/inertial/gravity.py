@@ -2,7 +2,7 @@
 
 The second difference of three positions `T` apart is the acceleration between them under a triangular weight; what the
 accelerometer shows beyond it, turned into the world by the registered attitudes, is gravity. The poses need not be
-differentiated, and the accelerometer's bias is told from gravity by the sensor's turns.
+differentiated, and the turns of the sensor separate the accelerometer's bias from gravity.
 """
 
 from dataclasses import dataclass

@@ -18,7 +18,7 @@ _FEWEST = 20
 
 
 class MountingError(ValueError):
-    """The turns do not show the rotation; the message says why."""
+    """The rotation is not observable by the turns; the message has the reason."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,7 +131,7 @@ def test_an_unknown_mounting_is_not_guessed_but_may_be_given(tmp_path: Path, roo
     source = record(tmp_path / "room", room, scans=20, mounting=False)
     result, _ = run(source, "--odometry", "imu", name="guess")
     assert result.exit_code == 1
-    assert "does not say how its IMU is mounted, and its turns do not show it (too few scans)" in result.output
+    assert "the extrinsic rotation of its IMU is not recorded, and not observable (too few scans)" in result.output
     angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
     result, out = run(source, "--odometry", "imu", "--set", f"odometry.imu_rotation_deg={angles}", name="given")
     assert result.exit_code == 0, result.output

@@ -43,7 +43,7 @@ _BASE_TYPES = {
 
 @dataclass(frozen=True, order=True)
 class PublishedTopic:
-    """A topic of ROS that somebody publishes."""
+    """A published topic of ROS."""
 
     name: str  # as in ROS, such as /points
     message_type: str  # as in ROS, such as sensor_msgs/msg/PointCloud2
@@ -58,7 +58,7 @@ class DdsNode:
 
     def __init__(self, domain: int) -> None:
         self.domain = domain
-        # Held, as the library deletes what nobody refers to.
+        # Held, as the library deletes what has no reference.
         self._domain = Domain(domain, f"{_CONFIG},{os.environ.get('CYCLONEDDS_URI', '')}".rstrip(","))
         self._participant = DomainParticipant(domain)
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)

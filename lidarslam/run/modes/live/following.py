@@ -25,14 +25,14 @@ logger = logging.getLogger(__name__)
 
 ODOMETRY_TOPIC, TF_TOPIC, TF_STATIC_TOPIC = "/lidarslam/odometry", "/tf", "/tf_static"
 _POLL_S, _SHOWN_EVERY_S = 0.2, 1.0
-# Reports without a message after which the user is told.
+# Reports without a message after which the silence is reported.
 _SILENT = 5
 _SILENCE = "no scan came for some seconds; waiting on, Ctrl-C ends the run and writes its results"
 _NOTHING = (
     "the topic is published, but nothing comes; waiting on. Publisher and this program may see each other without being"
     " able to reach each other (firewall, container, network interface), or the publisher is idle"
 )
-# A static transform is sent again to whoever subscribes; discovery of its publisher takes a while.
+# A static transform is sent again to later subscribers; discovery of its publisher takes a while.
 _STATIC_WITHIN_S = 5.0
 
 

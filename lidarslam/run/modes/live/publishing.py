@@ -17,7 +17,7 @@ class PosePublisher:
 
     Args:
         odometry: publishes a nav_msgs/Odometry.
-        transforms: publishes a tf2_msgs/TFMessage; None: nobody does.
+        transforms: publishes a tf2_msgs/TFMessage; None: no transforms.
         fixed_frame, body_frame: the names of the frames.
         T_body_lidar: (4, 4) the pose of the LiDAR on the body.
     """
