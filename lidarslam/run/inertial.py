@@ -84,8 +84,8 @@ def _found(config: Config, recording: Recording, chosen: range, samples: ImuSamp
                 reason = str(error)
     if mounting is None:
         raise InputError(
-            f"{recording.name}: the extrinsic rotation of its IMU is not recorded, and not observable ({reason}); give its"
-            f" roll, pitch and yaw with --set odometry.imu_rotation_deg=[R,P,Y], or {_INSTEAD}"
+            f"{recording.name}: the extrinsic rotation of its IMU is not recorded, and not observable ({reason}); give"
+            f" its roll, pitch and yaw with --set odometry.imu_rotation_deg=[R,P,Y], or {_INSTEAD}"
         )
     logger.info("the IMU's mounting was found to %.2f degrees", np.rad2deg(mounting.sigma))
     return make_transform(mounting.R_lidar_imu, np.zeros(3))

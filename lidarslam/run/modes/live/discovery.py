@@ -10,7 +10,7 @@ from lidarslam.datasets.ros.bag_message import CLOUD_TYPES
 
 logger = logging.getLogger(__name__)
 
-# Discovery of a running system is done within a second or two; after the second span the topics that are seen are printed.
+# Discovery of a running system is done within a second or two; after the second span the topics seen are printed.
 _SETTLED_S, _PATIENCE_S, _POLL_S = 2.0, 5.0, 0.1
 
 
