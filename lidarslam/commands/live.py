@@ -7,7 +7,11 @@ from typing import Any
 import click
 
 from lidarslam.commands.shared.options import (
+    OVERWRITE,
+    POSE_GRAPH,
     POSITIVE,
+    REPORT,
+    RERUN,
     CommandWithExample,
     config_options,
     default_out,
@@ -51,17 +55,11 @@ from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, s
 )
 @odometry_options
 @mapping_options
-@click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
-@click.option(
-    "--rerun",
-    type=click.Choice(["off", "save", "web", "spawn"]),
-    default="off",
-    show_default=True,
-    help="Save a Rerun recording; web serves a browser while it is written; spawn opens a window.",
-)
+@POSE_GRAPH
+@RERUN
 @map_options
-@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
+@REPORT
+@OVERWRITE
 @config_options
 @click.pass_context
 def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: Any) -> None:

@@ -7,7 +7,10 @@ from typing import Any
 import click
 
 from lidarslam.commands.shared.options import (
+    OVERWRITE,
     PATH,
+    REPORT,
+    RERUN,
     SOURCE,
     CommandWithExample,
     config_options,
@@ -41,15 +44,9 @@ from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, s
 )
 @odometry_options
 @scan_options
-@click.option(
-    "--rerun",
-    type=click.Choice(["off", "save", "web", "spawn"]),
-    default="off",
-    show_default=True,
-    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
-)
-@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
+@RERUN
+@REPORT
+@OVERWRITE
 @reader_options
 @config_options
 @click.pass_context

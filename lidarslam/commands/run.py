@@ -8,6 +8,10 @@ import click
 
 from lidarslam.commands.shared.options import (
     FILE,
+    OVERWRITE,
+    POSE_GRAPH,
+    REPORT,
+    RERUN,
     SOURCE,
     CommandWithExample,
     config_options,
@@ -38,19 +42,13 @@ from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, s
 @odometry_options
 @click.option("--prior", type=FILE, metavar="TUM_FILE", help="External trajectory to use as the odometry.")
 @mapping_options
-@click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
+@POSE_GRAPH
 @scan_options
-@click.option(
-    "--rerun",
-    type=click.Choice(["off", "save", "web", "spawn"]),
-    default="off",
-    show_default=True,
-    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
-)
+@RERUN
 @map_options
-@click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
+@REPORT
 @click.option("--resume", is_flag=True, help="Continue a run that was killed or stopped; repeat its other options.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
+@OVERWRITE
 @reader_options
 @config_options
 @click.pass_context

@@ -60,6 +60,17 @@ def _together(*decorators: _Decorator) -> _Decorator:
     return apply
 
 
+# Of the commands that leave a run directory.
+POSE_GRAPH = click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
+RERUN = click.option(
+    "--rerun",
+    type=click.Choice(["off", "save", "web", "spawn"]),
+    default="off",
+    show_default=True,
+    help="Save a Rerun recording; web serves a browser while it is written, and on until Ctrl-C; spawn opens a window.",
+)
+REPORT = click.option("--report/--no-report", default=True, help="Draw report.html and pictures.  [default: report]")
+OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace an earlier run in the directory.")
 SOURCE = click.argument("source", type=PATH)
 
 config_options = _together(
