@@ -62,6 +62,8 @@ class EvalioEstimator:
         from evalio.types import SE3, ImuParams, LidarParams
 
         self._pipeline = pipeline
+        # evalio counts seconds without a sign; a sweep whose stamp is its middle may start before zero.
+        self._begin = min(first.start, np.inf if imu is None else float(imu.stamps[0])) - 1.0
         self._shape = _image_shape(first)
         self._T_lidar_imu = np.eye(4) if imu is None or imu.T_lidar_imu is None else imu.T_lidar_imu
         self._sweeps: list[Sweep] = []
@@ -85,7 +87,7 @@ class EvalioEstimator:
         """Take the sample with this number."""
         from evalio.types import ImuMeasurement, Stamp
 
-        stamp = Stamp.from_sec(float(samples.stamps[number]))
+        stamp = Stamp.from_sec(float(samples.stamps[number]) - self._begin)
         self._native.add_imu(ImuMeasurement(stamp, samples.angular_velocities[number], samples.accelerations[number]))
 
     def load(self, sweep: Sweep) -> Callable[[], None]:
@@ -94,11 +96,13 @@ class EvalioEstimator:
 
         self._sweeps.append(sweep)
         points = _by_rings(sweep, self._shape) if self._pipeline.by_rings else _as_recorded(sweep)
-        measured = LidarMeasurement(Stamp.from_sec(sweep.start), points)
+        measured = LidarMeasurement(Stamp.from_sec(sweep.start - self._begin), points)
 
         def register() -> None:
             self._native.add_lidar(measured)
-            self._saved += [(stamp.to_sec(), pose.to_mat()) for stamp, pose in self._native.saved_estimates()]
+            self._saved += [
+                (stamp.to_sec() + self._begin, pose.to_mat()) for stamp, pose in self._native.saved_estimates()
+            ]
             self._native.saved_features()  # they pile up otherwise
 
         return register

@@ -126,6 +126,14 @@ def test_the_poses_fit_the_truth_best_at_the_scans_own_stamps(name: str, room: A
     assert error_m(0.0) < min(error_m(-0.5 * SWEEP_S), error_m(0.5 * SWEEP_S))
 
 
+def test_a_sweep_may_start_before_the_clock(room: Any) -> None:
+    pytest.importorskip("evalio", reason="needs the extra peers")
+    sweeps = [room.sweep(_swaying, SWEEP_S * number) for number in range(1, 7)]
+    earlier = [replace(sweep, stamp=sweep.stamp - 0.25) for sweep in sweeps]
+    found, shifted = (estimate(PEERS["kiss-icp-evalio"], scans).trajectory for scans in (sweeps, earlier))
+    np.testing.assert_allclose(shifted.T_world_lidar, found.T_world_lidar, atol=1e-6)
+
+
 @pytest.fixture
 def recording(tmp_path: Path, room_scans: list[Scan], room_truth: Trajectory) -> Path:
     folder = tmp_path / "room"
