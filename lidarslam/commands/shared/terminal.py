@@ -2,7 +2,7 @@
 
 import contextlib
 import logging
-import signal
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -40,7 +40,8 @@ def serving() -> "Iterator[WebPage]":
 def wait_for_interrupt() -> None:
     """Serve on until Ctrl-C or SIGTERM, which is how it ends well."""
     with contextlib.suppress(KeyboardInterrupt):
-        signal.pause()
+        while True:  # signal.pause would sleep on after a signal that came just before it
+            time.sleep(0.5)
 
 
 def _announce(address: str) -> None:
