@@ -121,6 +121,7 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     np.testing.assert_allclose([one.transform.translation.x for one in sent], trajectory.positions[:, 0], atol=1e-8)
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_interrupted_it_writes_what_came(
     bag: Path, tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
 ) -> None:
