@@ -1,25 +1,19 @@
-"""Messages of ROS 1 and ROS 2, made of poses and points."""
+"""Messages of a run, for ROS 1 or ROS 2."""
 
 from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
-
-ODOMETRY = "nav_msgs/msg/Odometry"
-PATH = "nav_msgs/msg/Path"
-POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
-TF_MESSAGE = "tf2_msgs/msg/TFMessage"
-
-_NS = 10**9
+from lidarslam.datasets.ros import made_messages as made
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
 
 
 def nanoseconds(stamp: float) -> int:
     """A stamp in whole nanoseconds; `nanoseconds(stamp) / 10**9` is the stamp again."""
-    return round(stamp * _NS)
+    return round(stamp * 10**9)
 
 
 class RosMessages:
@@ -28,8 +22,8 @@ class RosMessages:
     def __init__(self, ros2: bool) -> None:
         self._ros2 = ros2
         self.store = get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
-        if not ros2:
-            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
+        if not ros2:  # ROS 2's store has it
+            self.store.register(get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS_TYPE))
         self._sequence = 0
 
     def serialize(self, message: Any) -> bytes:
@@ -42,37 +36,24 @@ class RosMessages:
     ) -> Any:
         """A pose (4, 4) of the second frame in the first, with standard deviations (6,) and body velocity (6,).
 
-        Both have the rotation first and the axes of the second frame. ROS has translation first, and the covariance of
-        the pose in the axes of the first frame. Unknown covariances are zero.
+        Both have the rotation first and the axes of the second frame; standard deviations that are not finite are
+        unknown.
         """
-        covariance = np.zeros((6, 6))
-        if np.isfinite(sigmas).all():
-            R = T[:3, :3]
-            covariance[:3, :3] = R @ np.diag(sigmas[3:] ** 2) @ R.T
-            covariance[3:, 3:] = R @ np.diag(sigmas[:3] ** 2) @ R.T
-        pose = self._new("geometry_msgs/msg/PoseWithCovariance", self._pose(T), covariance.ravel())
-        vector = "geometry_msgs/msg/Vector3"
-        twist = self._new("geometry_msgs/msg/Twist", self._new(vector, *velocity[3:]), self._new(vector, *velocity[:3]))
-        with_covariance = self._new("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
-        return self._new(ODOMETRY, self._header(stamp, frames[0]), frames[1], pose, with_covariance)
+        covariance = np.diag(sigmas**2) if np.isfinite(sigmas).all() else None
+        return made.odometry(self.store, self._header(stamp, frames[0]), frames[1], T, covariance, velocity)
 
     def transforms(self, stamp: float, *poses: tuple[str, str, FloatArray]) -> Any:
         """Parent frame, child frame and pose (4, 4) of the child in the parent, of each transform."""
-        transforms = []
-        for parent, child, T in poses:
-            translation = self._new("geometry_msgs/msg/Vector3", *T[:3, 3])
-            transform = self._new("geometry_msgs/msg/Transform", translation, self._quaternion(T))
-            stamped = "geometry_msgs/msg/TransformStamped"
-            transforms.append(self._new(stamped, self._header(stamp, parent), child, transform))
-        return self._new(TF_MESSAGE, transforms)
+        return made.transforms(self.store, *((self._header(stamp, parent), child, T) for parent, child, T in poses))
 
     def path(self, stamps: FloatArray, frame: str, T: FloatArray) -> Any:
         """Poses (N, 4, 4) in a frame; the header has the last stamp."""
+        types, store = self.store.types, self.store
         poses = [
-            self._new("geometry_msgs/msg/PoseStamped", self._header(float(stamp), frame), self._pose(each))
+            types["geometry_msgs/msg/PoseStamped"](self._header(float(stamp), frame), made.pose(store, each))
             for stamp, each in zip(stamps, T, strict=True)
         ]
-        return self._new(PATH, self._header(float(stamps[-1]), frame), poses)
+        return types["nav_msgs/msg/Path"](self._header(float(stamps[-1]), frame), poses)
 
     def cloud(self, stamp: float, frame: str, points: FloatArray, attributes: PointAttributes) -> Any:
         """Points (N, 3) with intensity, ring and colour as far as there are any."""
@@ -87,31 +68,8 @@ class RosMessages:
         records = np.empty(len(points), np.dtype([(name, values.dtype) for name, values in columns.items()]))
         for name, values in columns.items():
             records[name] = values
-        kind: Any = self.store.types["sensor_msgs/msg/PointField"]
-        fields = [
-            kind(name, offset, getattr(kind, dtype.name.upper()), 1)
-            for name, (dtype, offset, *_) in (records.dtype.fields or {}).items()
-        ]
-        step, count = records.dtype.itemsize, len(records)
-        data = np.frombuffer(records.tobytes(), np.uint8)
-        return self._new(
-            POINT_CLOUD2, self._header(stamp, frame), 1, count, fields, False, step, step * count, data, True
-        )
-
-    def _new(self, name: str, *values: Any) -> Any:
-        return self.store.types[name](*values)
+        return made.point_cloud(self.store, self._header(stamp, frame), records)
 
     def _header(self, stamp: float, frame: str) -> Any:
-        seconds, ns = divmod(nanoseconds(stamp), _NS)
-        time = self._new("builtin_interfaces/msg/Time", seconds, ns)
-        if self._ros2:
-            return self._new("std_msgs/msg/Header", time, frame)
         self._sequence += 1
-        return self._new("std_msgs/msg/Header", self._sequence - 1, time, frame)
-
-    def _pose(self, T: FloatArray) -> Any:
-        point = self._new("geometry_msgs/msg/Point", *T[:3, 3])
-        return self._new("geometry_msgs/msg/Pose", point, self._quaternion(T))
-
-    def _quaternion(self, T: FloatArray) -> Any:
-        return self._new("geometry_msgs/msg/Quaternion", *Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True))
+        return made.header(self.store, nanoseconds(stamp), frame, self._sequence - 1)

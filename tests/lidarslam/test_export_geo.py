@@ -16,7 +16,9 @@ from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.core.trajectory_io import read_tum, write_tum
-from lidarslam.exports.ros_messages import POINT_CLOUD2, TF_MESSAGE, RosMessages, nanoseconds
+from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
+from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
+from lidarslam.exports.ros_messages import RosMessages, nanoseconds
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 
@@ -63,7 +65,7 @@ def write_bag(path: Path, stamps: FloatArray, T_utm_lidar: FloatArray) -> None:
     antenna = T_utm_lidar[:, :3, :3] @ ANTENNA + T_utm_lidar[:, :3, 3]
     longitude, latitude = pyproj.Transformer.from_crs(32756, 4326, always_xy=True).transform(*antenna[:, :2].T)
     with Writer(path) as bag:
-        topics = {"/points": POINT_CLOUD2, "/fix": "sensor_msgs/msg/NavSatFix", "/tf_static": TF_MESSAGE}
+        topics = {"/points": POINT_CLOUD2_TYPE, "/fix": "sensor_msgs/msg/NavSatFix", "/tf_static": TRANSFORMS_TYPE}
         opened = {name: bag.add_connection(name, kind, typestore=messages.store) for name, kind in topics.items()}
         fixed = messages.transforms(stamps[0], ("lidar", "gps", make_transform(np.eye(3), ANTENNA)))
         bag.write(opened["/tf_static"], nanoseconds(stamps[0]), messages.serialize(fixed))

@@ -15,18 +15,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lidarslam.core.errors import OutputError
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
 from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
+from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE, header, point_cloud, transforms
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.driver_clouds import DriverCloud, Records, find_driver
-from lidarslam.simulation.writers.imu_messages import (
-    IMU_TYPE,
-    STATIC_TRANSFORMS,
-    header,
-    imu_messages,
-    static_transform,
-)
+from lidarslam.simulation.writers.imu_messages import IMU_TYPE, imu_messages
 from lidarslam.simulation.writers.interface import CLOCK_START_NS, Rig, clock_ns
 
-_POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
+_STATIC_TRANSFORMS = "/tf_static"
 _CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
 _CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
 
@@ -88,8 +83,9 @@ def _imu(bag: Rosbag1Writer | Rosbag2Writer, serializer: "MessageSerializer", ri
         return
     store = serializer.store
     if imu.T_lidar_imu is not None:
-        placed = bag.add_connection(STATIC_TRANSFORMS, TRANSFORMS_TYPE, typestore=store)
-        message = static_transform(store, CLOCK_START_NS, driver.frame_id, driver.imu_frame_id, imu.T_lidar_imu)
+        placed = bag.add_connection(_STATIC_TRANSFORMS, TRANSFORMS_TYPE, typestore=store)
+        parent = header(store, CLOCK_START_NS, driver.frame_id)
+        message = transforms(store, (parent, driver.imu_frame_id, imu.T_lidar_imu))
         yield placed, CLOCK_START_NS, serializer.serialized(message, TRANSFORMS_TYPE)
     connection = bag.add_connection(driver.imu_topic, IMU_TYPE, typestore=store)
     for stamp_ns, sample in imu_messages(store, imu, driver.imu_frame_id):
@@ -109,14 +105,14 @@ class MessageSerializer:
 
     def message_type(self, driver: DriverCloud) -> str:
         """The name of the driver's message type."""
-        return _CUSTOM_MESSAGE if driver.custom_message else _POINT_CLOUD2
+        return _CUSTOM_MESSAGE if driver.custom_message else POINT_CLOUD2_TYPE
 
     def serialize(self, driver: DriverCloud, records: Records, stamp_ns: int, sequence: int) -> bytes:
         """The message with these points (N,), stamped `stamp_ns`; `sequence` counts the messages, for ROS 1."""
         message_header = header(self.store, stamp_ns, driver.frame_id, sequence)
         message_type = self.message_type(driver)
         if not driver.custom_message:
-            return self.serialized(self._cloud(message_header, records), message_type)
+            return self.serialized(point_cloud(self.store, message_header, records), message_type)
         rsvd = np.zeros(3, np.uint8)
         message = self.store.types[message_type](message_header, stamp_ns, len(records), _LIDAR_ID, rsvd, [])
         # Twenty thousand point objects would take longer than casting their rays: the bytes are put in place of the
@@ -128,26 +124,6 @@ class MessageSerializer:
         """The bytes of a message."""
         serialize = self.store.serialize_cdr if self._ros2 else self.store.serialize_ros1
         return bytes(serialize(message, message_type))
-
-    def _cloud(self, header: Any, records: Records) -> Any:
-        point_field: Any = self.store.types["sensor_msgs/msg/PointField"]
-        # The message names its constants FLOAT32, UINT16 and so on, as NumPy names its types.
-        fields = [
-            point_field(name=name, offset=offset, datatype=getattr(point_field, kind.name.upper()), count=1)
-            for name, (kind, offset, *_) in (records.dtype.fields or {}).items()
-        ]
-        step = records.dtype.itemsize
-        return self.store.types[_POINT_CLOUD2](
-            header=header,
-            height=1,
-            width=len(records),
-            fields=fields,
-            is_bigendian=False,
-            point_step=step,
-            row_step=step * len(records),
-            data=np.frombuffer(records.tobytes(), np.uint8),
-            is_dense=True,
-        )
 
     def _packed(self, records: Records) -> bytes:
         """Points one after the other; in CDR each begins at a multiple of four bytes."""

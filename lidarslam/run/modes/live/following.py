@@ -11,11 +11,11 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
+from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
 from lidarslam.run.modes.live.clouds import CloudDecoder
 from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
 from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
-from lidarslam.run.modes.live.messages import ODOMETRY_TYPE
 from lidarslam.run.modes.live.publishing import PosePublisher
 from lidarslam.run.modes.live.request import LiveRequest
 from lidarslam.run.modes.live.session import LiveSession
