@@ -335,6 +335,14 @@ def test_light_modules_load_nothing_heavy(sources):
     assert done.stdout.strip() == "[]", done.stderr
 
 
+def test_a_run_begins_without_libraries_that_few_runs_need():
+    slow = {"scipy.interpolate", "scipy.optimize", "scipy.spatial", "open3d", "torch", "gtsam", "rerun", "evalio"}
+    names = ("lidarslam.run.run", "lidarslam.datasets.ros.rosbag", "lidarslam.datasets.folders.scan_folder")
+    code = f"import sys, {', '.join(names)}; print(sorted({slow!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
 @pytest.mark.parametrize(
     ("rule", "planted", "told"),
     [

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform
 from lidarslam.core.imu import ImuSamples
@@ -39,6 +38,8 @@ class Integral:
     """The integral of samples (N, 3), linear between their stamps (N,)."""
 
     def __init__(self, stamps: FloatArray, samples: FloatArray) -> None:
+        from scipy.interpolate import make_interp_spline  # takes a while to load
+
         self._begin = stamps[0]  # of clocks that count from 1970 half the digits would be lost
         self._curve = make_interp_spline(stamps - stamps[0], samples, k=1).antiderivative()
 

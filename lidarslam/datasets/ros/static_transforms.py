@@ -4,7 +4,6 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.datasets.ros.bag_file import BagFile
@@ -55,6 +54,8 @@ def _name(frame_id: str) -> str:
 
 def _matrix(transform: Any) -> FloatArray:
     """(4, 4) of a geometry_msgs/Transform."""
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
     q, t = transform.rotation, transform.translation
     T = make_transform(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), [t.x, t.y, t.z])
     if not np.isfinite(T).all():

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.times.point_time import PointTimeModel, is_return
@@ -161,6 +160,8 @@ def are_as_measured(pairs: Iterable[Sequence[SweepOrder]]) -> bool | None:
 
 def _across_seam(sweep: SweepOrder, following: SweepOrder) -> tuple[FloatArray, FloatArray]:
     """Differences of range (K,) of a sweep's last points to the next one's first points, and to its own."""
+    from scipy.spatial import KDTree  # takes a while to load
+
     end = sweep.end()
     end = end[np.linalg.norm(end, axis=1) > _NEAREST_M]
     ranges = np.linalg.norm(end, axis=1, keepdims=True)
