@@ -15,8 +15,8 @@ import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import execute
 from lidarslam.run.summary.summary import RunSummary

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
+from lidarslam.core.text.trajectory_io import read_kitti_poses
 from lidarslam.core.trajectory import Trajectory, chain
-from lidarslam.core.trajectory_io import read_kitti_poses
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.correction import corrected

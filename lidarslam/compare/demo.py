@@ -16,7 +16,7 @@ from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.core.plain_text import as_typed
+from lidarslam.core.text.plain_text import as_typed
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest

@@ -9,8 +9,8 @@ from lidarslam.compare.assessment.map_evaluation import evaluate_map
 from lidarslam.compare.assessment.reference_map import ReferenceMap, find_reference_map, load_reference_map
 from lidarslam.compare.plan import PlannedRecording
 from lidarslam.core.errors import InputError
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum
 from lidarslam.evaluation.comparison.comparison import MethodResult, SequenceComparison
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.compare.plan import REPORT_HTML, REPORT_MD
-from lidarslam.core.plain_text import as_typed
+from lidarslam.core.text.plain_text import as_typed
 from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.quantities import QUANTITIES
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text

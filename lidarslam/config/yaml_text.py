@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.plain_text import one_line
+from lidarslam.core.text.plain_text import one_line
 
 # A configuration has a few kilobytes.
 _LONGEST_BYTES = 4 << 20

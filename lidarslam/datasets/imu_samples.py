@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
-from lidarslam.core.plain_text import count
+from lidarslam.core.text.plain_text import count
 from lidarslam.datasets.recording import ImuSummary
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g

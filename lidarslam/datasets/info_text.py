@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.core.plain_text import count, one_line
 from lidarslam.core.scan import Scan
+from lidarslam.core.text.plain_text import count, one_line
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.recording import ImuSummary, RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.registry import choose_reader, open_recording

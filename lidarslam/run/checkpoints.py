@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import OutputError
-from lidarslam.core.plain_text import count
 from lidarslam.core.scan import Scan
+from lidarslam.core.text.plain_text import count
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.resuming import scans_left

@@ -7,8 +7,8 @@ from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.core.geometry import inverse
-from lidarslam.core.plain_text import count
-from lidarslam.core.trajectory_io import format_kitti, format_tum
+from lidarslam.core.text.plain_text import count
+from lidarslam.core.text.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import Config, ViewerConfig
 from lidarslam.core.errors import ConfigError, OutputError
-from lidarslam.core.trajectory_io import read_tum
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.plain_text import as_typed, count, scan_span, small_length
+from lidarslam.core.text.plain_text import as_typed, count, scan_span, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary.summary import GraphSummary, RunSummary, WrittenMap

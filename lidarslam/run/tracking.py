@@ -10,8 +10,8 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse
-from lidarslam.core.plain_text import count
 from lidarslam.core.scan import Scan
+from lidarslam.core.text.plain_text import count
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
 
-from lidarslam.core.plain_text import as_typed, count
+from lidarslam.core.text.plain_text import as_typed, count
 from lidarslam.odometry.training.training import Validation
 
 

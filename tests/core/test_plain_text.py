@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarslam.core.plain_text import one_line, printable
+from lidarslam.core.text.plain_text import one_line, printable
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import pytest
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp
+from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import write_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply

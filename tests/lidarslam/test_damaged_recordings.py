@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from lidarslam.cli import main
 from lidarslam.core.geometry import is_rigid
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
+from lidarslam.core.text.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.folders.ply import read_ply
 
 FAST = ("--odometry", "constant-velocity", "--no-pose-graph", "--no-report")

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
+from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.simulation.sensors.imu import MEMS_IMU, sample_imu
 
 SCANS = 20

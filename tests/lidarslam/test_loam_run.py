@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.mapping.loam.features import Features, extract_features
 
 SCANS = 8

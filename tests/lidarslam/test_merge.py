@@ -18,8 +18,8 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
+from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum, write_tum
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.run.modes.merge.merge import MergeOutcome, merge
 from lidarslam.run.modes.merge.parts import MergeRequest

@@ -11,8 +11,8 @@ from lidarslam.config.settings import Config, load_config
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.text.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import READERS, open_recording
 from lidarslam.datasets.unrecognised import absent

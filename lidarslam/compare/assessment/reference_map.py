@@ -5,8 +5,8 @@ from pathlib import Path
 
 from lidarslam.compare.assessment.reference_cloud import read_cloud
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import read_tum
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 
 

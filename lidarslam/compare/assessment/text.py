@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 
 from lidarslam.compare.assessment.evaluate import Evaluation
 from lidarslam.compare.assessment.map_evaluation import MapEvaluation
-from lidarslam.core.plain_text import as_typed
+from lidarslam.core.text.plain_text import as_typed
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics

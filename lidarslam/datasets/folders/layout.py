@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.plain_text import count
+from lidarslam.core.text.plain_text import count
 from lidarslam.datasets.folders.imu_csv import find_imu_file
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES, natural_key
 from lidarslam.datasets.folders.truth_files import find_truth_file

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.plain_text import count
+from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.core.trajectory_io import write_tum
 from lidarslam.simulation.casting.mesh import world_mesh
 from lidarslam.simulation.motion.carriers import find_carrier, mount_pose
 from lidarslam.simulation.recorder import SimulatedScan, Simulation

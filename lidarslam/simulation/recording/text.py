@@ -3,7 +3,7 @@
 import shlex
 from importlib.metadata import version
 
-from lidarslam.core.plain_text import as_typed, count, small_length
+from lidarslam.core.text.plain_text import as_typed, count, small_length
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.simulation.recording.request import RecordingSummary, RecordRequest
 from lidarslam.simulation.writers.registry import find_format

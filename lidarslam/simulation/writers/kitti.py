@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.scan import Scan
-from lidarslam.core.trajectory_io import format_kitti
+from lidarslam.core.text.trajectory_io import format_kitti
 from lidarslam.datasets.kitti.correction import ELEVATION_DEG, correct_elevation
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from lidarslam.config.settings import dump_yaml
+from lidarslam.core.text.trajectory_io import format_tum
 from lidarslam.core.tracking import Status
-from lidarslam.core.trajectory_io import format_tum
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser

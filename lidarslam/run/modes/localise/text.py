@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Iterator
 
-from lidarslam.core.plain_text import as_typed, count, scan_span
+from lidarslam.core.text.plain_text import as_typed, count, scan_span
 from lidarslam.run.modes.localise.localise import LocaliseOutcome
 from lidarslam.run.modes.localise.request import LocaliseRequest
 from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lidarslam.core.plain_text import count
+from lidarslam.core.text.plain_text import count
 from lidarslam.run.modes.merge.merge import MergeOutcome
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.results import RunOutcome

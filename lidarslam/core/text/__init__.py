@@ -1,0 +1,1 @@
+"""Text: trajectory files, and untrusted names on one line."""
