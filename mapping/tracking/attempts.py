@@ -10,6 +10,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
+from lidarslam.mapping.surfels.matching import Matcher
 from lidarslam.mapping.surfels.registration import Registration, register, with_mean_velocity
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
@@ -203,14 +204,17 @@ class ScanMatcher:
         if registration is None:
             return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
         points = keypoints.compensated(registration.velocity)
-        fit = measure_fit(points, registration.T_world_lidar, self._map)
+        fit = measure_fit(points, registration.T_world_lidar, self._map, registration.matcher)
         return Attempt(prediction, self._map, registration, fit, fit.status(self._config.tracking))
 
 
-def measure_fit(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> Fit:
-    """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4)."""
-    world = transform_points(T_world_lidar, points)
-    matches = surfel_map.match(world, T_world_lidar).first_of_each_point()
+def measure_fit(
+    points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap, matcher: Matcher | None = None
+) -> Fit:
+    """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4), with the matcher of a pose nearby."""
+    matcher, world = matcher or surfel_map.matcher(len(points)), transform_points(T_world_lidar, points)
+    matcher.match(world, T_world_lidar)
+    matches = matcher.correspondences().first_of_each_point()
     distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
     ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
     return Fit.of(distances, matches.normals, ranges, len(points), surfel_map.cell_m)
