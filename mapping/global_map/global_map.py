@@ -78,6 +78,15 @@ class _Voxels:
         count = kernels.add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
         return _Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
 
+    def united(self, other: "_Voxels") -> "_Voxels":
+        """Both of them, reduced; both are reduced already."""
+        layout = Layout.union([self.layout, other.layout])
+        sums = [part.layout.widened(part.sums, layout) for part in (self, other)]
+        unique = np.empty(len(self.keys) + len(other.keys), dtype=np.int64)
+        totals = np.empty((len(unique), layout.width), dtype=np.float32)
+        count = kernels.unite(self.keys, sums[0], other.keys, sums[1], layout.summed, unique, totals)
+        return _Voxels(unique[:count].copy(), totals[:count].copy(), layout)
+
     def chosen(self, rows: NDArray[np.bool_]) -> "_Voxels":
         """Some of them."""
         return _Voxels(self.keys[rows], self.sums[rows], self.layout)
@@ -168,7 +177,7 @@ class GlobalMap(Stateful):
     def _merge(self) -> None:
         if self._pending_size:
             waiting = _Voxels.join(self._pending).reduced()
-            self._merged = _Voxels.join([self._merged, waiting]).reduced()
+            self._merged = self._merged.united(waiting)
         self._pending, self._pending_size = [], 0
 
     def _voxels(self, min_hits: int) -> _Voxels:
