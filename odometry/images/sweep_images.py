@@ -109,9 +109,9 @@ class Imager(Stateful):
 
 def _images(projection: Projection, grid: ImageGrid, scan: Scan, is_fine: bool = False) -> SweepImages:
     offsets = np.zeros(projection.index.shape, dtype=np.float32)
-    if scan.time_offsets is not None:
-        seen = projection.index >= 0
-        offsets[seen] = scan.time_offsets[projection.index[seen]] - scan.middle_offset_s
+    if scan.time_offsets is not None and len(scan):
+        seconds = scan.time_offsets.take(projection.index) - scan.middle_offset_s
+        np.copyto(offsets, seconds, where=projection.index >= 0, casting="same_kind")
     normals = surface_normals(projection.image, FINE_PATCHES if is_fine else PATCHES)
     return SweepImages(projection.image[:3], normals, offsets, grid.elevation_low, grid.elevation_high)
 
