@@ -192,13 +192,13 @@ def column_of(azimuth: float, width: int) -> float:
 def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: Floats) -> None:
     """Write the angles of points to single precision, in loops each of which takes several at once."""
     for i in range(len(x)):
-        elevations[i] = _arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
+        elevations[i] = arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
     for i in range(len(x)):
-        azimuths[i] = _arc_tangent(y[i], x[i])
+        azimuths[i] = arc_tangent(y[i], x[i])
 
 
 @compiled_part
-def _arc_tangent(y: np.float32, x: np.float32) -> np.float32:
+def arc_tangent(y: np.float32, x: np.float32) -> np.float32:
     """atan2 in single precision without branches, so that the processor takes several at once; NaN for NaN.
 
     Cephes Mathematical Library, atanf.c (Moshier, 1989).
