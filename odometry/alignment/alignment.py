@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.odometry.alignment.correspondences import Motion
 from lidarslam.odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
-from lidarslam.odometry.alignment.residuals import Motion
 from lidarslam.odometry.alignment.steps import gauss_newton_step
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from lidarslam.odometry.alignment.residuals import Motion, Planes, accumulate
+from lidarslam.odometry.alignment.correspondences import Motion, Planes
+from lidarslam.odometry.alignment.residuals import accumulate
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.projection import Floats
 from lidarslam.odometry.images.sweep_images import SweepImages
@@ -65,7 +66,7 @@ class PointToPlane:
 
 
 def _points(images: SweepImages, column_step: int) -> tuple[Floats, int]:
-    """(7, N or more) point, normal and seconds of pixels that have a normal, and N; the more rows, the fewer of each."""
+    """(7, N or more) point, normal and seconds of pixels that have a normal, and N; of more rows fewer each."""
     height, width = images.offsets.shape
     fewer = max(1, height // _FULL_ROWS)
     room = np.empty((7, height * (width // (fewer * column_step) + 1)), dtype=np.float32)

@@ -61,7 +61,7 @@ def surface_normals(image: Floats, patches: Sequence[Patch] = PATCHES) -> Floats
             patches.
         patches: of the tries, in turn.
     """
-    rows, columns = (max((patch[axis] for patch in patches), default=0) for axis in (0, 1))
+    rows, columns = max((one.rows for one in patches), default=0), max((one.columns for one in patches), default=0)
     height, width = image.shape[1:]
     padded = np.empty((4, height + 2 * rows, width + 2 * columns + _AT_ONCE - 1), dtype=np.float32)
     _pad(image, rows, columns, padded)
