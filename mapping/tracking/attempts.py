@@ -79,7 +79,7 @@ class ScanMatcher:
             up = prediction.T_world_lidar[:3, :3].T @ self._map.vertical()
             velocities = prediction.velocity + np.outer(_YAW_RATES, np.concatenate([up, np.zeros(3)]))
             velocity = best_velocity(keypoints, velocities, prediction.T_world_lidar, self._map)
-            if not np.array_equal(velocity, prediction.velocity):
+            if not (np.array_equal(velocity, prediction.velocity) or self._budget.is_spent):
                 attempts.append(self._attempt(prediction, replace(prediction, velocity=velocity), patient=True))
         return max(attempts, key=lambda attempt: attempt.quality)
 
@@ -131,7 +131,7 @@ class ScanMatcher:
         best = best_of(attempts)
         return best if best is not None and best.is_reliable and not best.has_rivals(attempts) else None
 
-    def search_along(self, found: Attempt, begun: Prediction, prediction: Prediction) -> Steps[Attempt | None]:
+    def relocalise_along(self, found: Attempt, begun: Prediction, prediction: Prediction) -> Attempt | None:
         """Relocalise by the place of an earlier scan and the motion since; None where that is not reliable.
 
         Args:
@@ -144,12 +144,8 @@ class ScanMatcher:
         moved = exp((prediction.stamp - begun.stamp) * found.registration.velocity)
         starts = found.T_world_lidar @ np.array([predicted, moved])
         points = self.scan.keypoints.compensated(prediction.velocity)
-        for start in complete(best_starts(points, starts, self._map)):
-            attempt = self._attempt_at(start, prediction)
-            if attempt.is_reliable:
-                return attempt
-            yield
-        return None
+        attempt = self._attempt_at(complete(best_starts(points, starts, self._map))[0], prediction)
+        return attempt if attempt.is_reliable else None
 
     def _from(self, starts: FloatArray, prediction: Prediction) -> Steps[list[Attempt]]:
         """Attempts with status ok from the best of the poses (K, 4, 4)."""

@@ -12,7 +12,7 @@ Steps: TypeAlias = Generator[None, None, T]
 
 # Share of the time between two scans that `auto` is: the odometry needs the other part.
 _AUTO_SHARE = 0.5
-# A computation that goes on has this share of the budget even where the registration before it left less.
+# A search that goes on has this share of the budget at least.
 _LEAST_SHARE = 0.2
 # The velocity is unknown at first, and nothing waits yet: so many scans are not bounded.
 _FREE_SCANS = 2
@@ -32,6 +32,7 @@ class Budget:
         self._length_s = self._until_s = float("inf")
         self._last_interval_s = float("inf")
         self._scans = 0
+        self._was_spent = False  # before a search could go on, at the last scan with one
 
     @property
     def is_spent(self) -> bool:
@@ -47,6 +48,11 @@ class Budget:
             self._length_s = 1e-3 * self._budget_ms
         self._last_interval_s = interval_s
         self._until_s = self._clock() + self._length_s if self._scans > _FREE_SCANS else float("inf")
+
+    def lets_search_on(self) -> bool:
+        """Whether a scan's search may go on; true as well where nothing was left for it at the scan before."""
+        self._was_spent = self.is_spent and not self._was_spent
+        return not self._was_spent
 
     def run(self, steps: Steps[T]) -> tuple[T] | None:
         """Carry on with a computation until it is done or the time is spent; its result, None where it is not done."""

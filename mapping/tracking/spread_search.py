@@ -33,6 +33,8 @@ class SpreadSearch:
     def go_on(self, matcher: ScanMatcher, prediction: Prediction, budget: Budget) -> Attempt | None:
         """Search until the budget is spent; the present scan, relocalised, if that succeeds."""
         assert self._begun is not None
+        if not budget.lets_search_on():
+            return None
         if self._steps is not None:
             done = budget.run(self._steps)
             if done is None:
@@ -44,5 +46,4 @@ class SpreadSearch:
         self.drop()
         if found is None or prediction.stamp == begun.stamp:
             return found
-        along = budget.run(matcher.on(found.surfel_map).search_along(found, begun, prediction))
-        return None if along is None else along[0]
+        return matcher.on(found.surfel_map).relocalise_along(found, begun, prediction)
