@@ -3,12 +3,15 @@
 import contextlib
 import errno
 import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.files import cannot_write, make_directory, only_writer, replacing
+from lidarslam.core.files import cannot_write, make_directory, only_writer, remove_partial_files, replacing
+
+_TILE = re.compile(r"-?\d+_-?\d+\.laz")
 
 # What a full or failing disk says.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
@@ -23,6 +26,9 @@ ODOMETRY_TUM = "odometry.tum"
 MAP_PLY = "map.ply"
 # Further formats of the map, by their names in `--map-format`.
 MAPS = {"pcd": "map.pcd", "laz": "map.laz", "e57": "map.e57"}
+# The folder of a large map's tiles, and the list of these.
+MAP_TILES = "map"
+MAP_INDEX = f"{MAP_TILES}/index.json"
 POSE_GRAPH = "pose_graph.g2o"
 SCANS_CSV = "scans.csv"
 SUMMARY = "summary.json"
@@ -39,6 +45,7 @@ FILES = (
     ODOMETRY_TUM,
     MAP_PLY,
     *MAPS.values(),
+    MAP_INDEX,
     POSE_GRAPH,
     SCANS_CSV,
     SUMMARY,
@@ -88,8 +95,7 @@ class RunDirectory:
                 except BaseException:
                     directory._discard_unless_run()
                     raise
-                for name in directory._stale:
-                    (path / name).unlink(missing_ok=True)
+                directory._remove_stale()
         except OSError as error:
             if error.errno not in _NO_ROOM:
                 raise
@@ -133,18 +139,45 @@ class RunDirectory:
         """
         self.write_text(name, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
+    def _remove_stale(self) -> None:
+        """Remove what is left of the earlier run."""
+        for name in self._stale:
+            (self.path / name).unlink(missing_ok=True)
+        if MAP_INDEX not in self._written:
+            remove_tiles(self.path)
+
     def _discard_unless_run(self) -> None:
         """Remove files that no config.yaml describes: they would be in the way of the next attempt."""
         if not _is_run(self.path):
             for name in self._written:
                 (self.path / name).unlink(missing_ok=True)
+            remove_tiles(self.path)
+
+
+def remove_files(path: Path) -> None:
+    """Remove all files of a run."""
+    for name in FILES:
+        (path / name).unlink(missing_ok=True)
+    remove_tiles(path)
+
+
+def remove_tiles(path: Path) -> None:
+    """Remove the tiles of a run's map, and their folder when nothing else lies there."""
+    folder = path / MAP_TILES
+    if folder.is_dir():
+        (path / MAP_INDEX).unlink(missing_ok=True)  # first: without it the others are nothing
+        remove_partial_files(folder)
+        for tile in folder.glob("*_*.laz"):
+            if _TILE.fullmatch(tile.name):
+                tile.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # something else lies there
+            folder.rmdir()
 
 
 def remove_run(path: Path) -> None:
     """Remove a run's files, and its directory when nothing else lies there; leave anything else alone."""
     if _is_run(path):
-        for name in FILES:
-            (path / name).unlink(missing_ok=True)
+        remove_files(path)
         if not any(path.iterdir()):
             path.rmdir()
 
