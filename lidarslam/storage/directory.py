@@ -45,7 +45,6 @@ FILES = (
     ODOMETRY_TUM,
     MAP_PLY,
     *MAPS.values(),
-    MAP_INDEX,
     POSE_GRAPH,
     SCANS_CSV,
     SUMMARY,
@@ -143,33 +142,37 @@ class RunDirectory:
         """Remove what is left of the earlier run."""
         for name in self._stale:
             (self.path / name).unlink(missing_ok=True)
-        if MAP_INDEX not in self._written:
-            remove_tiles(self.path)
+        _remove_empty(self.path)
 
     def _discard_unless_run(self) -> None:
         """Remove files that no config.yaml describes: they would be in the way of the next attempt."""
         if not _is_run(self.path):
             for name in self._written:
                 (self.path / name).unlink(missing_ok=True)
-            remove_tiles(self.path)
+            _remove_empty(self.path)
 
 
 def remove_files(path: Path) -> None:
     """Remove all files of a run."""
-    for name in FILES:
+    for name in (*tile_names(path), *FILES):
         (path / name).unlink(missing_ok=True)
-    remove_tiles(path)
+    _remove_empty(path)
 
 
-def remove_tiles(path: Path) -> None:
-    """Remove the tiles of a run's map, and their folder when nothing else lies there."""
+def tile_names(path: Path) -> list[str]:
+    """The index of a map's tiles, and then the tiles, as far as they lie in the directory of a run itself."""
     folder = path / MAP_TILES
-    if folder.is_dir():
-        (path / MAP_INDEX).unlink(missing_ok=True)  # first: without it the others are nothing
+    if folder.is_symlink() or not folder.is_dir():
+        return []
+    tiles = sorted(f"{MAP_TILES}/{file.name}" for file in folder.iterdir() if _TILE.fullmatch(file.name))
+    return [*([MAP_INDEX] if (path / MAP_INDEX).exists() else []), *tiles]
+
+
+def _remove_empty(path: Path) -> None:
+    """Remove the folder of a map's tiles, when nothing lies there but what a killed process left."""
+    folder = path / MAP_TILES
+    if folder.is_dir() and not folder.is_symlink():
         remove_partial_files(folder)
-        for tile in folder.glob("*_*.laz"):
-            if _TILE.fullmatch(tile.name):
-                tile.unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # something else lies there
             folder.rmdir()
 
@@ -184,7 +187,7 @@ def remove_run(path: Path) -> None:
 
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
-    present = [name for name in FILES if (path / name).exists()]
+    present = [*(name for name in FILES if (path / name).exists()), *tile_names(path)]
     if (path / ABOUT).exists():  # the other files are of that run or merge, even without a config.yaml
         if not overwrite and not resume:
             raise OutputError(

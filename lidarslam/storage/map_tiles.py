@@ -8,7 +8,7 @@ from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
 from lidarslam.mapping.global_map.tile_store import Tile
-from lidarslam.storage.directory import MAP_INDEX, MAP_TILES, RunDirectory, remove_tiles
+from lidarslam.storage.directory import MAP_INDEX, MAP_TILES, RunDirectory
 
 
 class TileWriter:
@@ -54,10 +54,12 @@ class TileWriter:
 
     def _begin(self) -> None:
         folder = self._directory.path / MAP_TILES
-        remove_tiles(self._directory.path)  # of an earlier run
         try:
+            if folder.is_symlink():
+                folder.unlink()
+            (self._directory.path / MAP_INDEX).unlink(missing_ok=True)  # first: tiles of an earlier run are replaced
             folder.mkdir(exist_ok=True)
-        except FileExistsError as error:
+        except (FileExistsError, NotADirectoryError) as error:
             raise OutputError(f"{folder}: a file is in the way; name another directory") from error
         except OSError as error:
             raise cannot_write(folder, error) from error

@@ -67,6 +67,7 @@ class GlobalMap(Stateful):
     """
 
     voxel_size_m: float
+    most_points: int | None
     _merged: Voxels
     _pending: list[Voxels]
     _store: TileStore | None  # None where the number of voxels is not bounded

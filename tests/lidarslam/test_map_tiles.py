@@ -1,6 +1,7 @@
 """A large map on disk: tiles with an index, an overview, and nothing of an earlier run."""
 
 import json
+import shutil
 from pathlib import Path
 
 import laspy
@@ -78,6 +79,25 @@ def test_tiles_of_an_earlier_run_go_with_it(whole: Path, small_recording: Path, 
     assert lidarslam("run", small_recording, "--out", out, *FAST, *BOUND, "--overwrite").exit_code == 0
     remove_run(out)
     assert not out.exists()
+
+
+def test_tiles_of_others_are_not_touched(small_recording: Path, tmp_path: Path) -> None:
+    """Neither where they lie in a folder that is no run's, nor where a link in one leads."""
+    out, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    for folder in (out / "map", elsewhere):
+        folder.mkdir(parents=True)
+        for name in ("index.json", "0_0.laz"):
+            (folder / name).write_text("precious")
+    result = lidarslam("run", small_recording, "--out", out, *FAST, *BOUND)
+    assert result.exit_code == 1
+    assert "holds files that are not those of a run (map/index.json, map/0_0.laz)" in result.stderr
+    shutil.rmtree(out)
+    assert lidarslam("run", small_recording, "--out", out, *FAST).exit_code == 0
+    (out / "map").symlink_to(elsewhere)
+    for more in ((), BOUND):
+        assert lidarslam("run", small_recording, "--out", out, *FAST, *more, "--overwrite").exit_code == 0
+    assert (out / "map" / "0_0.laz").stat().st_size > 1000
+    assert [path.read_text() for path in elsewhere.iterdir()] == ["precious", "precious"]
 
 
 def test_a_file_in_the_way_of_the_tiles(small_recording: Path, tmp_path: Path) -> None:

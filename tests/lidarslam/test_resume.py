@@ -328,7 +328,7 @@ EVERYWHERE = 24
 
 
 @pytest.mark.slow  # a run for every different thing that a killed one may leave: a minute
-@pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10)])
+@pytest.mark.parametrize(("method", "every_scans"), [("constant velocity", 3), ("pose graph", 10), ("tiles", 5)])
 def test_a_run_may_be_killed_before_anything_it_does_on_disk(
     run: Run, whole: Callable[[str], Whole], source: Path, tmp_path: Path, method: str, every_scans: int
 ) -> None:

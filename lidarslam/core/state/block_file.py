@@ -58,6 +58,11 @@ class BlockFile(Stateful):
     def __len__(self) -> int:
         return len(self._checksums)
 
+    @property
+    def size_bytes(self) -> int:
+        """Of all blocks."""
+        return self._ends[-1]
+
     def write(self, block: bytes) -> None:
         """Keep one more; what lies behind the last was written after the state that was restored.
 
