@@ -3,10 +3,10 @@
     python benchmarks/map_tiles.py --most-points 1000000
     python benchmarks/map_tiles.py --most-points none
 
-A made-up street of 80 m width winds through a square of 1 km; every 0.8 m a scan is added to the map at the true pose, as
-in a run. Prints a Markdown table, a row every `--every` scans: resident memory, the most of it so far, and
-the size of the file of tiles, megabytes; voxels in memory; and the time of a scan, without the making of its points.
-Below it, the time and memory of the final map, written to a temporary folder. Linux only: memory is read from /proc.
+A made-up street of 80 m width winds through a square of 1 km; every 0.8 m a scan is added to the map at the true
+pose. Prints a Markdown table, a row every `--every` scans: resident memory, the most of it so far, and the size of the
+file of tiles, in megabytes; voxels in memory; and the time of a scan, without the making of its points. Below it, the
+time and memory of the final map, written to a temporary folder. Linux only: memory is read from /proc.
 """
 
 import argparse

@@ -110,6 +110,18 @@ def test_a_file_in_the_way_of_the_tiles(small_recording: Path, tmp_path: Path) -
     assert [path.name for path in out.iterdir()] == ["map"]
 
 
+def test_a_merge_with_tiles(small_recording: Path, tmp_path: Path) -> None:
+    """The common map and that of each recording."""
+    sources = [shutil.copytree(small_recording, tmp_path / name) for name in ("one", "two")]
+    out, method = tmp_path / "merged", ("--odometry", "constant-velocity", "--set", "global_map.voxel_size_m=0.1")
+    result = lidarslam("merge", *sources, "--out", out, *method, *BOUND)
+    assert result.exit_code in (0, 1), result.output  # 1: nothing joins them
+    for folder in (out, out / "01_one", out / "02_two"):
+        index, summary = (json.loads((folder / name).read_text()) for name in ("map/index.json", "summary.json"))
+        assert sum(tile["points"] for tile in index["tiles"]) == summary["map_tiles"]["points"] > MOST
+        assert 0 < summary["map_points"] <= MOST
+
+
 def test_the_python_interface_writes_tiles(tmp_path: Path, small_recording: Path) -> None:
     from lidarslam import Slam
 
