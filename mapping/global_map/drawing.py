@@ -98,7 +98,7 @@ class _Overview:
         self._parts.append(self._merged([part]).means())
         while self._most_points is not None and sum(map(len, self._parts)) > self._most_points:
             self.voxel_size_m = round(_COARSER * self.voxel_size_m, 3)
-            self._parts = [self._merged([part]).means() for part in self._parts]
+            self._parts = [self._merged(self._parts).means()]
 
     def merged(self) -> GlobalMap:
         return self._merged(self._parts)

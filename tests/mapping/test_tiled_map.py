@@ -144,6 +144,17 @@ def test_the_overview_has_no_more_points_than_it_may(views: PlacedViews) -> None
     assert drawn.tiled.brightest > 1.0
 
 
+def test_an_overview_may_have_fewer_points_than_there_are_tiles() -> None:
+    far = GlobalMap(VOXEL_M, 20, TileStore())
+    for number in range(60):
+        far.add(np.array([[10.0 * number, 0.0, 0.0], [10.0 * number, 0.3, 0.0]]), np.eye(4))
+    drawn = drawn_map(far, PlacedViews.join([]), CONFIG.model_construct(min_hits=1, fields=()))
+    assert drawn.cloud is not None
+    assert drawn.tiled is not None
+    assert (drawn.tiled.total, len(drawn.tiled.points)) == (120, 60)
+    assert 5 < len(drawn.cloud) <= 20
+
+
 def test_memory_is_bounded(tmp_path: Path) -> None:
     built = GlobalMap(VOXEL_M, MOST, TileStore(tmp_path))
     for number in range(40):
