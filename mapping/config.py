@@ -120,6 +120,12 @@ class GlobalMapConfig(BaseModel):
     leave_out_moved: bool = Field(
         True, description="leave out what other scans saw through where it was: people and vehicles that passed"
     )
+    most_points: int | None = Field(
+        20_000_000,
+        ge=1000,
+        description="a larger map lies on disk, is written in tiles, map/, and map.ply is thinned to so many points;"
+        " null: any number",
+    )
     fields: tuple[MapField, ...] = Field(
         ("intensity", "rgb"),
         description="attributes of points that the map has where scans have them: intensity, rgb, ring, time",

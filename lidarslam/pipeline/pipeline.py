@@ -18,6 +18,7 @@ from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult
 from lidarslam.pipeline.localisation import Localiser
@@ -49,6 +50,7 @@ class Pipeline(Stateful):
         config: of the global map.
         graph: built along the way; complete when the last result has come.
         checkpointer: saves the state now and then, without that of odometry and graph.
+        store: of the global map, see `MapBuilder`.
     """
 
     _stages: Stages
@@ -61,8 +63,9 @@ class Pipeline(Stateful):
         config: GlobalMapConfig,
         graph: "SlamGraph | None" = None,
         checkpointer: Checkpointer | None = None,
+        store: TileStore | None = None,
     ) -> None:
-        self._stages = Stages(odometry, localiser, config, graph)
+        self._stages = Stages(odometry, localiser, config, graph, store)
         self._checkpointer = checkpointer
         self.held = None
         self._error: LidarSlamError | None = None  # that ended the scans

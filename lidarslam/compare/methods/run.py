@@ -55,8 +55,8 @@ def run_method(
     """
     folder = run.request.out
     if (folder / LOG).is_file():  # of an earlier comparison
-        for name in (*files.FILES, PROCESS):
-            (folder / name).unlink(missing_ok=True)
+        files.remove_files(folder)
+        (folder / PROCESS).unlink(missing_ok=True)
     folder.mkdir(parents=True, exist_ok=True)
 
     def see(line: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
@@ -106,6 +107,7 @@ class WrittenMap:
     moved: int  # number of points that were removed as moving objects
     entropy: float | None = None  # mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed
     fields: tuple[str, ...] = ()  # the attributes of its points
+    tiled: TiledMap | None = None  # all of it, where `points` are those of an overview
 
 
 @dataclass(frozen=True)
@@ -169,8 +171,14 @@ def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings
         "map_points_moved": written.moved,
         "map_entropy": written.entropy,
         "map_fields": list(written.fields),
+        "map_tiles": None if written.tiled is None else _tiles_json(written.tiled),
         "warnings": list(warnings),
     }
+
+
+def _tiles_json(tiled: TiledMap) -> dict[str, Any]:
+    tiling = tiled.tiling
+    return {"tiles": len(tiled.points), "points": tiled.total, "voxel_size_m": tiling.voxel_size_m}
 
 
 def summarise(
