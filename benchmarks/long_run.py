@@ -12,8 +12,9 @@ the row before, of all stages but reading; the same of keyframes, on the graph's
 process a scan; resident memory; size of the saved state and seconds to save it; size of the submaps on disk; cells of
 the local map, points of the global map, keyframes, loops accepted; the error of the position as it was registered. Then
 the time of the final optimisation and of drawing the map anew, and ATE and KITTI's drift of all methods. The folder
-has it in `long_run.json` and as a picture in `long_run.png`; `peers_NAME.log` has a line for each row of a peer. A file
-`stop` in the folder ends the drive there, and everything is measured on the scans so far.
+has the rows in `rows.jsonl` and the peers' in `NAME.jsonl`, as they come, and the end in `end.json`;
+`benchmarks/long_run_plot.py` draws them. A file `stop` in the folder ends the drive there, and everything is measured
+on the scans so far.
 
 Linux only: memory is read from /proc.
 """
@@ -32,7 +33,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from long_run_peers import FedPeer, feed_peers
+from long_run_peers import FedPeer, add_line, feed_peers
 from mapping_accuracy import make_simulation, print_row
 from mapping_memory import resident_mb
 
@@ -134,8 +135,10 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
         pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, graph, checkpoints)
         scans = checkpoints.begin(pipeline, scans, is_recorded=False)
-        rows = list(_rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished))
-        return {"rows": [asdict(row) for row in rows]} | _finish(graph, log, pipeline, truth)
+        for row in _rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished):
+            print_row(row.cells_of_table())
+            add_line(options.out / "rows.jsonl", asdict(row))
+        return _finish(graph, log, pipeline, truth)
 
 
 def _rows(
@@ -178,7 +181,6 @@ def _rows(
             loops=sum(closure.accepted for closure in list(graph._closures)),
             error_m=float(np.linalg.norm(true_position - result.T_world_lidar[:3, 3])),
         )
-        print_row(row.cells_of_table())
         yield row
         ms, keyframes, cpu = [], len(graph.keyframe_ms), time.process_time()
 
@@ -189,7 +191,8 @@ def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajector
     started = time.perf_counter()
     result = graph.finish()
     optimise_s = time.perf_counter() - started
-    assert result is not None and pipeline.map.voxel_size_m is not None
+    assert result is not None
+    assert pipeline.map.voxel_size_m is not None
     drawn = graph.draw_map(result, pipeline.map.voxel_size_m)
     return {
         "optimise_s": optimise_s,
@@ -207,10 +210,11 @@ def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajector
 def errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float | None]:
     """ATE and KITTI's drift."""
     found: TrajectoryMetrics = evaluate_trajectory(estimate, truth)
+    drift = None if found.kitti is None else found.kitti.overall
     return {
         "ate_m": found.errors.ate_rmse_m,
-        "drift_percent": found.kitti and found.kitti.overall.translation_percent,
-        "drift_deg_per_100m": found.kitti and 100.0 * found.kitti.overall.rotation_deg_per_m,
+        "drift_percent": None if drift is None else drift.translation_percent,
+        "drift_deg_per_100m": None if drift is None else 100.0 * drift.rotation_deg_per_m,
     }
 
 
@@ -220,10 +224,8 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
         f"\nfinal optimisation {found['optimise_s']:.1f} s ({found['loops']} loops kept), map drawn anew in"
         f" {found['draw_s']:.1f} s ({found['map_points']:,} points), {found['rss_mb']:.0f} MB\n"
     )
-    found["peers"] = {}
     for peer in peers:
-        rows, estimate = peer.result()
-        found["peers"][peer.name] = rows
+        estimate = peer.result()
         if estimate is not None:
             found["methods"][peer.name] = errors(estimate, truth)
     print_row(["method", "ATE, m", "drift, %", "drift, degrees in 100 m"])
@@ -236,7 +238,7 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
 def main() -> None:
     """Parse the command line, run everything, print and draw it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of long_run.json and long_run.png")
+    parser.add_argument("--out", type=Path, required=True, help="folder of what was measured")
     parser.add_argument("--world", default="town")
     parser.add_argument("--motion", default="car-fast")
     parser.add_argument("--sensor", default="vlp-16")
@@ -248,7 +250,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     logging.disable(logging.INFO)
-    options.out.mkdir(parents=True, exist_ok=True)
+    options.out.mkdir(parents=True)
     context = multiprocessing.get_context("spawn")
     source, sink = context.Pipe(duplex=False)
     simulator = context.Process(target=simulate, args=(options, sink), daemon=True)
@@ -256,10 +258,10 @@ def main() -> None:
     truth = source.recv()
     print_row(list(Row.__dataclass_fields__))
     print_row(["---"] * len(Row.__dataclass_fields__))
-    peers = [FedPeer(context, name, options.every, options.out / f"peers_{name}.log") for name in options.peers]
+    peers = [FedPeer(context, name, options.every, options.out / f"{name}.jsonl") for name in options.peers]
     found = run(options, feed_peers(received(source, options.scans, options.out / "stop"), peers), truth)
     found = report(found, peers, truth)
-    (options.out / "long_run.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+    (options.out / "end.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

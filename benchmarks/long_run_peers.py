@@ -1,7 +1,8 @@
 """Peers of `long_run.py`, each in a process of its own that takes the scans as they come."""
 
+import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from pathlib import Path
@@ -71,14 +72,14 @@ class FedPeer:
         except OSError:
             self._end.close()
 
-    def result(self) -> tuple[list[dict[str, float]], Trajectory | None]:
-        """Its rows, and its trajectory; None where it failed, which its log says."""
+    def result(self) -> Trajectory | None:
+        """Its trajectory; None where it failed, which its log says."""
         try:
             self._end.send(_END)
-            rows, trajectory = self._end.recv()
+            trajectory: Trajectory = self._end.recv()
         except (OSError, EOFError):
-            return [], None
-        return rows, trajectory
+            return None
+        return trajectory
 
 
 def feed_peers(scans: Iterator[Scan], peers: list[FedPeer]) -> Iterator[Scan]:
@@ -91,22 +92,25 @@ def feed_peers(scans: Iterator[Scan], peers: list[FedPeer]) -> Iterator[Scan]:
 
 def _estimate(source: Connection, name: str, every: int, log: Path) -> None:
     """The peer's process."""
-    rows: list[dict[str, float]] = []
     started = time.process_time()
 
     def progress(number: int) -> None:
         nonlocal started
         if number % every == 0:
             cpu_ms = 1e3 * (time.process_time() - started) / every
-            rows.append({"scans": number, "cpu_ms": cpu_ms, "rss_mb": resident_mb()})
-            with log.open("a", encoding="utf-8") as file:
-                file.write(f"{rows[-1]}\n")
+            add_line(log, {"scans": number, "cpu_ms": cpu_ms, "rss_mb": resident_mb()})
             started = time.process_time()
 
     peer = _KISS_ICP if name == _KISS_ICP.name else PEERS[name]
     try:
         estimated = estimate(peer, iter(source.recv, _END), progress=progress)
     except LidarSlamError as error:
-        log.write_text(f"{error}\n", encoding="utf-8")
+        add_line(log, {"error": str(error)})
         return
-    source.send((rows, estimated.trajectory))
+    source.send(estimated.trajectory)
+
+
+def add_line(path: Path, values: Mapping[str, object]) -> None:
+    """Append a line of JSON."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{json.dumps(values)}\n")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.loops.drift import Track
 from lidarslam.mapping.loops.registration import SubmapCloud
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap
+from lidarslam.mapping.loops.submap_file import SubmapFile
 
 # Shorter ways back are no loops, in median ranges and in metres.
 _MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0
@@ -63,15 +65,15 @@ class KeyframeDatabase(Stateful):
 
     Attributes:
         track: the present estimates.
-        submaps: one a keyframe.
+        submaps: one a keyframe, in a file.
     """
 
     track: Track
 
-    def __init__(self, config: LoopConfig) -> None:
+    def __init__(self, config: LoopConfig, directory: Path | None = None) -> None:
         self._config = config
         self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
-        self.submaps: list[SparseSubmap] = []
+        self.submaps = SubmapFile(directory)
         self._descriptors = np.empty((0, 1, 1), dtype=np.complex64)  # (N, ...), with room for more keyframes
 
     def __len__(self) -> int:
@@ -135,7 +137,9 @@ class KeyframeDatabase(Stateful):
             yield from self._alike(index, others)
 
     def _compare(self, view: BirdEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        return compare(view.descriptor(self.radius_m), self._descriptors[others])
+        is_run = others[-1] - others[0] == len(others) - 1  # as within one segment: a view of them is no copy
+        chosen = self._descriptors[slice(others[0], others[-1] + 1) if is_run else others]
+        return compare(view.descriptor(self.radius_m), chosen)
 
     def _nearby(self, index: int, others: NDArray[np.intp]) -> Iterator[Candidate]:
         """Earlier keyframes of the segment within reach of the estimate."""

@@ -53,7 +53,7 @@ def build_along(path: FloatArray, seed: int, fullness: float | None = None) -> W
         fullness: share of houses with ornaments, and of kerbs with cars and trees; None: less the longer the path.
 
     Raises:
-        InputError: the path is shorter than a metre, or extends over more than 5 km.
+        InputError: the path is shorter than 1 m, or extends over more than 5 km.
     """
     extent = np.ptp(path[:, :2], axis=0)
     length = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()
@@ -67,7 +67,9 @@ def build_along(path: FloatArray, seed: int, fullness: float | None = None) -> W
     ground = _ground(rng, course)
     there = course.points[:: round(2.0 / _STEP_M), :2]
     route = Route(on_ground(np.concatenate([there, there[-2:0:-1]]), ground), 2.0, FREE_SIDE_M, 4.0, 11.0)
-    rows = _Rows(rng, course, ground, min(1.0, _FULL_M / course.length_m) if fullness is None else fullness)
+    fullness = min(1.0, _FULL_M / course.length_m) if fullness is None else fullness
+    taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
+    rows = _Rows(rng, course, ground, fullness, taken)
     rows.build(replace(route, free_height_m=1e3))
     return World("street", seed, route, *rows.solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
 
@@ -117,9 +119,7 @@ class Course:
     def distance(self, xy: FloatArray) -> FloatArray:
         """Distance (M,) of points (M, 2) from the nearest part of the course."""
         nearest = self.tree.query(xy)[0]
-        return np.asarray(
-            np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0))
-        )  # between two points it is nearer
+        return np.asarray(np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0)))  # nearer between two points
 
 
 def _ground(rng: np.random.Generator, course: Course) -> HeightField:
@@ -142,12 +142,9 @@ class _Rows:
     course: Course
     ground: HeightField
     fullness: float
+    taken: NDArray[np.bool_]  # (X, Y) cells of one metre of the ground
     solid: Builder = field(default_factory=Builder)
     _loose: Builder = field(default_factory=Builder)  # may reach into the free space, and is pruned
-    _taken: NDArray[np.bool_] = field(init=False)  # (X, Y) cells of one metre of the ground
-
-    def __post_init__(self) -> None:
-        self._taken = np.zeros(np.ceil(self.ground.cell_m * np.array(self.ground.heights.shape)).astype(int), dtype=bool)
 
     def build(self, free: Route) -> None:
         """Add everything; houses first, they need most room."""
@@ -162,13 +159,11 @@ class _Rows:
     def _claim(self, footprint: FloatArray, nearest_m: float) -> bool:
         """Take the cells of points (M, 2) if they are free and keep that distance from the course; whether they did."""
         x, y = np.floor(footprint - self.ground.origin_xy).astype(int).T
-        # Most are refused by their first point.
-        if self.course.distance(footprint[:1])[0] < nearest_m or self._taken[x, y].any():
-            return False
-        if self.course.distance(footprint).min() < nearest_m:
-            return False
-        self._taken[x, y] = True
-        return True
+        # Most are refused by their first point, which saves the search for all.
+        is_free = self.course.distance(footprint[:1])[0] >= nearest_m and not self.taken[x, y].any()
+        is_free = is_free and self.course.distance(footprint).min() >= nearest_m
+        self.taken[x, y] |= is_free
+        return bool(is_free)
 
     def _houses(self, side: Course) -> None:
         at = 0.0

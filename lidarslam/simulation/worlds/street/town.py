@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
