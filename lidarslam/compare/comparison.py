@@ -73,7 +73,7 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
     sequences: list[SequenceComparison] = []
     with only_writer(request.out):
         if not request.where.is_serial:
-            turns.run_ahead(recordings)
+            turns.take_together(recordings)
         for planned in recordings:
             sequences.append(turns.measured(planned))
             if len(recordings) > 1:
@@ -106,7 +106,7 @@ class _Turns:
     # of those that ran side by side, by their directories
     _done: dict[Path, MethodResult] = field(default_factory=dict)
 
-    def run_ahead(self, recordings: Sequence[PlannedRecording]) -> None:
+    def take_together(self, recordings: Sequence[PlannedRecording]) -> None:
         """Run all methods on all recordings side by side."""
         wanted = [(planned, run) for planned in recordings for run in planned.runs if self._has_to_run(planned, run)]
         scans = [len(range(len(p.recording))[p.entry.start : p.entry.stop : p.entry.step]) for p, _ in wanted]
@@ -121,6 +121,8 @@ class _Turns:
             self.narrator.tell(format_result(planned.name, result))
 
         runs = [run for _, run in wanted]
+        if not runs:
+            return
         with self.narrator.counting(f"{count(len(runs), 'run')} side by side") as counter:
             self.interrupted = run_side_by_side(runs, self.request.limits, self.command, self.request.where, take)
 

@@ -1,4 +1,4 @@
-"""Methods side by side: the folder of a serial comparison but for times, on this machine and on a cluster that shrinks."""
+"""Methods side by side: the folder of a serial comparison but for times, here and on a cluster that loses a node."""
 
 import json
 import os
@@ -29,8 +29,9 @@ TIMED = {"summary.json", "scans.csv", "process.json", "process.log"}
 
 # Each start of a method is a line in the file; what it does then depends on its name and on how often it was started.
 COUNTED = """
-import json, os, sys, time
+import json, os, signal, sys, time
 from pathlib import Path
+signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 log, request = Path(sys.argv[1]), json.loads(sys.argv[-1])
 name = Path(request["out"]).name
 with log.open("a") as file: file.write(f"{name} {os.getppid()} {os.getpid()}\\n")
@@ -48,7 +49,7 @@ class Told:
         self.counts: list[tuple[int, int]] = []
 
     @contextmanager
-    def counting(self, name: str) -> Iterator[Counter]:
+    def counting(self, _name: str) -> Iterator[Counter]:
         yield lambda number, total: self.counts.append((number, total))
 
     @property
@@ -106,6 +107,7 @@ def _wait_for(condition: Any, seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_side_by_side_is_the_same_as_one_after_another(
     small_recording: Path, tmp_path: Path, serial: dict[str, Any]
 ) -> None:
@@ -157,6 +159,7 @@ def test_a_node_that_dies_costs_only_its_tasks(
     assert not Path(f"/proc/{died[0]}").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_all_methods_and_writes_what_there_is(
     small_recording: Path, tmp_path: Path, counted: tuple[str, ...]
@@ -175,6 +178,37 @@ def test_ctrl_c_ends_all_methods_and_writes_what_there_is(
     assert rows == {"constant-velocity+map": "ok", "learned+map": "not run", "prior": "ok"}
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["notes"][0].startswith("interrupted")
     assert not any(Path(f"/proc/{process}").exists() for _, _, process in _starts(tmp_path))
+
+
+@pytest.mark.slow
+def test_a_simulated_recording_is_the_same_to_the_byte(tmp_path: Path) -> None:
+    for jobs in ("1", "2"):
+        out = tmp_path / jobs / "walk"
+        command = ["simulate", "--out", str(out), "--scans", "23", "--format", "ply", "--jobs", jobs]
+        result = CliRunner().invoke(main, command, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    one, two = (
+        {path.name: path.read_bytes() for path in (tmp_path / jobs / "walk").iterdir() if path.name != "README.md"}
+        for jobs in ("1", "2")
+    )
+    assert len(one) == 26
+    assert one == two
+
+
+@pytest.mark.slow
+def test_prepared_recordings_are_the_same_to_the_byte(small_recording: Path, tmp_path: Path) -> None:
+    data = pytest.importorskip("lidarslam.train.data")
+    side_by_side = pytest.importorskip("lidarslam.train.side_by_side")
+    config = data.TrainingConfig(images={"columns": 96}, teacher="map")
+    stretches = [
+        data.recorded(small_recording, data.ReaderConfig()),
+        *data.simulated(data.SimulatedConfig(recordings=1, scans=3)),
+    ]
+    data.prepared(stretches, config, tmp_path / "one", lambda _: None)
+    side_by_side.prepare_side_by_side(stretches, config, tmp_path / "two", Where(2))
+    one, two = ({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("one", "two"))
+    assert len(one) == 2
+    assert one == two
 
 
 def test_a_cluster_and_jobs_exclude_each_other(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def _connect(where: Where, place: str) -> None:
         _require_answer(where.cluster)
         ray.init(address=where.cluster, **quiet)
         return
-    own = {"object_store_memory": _OBJECT_STORE_BYTES, "include_dashboard": False, "_temp_dir": place}
+    own: dict[str, Any] = {"object_store_memory": _OBJECT_STORE_BYTES, "include_dashboard": False, "_temp_dir": place}
     ray.init(address="local", num_cpus=where.jobs, **own, **quiet)
 
 

@@ -33,15 +33,17 @@ def cache_folder() -> Path:
 def fetched(source: str | Path) -> Path:
     """The path of a source, which is fetched first where it is named by URL and not there yet.
 
+    Over http a folder is known by the slash at the end of its URL.
+
     Raises:
         InputError: it cannot be fetched.
     """
     parts = _URL.fullmatch(str(source))
     if parts is None:
         return Path(source)
-    scheme, rest = parts[1], parts[2].rstrip("/")
+    scheme, rest = parts[1], parts[2]
     url = f"{scheme}://{'/' if scheme == 'file' else ''}{rest}"
-    name = rest.rpartition("/")[2].partition("?")[0] or "recording"
+    name = rest.partition("?")[0].rstrip("/").rpartition("/")[2] or "recording"
     path = cache_folder() / hashlib.sha256(url.encode()).hexdigest()[:16] / name
     fetch(url, path)
     return path
@@ -90,9 +92,9 @@ def _download(url: str, place: Path) -> None:
         raise InputError(f"{url}: {error}; pip install 'lidarslam[remote]'") from error
     except ValueError as error:
         raise InputError(f"{url}: {error}") from error
-    if storage.isfile(remote):
+    if not url.endswith("/") and storage.isfile(remote):
         storage.get_file(remote, str(place))
     elif storage.isdir(remote):
-        storage.get(f"{remote}/", f"{place}/", recursive=True)
+        storage.get(f"{remote.rstrip('/')}/", f"{place}/", recursive=True)
     else:
         raise InputError(f"{url}: is not there")
