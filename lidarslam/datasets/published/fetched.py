@@ -94,7 +94,13 @@ def _download(url: str, place: Path) -> None:
         raise InputError(f"{url}: {error}") from error
     if not url.endswith("/") and storage.isfile(remote):
         storage.get_file(remote, str(place))
-    elif storage.isdir(remote):
-        storage.get(f"{remote.rstrip('/')}/", f"{place}/", recursive=True)
-    else:
+        return
+    root = f"{remote.rstrip('/')}/"
+    names = [name.removeprefix(root) for name in storage.find(root)] if storage.isdir(remote) else []
+    if not names:
         raise InputError(f"{url}: is not there")
+    for name in names:  # not get(recursive=True), which takes a folder of a web page for a file, too
+        if ".." in Path(name).parts or Path(name).is_absolute():
+            raise InputError(f"{url}: lists a file elsewhere, {name}")
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        storage.get_file(f"{root}{name}", str(place / name))

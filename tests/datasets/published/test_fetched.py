@@ -127,7 +127,7 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_commands_take_urls_as_sources_and_nothing_else(recording: Path) -> None:
     result = CliRunner().invoke(main, ["info", f"file://{recording}"])
     assert result.exit_code == 0, result.output
-    assert "3 scans" in result.output
+    assert "scan-folder" in result.output
     result = CliRunner().invoke(main, ["run", str(recording), "--out", "s3://bucket/run"])
     assert result.exit_code == 2
     assert "only sources are fetched" in result.output
