@@ -26,7 +26,6 @@ _RETRIES = 3
 _OBJECT_STORE_BYTES = 128 * 2**20
 _ANSWER_S = 5.0
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_DIED = (exceptions.WorkerCrashedError, exceptions.ObjectLostError, exceptions.NodeDiedError)
 
 
 @contextlib.contextmanager
@@ -99,10 +98,13 @@ def _take(done: list[Any], running: dict[Any, int], results: dict[int, Any], on_
         index = running.pop(reference)
         try:
             result = ray.get(reference)
-        except _DIED as error:
-            raise LidarSlamError(f"the process of a task died {_RETRIES + 1} times; its log is Ray's") from error
         except exceptions.RayTaskError as error:
-            raise error.cause if isinstance(error.cause, Exception) else error from None
+            raise _of_task(error) from None
+        except exceptions.RayError as error:
+            name = type(error).__name__
+            raise LidarSlamError(
+                f"a task came to no result in {_RETRIES + 1} attempts ({name}); see Ray's log"
+            ) from error
         if isinstance(result, LidarSlamError):
             raise result
         results[index] = result
@@ -115,8 +117,16 @@ def _end(running: dict[Any, int], results: dict[int, Any], on_done: OnDone | Non
     for reference in running:
         ray.cancel(reference, force=False)
     while running:
-        with contextlib.suppress(LidarSlamError, exceptions.RayError, Exception):
-            _take(ray.wait([*running], num_returns=1)[0], running, results, on_done)
+        done = ray.wait([*running], num_returns=1)[0]
+        with contextlib.suppress(Exception):  # cancelled, or as it was interrupted
+            _take(done, running, results, on_done)
+
+
+def _of_task(error: Any) -> Exception:
+    """What a task raised."""
+    if isinstance(error.cause, ImportError):
+        return ConfigError(f"a node of the cluster lacks a library or has another lidarslam: {error.cause}")
+    return error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))
 
 
 def _carry_out(shared: tuple[Callable[[T], R], str], item: T) -> R | LidarSlamError:
@@ -159,9 +169,11 @@ def _environment(where: Where) -> Iterator[None]:
 def _own_signals() -> Iterator[None]:
     """Ray's handler of SIGTERM, which would end the program, is taken out again."""
     handler = signal.getsignal(signal.SIGTERM)
-    yield
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
 
 
 def _require_answer(address: str) -> None:
