@@ -117,7 +117,7 @@ class Part:
 PARTS = {
     "surfels": Part(
         _surfels,
-        tuple(f"mapping.surfels.{kind}_kernels" for kind in ("cell", "correspondence", "side", "surfel")),
+        tuple(f"mapping.surfels.{kind}_kernels" for kind in ("cell", "correspondence", "linear", "side", "surfel")),
     ),
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
     "alignment": Part(
