@@ -84,7 +84,7 @@ def execute(
                 compiling.wait_for_all(phase)
                 phase("writing the results")
                 closed = close_loops(graph, tracked.global_map, log, viewer)
-                drawn = final_map(tracked, closed, config.global_map)
+                drawn = final_map(tracked, closed, config.global_map, directory)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
             formats = request.map_formats

@@ -20,6 +20,7 @@ from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import DenseSubmap, refine
@@ -97,18 +98,14 @@ class SlamGraph(Stateful):
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, self._segment + 1
 
     def draw(
-        self,
-        points: FloatArray,
-        T_world_lidar: FloatArray,
-        voxel_size_m: float,
-        attributes: PointAttributes | None = None,
+        self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, known: PointAttributes | None = None
     ) -> None:
         """Add points (N, 3) of the latest scan, at its pose as registered, to the submap of the last keyframe."""
         if not self._is_submap_open:
             return
         if self._submap is None:
             self._submap = GlobalMap(voxel_size_m)
-        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar, attributes)
+        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar, known)
 
     def add(self, scan: GraphScan) -> None:
         """Take the next scan; the points of the one before have been drawn by now."""
@@ -159,9 +156,11 @@ class SlamGraph(Stateful):
         corrected, edges = corrected_recordings(registered, firsts, scans, poses), (*self._edges, *loops)
         return Corrected(corrected, scans, poses, tuple(closures), inliers, edges, firsts, frames)
 
-    def draw_map(self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None) -> GlobalMap:
-        """The submaps of some recordings, or of all, at their keyframes' corrected poses."""
-        drawn = GlobalMap(voxel_size_m)
+    def draw_map(
+        self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None, most: int | None = None
+    ) -> GlobalMap:
+        """The submaps of some recordings, or of all, at their corrected poses, with `most` voxels in memory."""
+        drawn = GlobalMap(voxel_size_m, most, TileStore(self._store.directory))
         for index, (pose, recording) in enumerate(zip(result.keyframe_poses, result.keyframe_recordings, strict=True)):
             if recordings is None or recording in recordings:
                 drawn.add_means(self._means(index), pose)
