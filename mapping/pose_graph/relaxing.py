@@ -8,9 +8,9 @@ from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.loops.closure import LoopClosure
 
-# An optimisation takes time in proportion to the keyframes, so the next one waits for this part of their number: its
-# time for each keyframe, some 15 ms, does not grow. With 10,000 keyframes that is a wait of some 100 m.
-_PART = 200
+# An optimisation takes time in proportion to the keyframes. The next one waits for the hundredth part of their number,
+# so that its time for each keyframe does not grow: none waits with 100 keyframes, 300 m or so with 10,000.
+_PART = 100
 
 
 class RelaxSchedule(Stateful):
