@@ -1,7 +1,7 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
@@ -13,6 +13,8 @@ MapField = Literal["intensity", "rgb", "ring", "time"]
 """An attribute of the points of a map."""
 MapFormat = Literal["pcd", "laz", "e57"]
 """What a map can be written as beside .ply."""
+BudgetMs = Annotated[float, Field(gt=0.0)] | Literal["auto"] | None
+"""Milliseconds that a scan may take; auto: half of the time between scans; None: not bounded."""
 
 
 class TrackingConfig(BaseModel):
@@ -69,6 +71,11 @@ class MappingConfig(BaseModel):
         10.0,
         gt=0.0,
         description="factor on the standard deviations of an odometry: its errors are correlated in time",
+    )
+    budget_ms: BudgetMs = Field(
+        None,
+        description="surfels only: time of a scan after which no further attempt begins, and searches go on with the"
+        " next scan; auto: half of the time between scans; null: no limit (live: auto)",
     )
     tracking: TrackingConfig = TrackingConfig()
 

@@ -34,7 +34,9 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     total = summary.ms_per_scan["total"]
-    each = f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms)"
+    slowest = summary.slowest
+    worst = "" if slowest is None else f", slowest: scan {slowest.scan:,}, {slowest.ms:.0f} ms of {slowest.stage}"
+    each = f"{total.median:.0f} ms a scan (99 % under {total.p99:.0f} ms{worst})"
     in_all = f"{summary.elapsed_s:.1f} s for all{_speed(summary.realtime_factor)}"
     yield f"{each}, {in_all}; {summary.peak_rss_mb:,.0f} MB of memory"
     yield format_map(summary.map)

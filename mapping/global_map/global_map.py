@@ -204,7 +204,7 @@ class GlobalMap(Stateful):
     def _merge(self) -> None:
         if self._pending_size:
             waiting = Voxels.join(self._pending).reduced()
-            self._merged = Voxels.join([self._merged, waiting]).reduced()
+            self._merged = self._merged.united(waiting)
             if self._store is not None and self.most_points is not None and len(self._merged) > self.most_points:
                 self._merged = self._store.take(self._merged, self.tiling, waiting.keys, self.most_points)
         self._pending, self._pending_size = [], 0

@@ -46,6 +46,15 @@ class Voxels:
         count = kernels.add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
         return Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
 
+    def united(self, other: "Voxels") -> "Voxels":
+        """Both of them, reduced; both are reduced already."""
+        layout = Layout.union([self.layout, other.layout])
+        sums = [part.layout.widened(part.sums, layout) for part in (self, other)]
+        unique = np.empty(len(self) + len(other), dtype=np.int64)
+        totals = np.empty((len(unique), layout.width), dtype=np.float32)
+        count = kernels.unite(self.keys, sums[0], other.keys, sums[1], layout.summed, unique, totals)
+        return Voxels(unique[:count].copy(), totals[:count].copy(), layout)
+
     def chosen(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Voxels":
         """Some of them."""
         return Voxels(self.keys[rows], self.sums[rows], self.layout)

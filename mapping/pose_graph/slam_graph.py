@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
@@ -31,6 +31,7 @@ from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, drift_covari
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
 from lidarslam.mapping.pose_graph.optimizer import optimise, relax
+from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
 from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 
 # A closure is refined on submaps united with so many on either side: one alone is as sparse as the sensor, and over a
@@ -60,6 +61,7 @@ class SlamGraph(Stateful):
     _edges: list[RelativePose]
     _attitudes: list[Attitude]  # of the first recording, whose world they are in
     _closures: list[LoopClosure]
+    _relaxing: RelaxSchedule
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
     _motion: MotionSinceKeyframe
     _path_m: float
@@ -75,12 +77,12 @@ class SlamGraph(Stateful):
         self._config = config
         self._local_radius_m = local_radius_m
         self._selector = KeyframeSelector(config.keyframes)
-        self._detector = LoopDetector(config.loops)
+        self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
         self._store = SubmapStore(directory, file)
         self._submap = None
         self.scan_poses, self.keyframe_ms, self._first_scans = [], [], [0]
         self._keyframes, self._poses, self._edges, self._closures = [], [], [], []
-        self._unrefined, self._attitudes = [], []
+        self._unrefined, self._attitudes, self._relaxing = [], [], RelaxSchedule()
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
     def _after_restore(self) -> None:
@@ -206,13 +208,8 @@ class SlamGraph(Stateful):
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
         self._refine_closures(until=index - _REACH)
-        if any(closure.accepted and self._contradicts_poses(closure) for closure in found):
+        if self._relaxing.is_due(found, self._poses):
             self._poses = list(relax(np.array(self._poses), self._edges, self._accepted(), self._attitudes))
-
-    def _contradicts_poses(self, closure: LoopClosure) -> bool:
-        """Whether a closure is farther from the present poses than its own deviation: only then it moves them."""
-        error = log(inverse(self._poses[closure.first] @ closure.T_first_second) @ self._poses[closure.second])
-        return float(error @ np.linalg.solve(closure.covariance, error)) > len(error)
 
     def _refine_closures(self, until: int) -> None:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""

@@ -70,7 +70,7 @@ class SurfelGrid(Stateful):
         if not len(self._keys) == len(self._sums) == len(self._surfels) == len(self._surfel_counts):
             raise ValueError("the arrays of a surfel grid differ in length")
         self._hash = VoxelHash()
-        self._index()
+        self._index(len(self._keys))
 
     def insert(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
         """Insert points (N, 3) of the world.
@@ -185,24 +185,23 @@ class SurfelGrid(Stateful):
         """Keep the cells in these rows only."""
         if len(kept) == len(self):
             return
-        self._keys = self._keys[kept]
-        self._sums = self._sums[kept]
-        self._surfels = self._surfels[kept]
-        self._surfel_counts = self._surfel_counts[kept]
-        self._index()
+        for values in (self._keys, self._sums, self._surfels, self._surfel_counts):
+            values[: len(kept)] = values[kept]
+            values[len(kept) :] = 0  # new cells begin empty
+        self._index(len(kept))
 
-    def _index(self) -> None:
+    def _index(self, count: int) -> None:
         """Rebuild the hash and the links of sides; the other side of a cell without a first one becomes the first."""
-        self._hash.rebuild(self._keys)
-        others = np.flatnonzero(self._keys < 0)
-        first = self._keys[others] & kernels.FIRST_SIDE
+        keys = self._keys[:count]
+        self._hash.rebuild(keys)
+        others = np.flatnonzero(keys < 0)
+        first = keys[others] & kernels.FIRST_SIDE
         is_lone = self._hash.find(first) == ABSENT
         if is_lone.any():
-            self._keys[others[is_lone]] = first[is_lone]
-            self._hash.rebuild(self._keys)
+            keys[others[is_lone]] = first[is_lone]
+            self._hash.rebuild(keys)
         self._others = np.full(len(self._keys), ABSENT, dtype=np.int32)
-        rows = np.arange(len(self._keys), dtype=np.int32)
-        kernels.link_sides(self._keys, rows, *self._hash.slots, self._others)
+        kernels.link_sides(keys, np.arange(count, dtype=np.int32), *self._hash.slots, self._others)
 
     def _cells(self) -> kernels.Cells:
         return kernels.Cells(self.cell_m, *self._hash.slots, self._keys, self._others, self._sums)

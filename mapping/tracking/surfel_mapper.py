@@ -5,6 +5,8 @@ inserted into the map. `mapping.tracking` has the cases in which the registratio
 """
 
 import logging
+import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +20,7 @@ from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
@@ -30,7 +33,12 @@ _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
 
 
 class SurfelMapper(Stateful):
-    """Holds the local map and the state of the last scan."""
+    """Holds the local map and the state of the last scan.
+
+    Args:
+        config: of the mapping.
+        clock: seconds, for the budget of a scan.
+    """
 
     _sampler: Sampler
     _tracker: Tracker
@@ -38,10 +46,11 @@ class SurfelMapper(Stateful):
     _last: MotionState | None
     _first: SampledScan | None
 
-    def __init__(self, config: MappingConfig) -> None:
+    def __init__(self, config: MappingConfig, clock: Callable[[], float] = time.perf_counter) -> None:
         self._config = config
+        self._budget = Budget(config.budget_ms, clock)
         self._sampler = Sampler(config)
-        self._tracker = Tracker(config)
+        self._tracker = Tracker(config, self._budget)
         self._map = None
         self._last = None
         self._first = None  # while it alone is the map, drawn with a guessed motion
@@ -53,6 +62,7 @@ class SurfelMapper(Stateful):
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
+        self._budget.begin(np.inf if self._last is None else scan.stamp - self._last.stamp)
         return self.process_sampled(self._sampler.sample(scan), prior)
 
     def process_sampled(self, scan: SampledScan, prior: Prior) -> MappedScan:

@@ -19,7 +19,7 @@ def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
         length_m=0.0,
         duration_s=0.0,
         elapsed_s=0.1,
-        ms_per_scan={"total": Milliseconds(1.0, 1.0)},
+        ms_per_scan={"total": Milliseconds(1.0, 1.0, 1.0)},
         realtime_factor=None,
         peak_rss_mb=1.0,
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),

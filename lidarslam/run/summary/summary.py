@@ -25,15 +25,33 @@ _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
 
 @dataclass(frozen=True)
 class Milliseconds:
-    """Median and 95th percentile of wall times."""
+    """Median, 95th and 99th percentile of wall times."""
 
     median: float
     p95: float
+    p99: float
 
     @classmethod
     def of(cls, values: Sequence[float] | FloatArray) -> "Milliseconds":
         """Of at least one time."""
-        return cls(float(np.median(values)), float(np.percentile(values, 95.0)))
+        return cls(*(float(np.percentile(values, share)) for share in (50.0, 95.0, 99.0)))
+
+
+@dataclass(frozen=True)
+class SlowestScan:
+    """The longest stage of any scan but the first, which waits for loops to be loaded."""
+
+    scan: int
+    stage: str
+    ms: float
+
+    @classmethod
+    def of(cls, stage_ms: FloatArray) -> "SlowestScan | None":
+        """By the times (N, S) of the `STAGES`; None of fewer than two scans."""
+        if len(stage_ms) < 2:
+            return None
+        scan, stage = divmod(int(stage_ms[1:].argmax()), stage_ms.shape[1])
+        return cls(scan + 1, STAGES[stage], float(stage_ms[scan + 1, stage]))
 
 
 @dataclass(frozen=True)
@@ -112,6 +130,7 @@ class RunSummary:
     map: WrittenMap
     warnings: tuple[str, ...]
     contradictions: tuple[Contradiction, ...] = ()
+    slowest: SlowestScan | None = None
 
     @property
     def went_astray(self) -> bool:
@@ -131,6 +150,7 @@ class RunSummary:
             "duration_s": self.duration_s,
             "elapsed_s": self.elapsed_s,
             "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
+            "slowest_scan": None if self.slowest is None else vars(self.slowest),
             "realtime_factor": self.realtime_factor,
             "peak_rss_mb": self.peak_rss_mb,
             "lost_scans": self.lost_scans,
@@ -194,6 +214,7 @@ def summarise(
         map=written,
         warnings=(*log.warnings, *_warnings(log, skipped, contradictions)),
         contradictions=contradictions,
+        slowest=SlowestScan.of(log.stage_ms),
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
 
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.mapping.global_map.tile_store import TileStore
@@ -57,7 +58,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     node = _open_node(request.domain)
     if request.rerun == "spawn":
         require_window("serve a browser with --rerun web, or write a file with --rerun save")
-    config, log, faults = request.config, ScanLog(), Faults()
+    config, log, faults = bounded(request.config), ScanLog(), Faults()
     require_scans_only(config)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
@@ -103,6 +104,13 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
             show("drawing the report")
             leave_report(request.out, Accuracy(outcome.metrics))
     return LiveOutcome(outcome, topic.name, counts, is_interrupted)
+
+
+def bounded(config: Config) -> Config:
+    """The configuration with a budget of a scan's mapping, which follows the rate of the sensor unless one is given."""
+    if config.mapping.budget_ms is not None:
+        return config
+    return config.model_copy(update={"mapping": config.mapping.model_copy(update={"budget_ms": "auto"})})
 
 
 def _follower(request: LiveRequest, node: "DdsNode", session: LiveSession, decoder: CloudDecoder) -> "Follower":
