@@ -11,7 +11,8 @@ many threads as it likes; so do the peers (`pip install 'lidarslam[peers]'`), of
 
 Methods take turns for `--rounds` rounds. Wall and processor time are over all scans but the first `--warm-up`, divided
 by their number; the ratio is to the KISS-ICP of the same round: its median, smallest and largest. The median and the
-99th percentile are of single scans: of ours the sum of the stages, which work on several scans at once.
+99th percentile are of single scans: of ours the sum of the stages, which work on several scans at once; below the table
+is the median of each stage.
 """
 
 import argparse
@@ -21,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,7 @@ class Times:
     wall: float
     processor: float  # of all threads; NaN where it cannot be told from other work
     scan_ms: list[float]  # of single scans
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)  # of the stages of ours, of single scans
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -104,6 +106,10 @@ def _measure(name: str, scans: Sequence[Scan], source: Scans, options: argparse.
         ratios = [f"{np.median(r):.2f} [{r.min():.2f}, {r.max():.2f}]" for r in (taken / kiss).T]
         shown = [wall, *of_scans, processor]
         print_row([method, *(_blank_nan(f"{value:.1f}") for value in shown), *(_blank_nan(ratio) for ratio in ratios)])
+    for method in options.methods:
+        stages = {stage: [times[method].stage_ms[stage] for times in rounds] for stage in rounds[0][method].stage_ms}
+        medians = (f"{stage} {np.median(np.concatenate(ms)):.1f}" for stage, ms in stages.items())
+        print(f"\n{method}, ms: {', '.join(medians)}")
 
 
 def _blank_nan(text: str) -> str:
@@ -118,22 +124,22 @@ def _run_ours(method: str, scans: Iterable[Scan], warm_up: int) -> Times:
     config = load_config(None, parse_method(method).settings)
     odometry, graph = make_odometry(config.odometry), begin_graph(config)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
-    clock, count = _clock(), 0
-    scan_ms: list[float] = []
+    clock, results = _clock(), []
     for result in pipeline.run(scans):
-        count += 1
-        if count == warm_up:
-            clock, scan_ms = _clock(), []
-        scan_ms.append(sum(ms for stage, ms in result.stage_ms.items() if stage != "read"))
+        results.append(result.stage_ms)
+        if len(results) == warm_up:
+            clock = _clock()
     if pipeline.map.global_map is not None:
         pipeline.map.global_map.points()  # what waits to be merged is part of the work
     if graph is not None and pipeline.map.global_map is not None:
-        finished = FinishedGraph.of_recordings(graph, [count], pipeline.map.global_map.voxel_size_m)
+        finished = FinishedGraph.of_recordings(graph, [len(results)], pipeline.map.global_map.voxel_size_m)
         assert finished is not None
         finished.outcome([0])
         graph.close()
     odometry.close()
-    return Times(*clock(), scan_ms)
+    counted = results[warm_up:]
+    stage_ms = {stage: [times[stage] for times in counted] for stage in counted[0]} if counted else {}
+    return Times(*clock(), [sum(times.values()) - times["read"] for times in counted], stage_ms)
 
 
 def _saved(scans: Sequence[Scan], folder: Path) -> Path:

@@ -26,6 +26,7 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.surfels.registration import register
 from lidarslam.mapping.tracking import attempts
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.simulation.recorder import Simulation
@@ -49,7 +50,6 @@ def recorded(fault: str, simulation: Simulation) -> Faulty:
 
 def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Iterator[list[str]]:
     """The cells of each budget."""
-    register = attempts.register
     for budget_ms in budgets_ms:
         registration_ms = []
 

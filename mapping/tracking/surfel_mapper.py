@@ -30,6 +30,7 @@ logger = logging.getLogger(__name__)
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
+_SEARCHING = "the search for its place goes on with the next scan"
 
 
 class SurfelMapper(Stateful):
@@ -90,6 +91,7 @@ class SurfelMapper(Stateful):
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
+            reason = _SEARCHING if self._tracker.is_searching else reason
             return self._lose(scan, attempt.prediction, surfel_map, attempt.fit, reason)
         # Judge the pose by its fit, and adapt the noise of process and odometry.
         mapped = self._tracker.accept(attempt, scan, prior, prediction, last)

@@ -167,7 +167,7 @@ def _compared(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArra
     root = np.linalg.cholesky(other)
     half = np.linalg.inv(root)
     ratios, axes = np.linalg.eigh(half @ one @ half.T)
-    return root, ratios, axes
+    return np.asarray(root, dtype=np.float64), ratios, axes
 
 
 def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: FloatArray) -> Alignment:
