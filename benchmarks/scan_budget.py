@@ -26,6 +26,7 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.surfels.registration import register
 from lidarslam.mapping.tracking import attempts
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.simulation.recorder import Simulation
@@ -49,7 +50,6 @@ def recorded(fault: str, simulation: Simulation) -> Faulty:
 
 def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Iterator[list[str]]:
     """The cells of each budget."""
-    register = attempts.register
     for budget_ms in budgets_ms:
         registration_ms = []
 
@@ -59,7 +59,7 @@ def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Ite
             registration_ms.append(1e3 * (time.thread_time() - started))  # noqa: B023
             return result
 
-        mapper = SurfelMapper(MappingConfig(budget_ms=budget_ms or None), time.thread_time)
+        mapper = SurfelMapper(MappingConfig(budget_ms=budget_ms or None), clock=time.thread_time)
         results, ms = [], []
         with patch.object(attempts, "register", timed):
             for scan in faulty.scans:

@@ -19,11 +19,13 @@ class BackgroundWorker:
         self._pending: deque[Future[Any]] = deque()
         self._max_pending = max_pending
 
-    def submit(self, call: Callable[..., Any], *arguments: Any) -> None:
-        """Queue a call; an error of an earlier one may be raised here."""
-        self._pending.append(self._pool.submit(call, *arguments))
+    def submit(self, call: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Queue a call, which will have a result; an error of an earlier one may be raised here."""
+        future = self._pool.submit(call, *arguments)
+        self._pending.append(future)
         while len(self._pending) > self._max_pending:
             self._pending.popleft().result()
+        return future
 
     def wait(self) -> None:
         """Wait until all calls are done, and raise the first error among them."""

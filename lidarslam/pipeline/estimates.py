@@ -83,6 +83,7 @@ class Localised:
     stage_ms: dict[str, float]  # wall time of the stages, see `STAGES`
     is_connected: bool = True  # whether the pose follows from that of the previous scan; not when lost or relocalised
     gravity: GravityDirection | None = None  # as an IMU measured it, in the LiDAR frame; None where it did not
+    cell_m: float | None = None  # of the local map's surfels; None where there are none
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,7 +1,7 @@
 """The pose of each scan: scan-to-map registration, or the odometry alone with a check against the previous scan."""
 
 import time
-from typing import Annotated, Protocol
+from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
 
@@ -17,10 +17,15 @@ from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
+from lidarslam.pipeline.map_correction import SCANS_LATER
 
 
 class Localiser(Protocol):
     """Estimates the pose of one scan after the other."""
+
+    @property
+    def surfel_mapper(self) -> SurfelMapper | None:
+        """The mapper whose local map may be drawn anew; None without such a map."""
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """The pose of a scan, given the odometry of the next; None after the last."""
@@ -50,6 +55,8 @@ class OdometryAlone(Stateful):
 
     _check: ConsistencyCheck
     _T_odom_lidar: Annotated[FloatArray, Shape(4, 4)]
+
+    surfel_mapper: ClassVar[None] = None
 
     def __init__(self, check: ConsistencyCheck) -> None:
         self._check = check
@@ -98,6 +105,11 @@ class ScanToMap(Stateful):
         self._T_odom_lidar = np.eye(4)
         self._T_world_last = np.eye(4)
 
+    @property
+    def surfel_mapper(self) -> SurfelMapper | None:
+        """The mapper, where it has surfels; see `Localiser`."""
+        return self._mapper if isinstance(self._mapper, SurfelMapper) else None
+
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Refine the odometry's pose; where it measured nothing, the mapper predicts with the last velocity."""
         started = time.perf_counter()
@@ -128,6 +140,7 @@ class ScanToMap(Stateful):
             stage_ms={"refine": 1e3 * (time.perf_counter() - started)},
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
+            cell_m=None if self.surfel_mapper is None else self.surfel_mapper.cell_m,
         )
 
 
@@ -152,4 +165,4 @@ def make_localiser(config: Config, inertial: Inertial | None = None) -> Localise
         from lidarslam.mapping.loam.mapper import LoamMapper  # loads Open3D
 
         return ScanToMap(LoamMapper(config.mapping), inertial)
-    return ScanToMap(SurfelMapper(config.mapping), inertial)
+    return ScanToMap(SurfelMapper(config.mapping, SCANS_LATER if config.pose_graph.enabled else 0), inertial)

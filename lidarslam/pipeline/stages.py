@@ -12,11 +12,14 @@ from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.background_worker import BackgroundWorker
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, graph_scan
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
+from lidarslam.pipeline.map_correction import MapCorrection
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -37,6 +40,7 @@ class Stages(Stateful):
 
     map: MapBuilder
     _localiser: Localiser
+    _correction: MapCorrection | None
     _measured_stamp: float | None  # of the last scan, unless its motion was only predicted
 
     def __init__(
@@ -51,6 +55,8 @@ class Stages(Stateful):
         self._localiser = localiser
         self._graph = graph
         self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
+        mapper = localiser.surfel_mapper
+        self._correction = None if graph is None or mapper is None else MapCorrection(mapper)
         self._measured_stamp = None
         self.map = MapBuilder(config, store)
 
@@ -66,6 +72,8 @@ class Stages(Stateful):
 
     def localise(self, estimated: Estimated, following: Estimated | None = None) -> Localised:
         """The pose of a scan; the odometry of the following one gives the motion after the stamp, where it is known."""
+        if self._correction is not None:
+            self._correction.before_scan()
         return self._localiser.localise(estimated, following)
 
     def build(self, estimated: Estimated, localised: Localised) -> ScanResult:
@@ -77,7 +85,10 @@ class Stages(Stateful):
         self.add_pending(next_is_lost=localised.status is Status.LOST)
         self.map.add(thinned, points, localised)
         if self._graph is not None:
-            self._graph_worker.submit(self._graph.add, graph_scan(estimated, localised, points))
+            arrived = graph_scan(estimated, localised, points)
+            drawing = self._graph_worker.submit(_follow, self._graph, arrived, localised.cell_m)
+            if self._correction is not None:
+                self._correction.add(drawing)
         stage_ms = {"deskew": _ms(started, deskewed), "map": _ms(deskewed, time.perf_counter())}
         return ScanResult(
             **vars(localised) | {"stage_ms": estimated.stage_ms | localised.stage_ms | stage_ms},
@@ -105,6 +116,12 @@ class Stages(Stateful):
     def close(self) -> None:
         """Wait for the graph, and end its thread."""
         self._graph_worker.close()
+
+
+def _follow(graph: "SlamGraph", scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
+    """Give the graph a scan; the local map of surfels, where there is one and loop closures change it."""
+    graph.add(scan)
+    return None if cell_m is None else graph.redrawn_local_map(cell_m)
 
 
 def _ms(start: float, end: float) -> float:

@@ -74,6 +74,8 @@ def execute(
                 description = describe_computed(request, recording)
                 unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
             log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+            if config.mapping.budget_ms is not None:
+                log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
             if graph is not None:
                 stack.callback(graph.close)
             with viewing(request.rerun, config.viewer, recording.name, directory, log, page) as viewer:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from lidarslam.core.geometry import FloatArray, adjoint, inverse
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 
@@ -83,6 +83,12 @@ def drift_covariance(length_m: float, registered: bool = True, lost: bool = Fals
         factor = 1.0 if registered else _UNMAPPED
         sigma_rad, sigma_m = factor * (_LEAST_RAD + _RAD_PER_M * length_m), factor * (_LEAST_M + _M_PER_M * length_m)
     return np.diag(np.array([sigma_rad] * 3 + [sigma_m] * 3) ** 2)
+
+
+def squared_error(edge: RelativePose, poses: Sequence[FloatArray]) -> float:
+    """Squared Mahalanobis distance of an edge from keyframe poses (4, 4)."""
+    error = log(inverse(poses[edge.first] @ edge.T_first_second) @ poses[edge.second])
+    return float(error @ np.linalg.solve(edge.covariance, error))
 
 
 def first_connected(count: int, pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:

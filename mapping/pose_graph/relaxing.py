@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.mapping.pose_graph.edges import squared_error
 
-# An optimisation takes time in proportion to the keyframes, so the next one waits for this part of their number: its
-# time for each keyframe, some 15 ms, does not grow. With 10,000 keyframes that is a wait of some 100 m.
-_PART = 200
+# An optimisation takes time in proportion to the keyframes. The next one waits for the hundredth part of their number,
+# so that its time for each keyframe does not grow: none waits with 100 keyframes, 300 m or so with 10,000.
+_PART = 100
+# Expected squared Mahalanobis distance of a closure: only beyond it does one move the poses.
+_EXPECTED = 6.0
 
 
 class RelaxSchedule(Stateful):
@@ -33,13 +34,7 @@ class RelaxSchedule(Stateful):
         if _PART * (len(poses) - self._keyframes) < len(poses):
             return False
         waiting, self._waiting = self._waiting, []
-        if not any(_contradicts(closure, poses) for closure in waiting):
+        if not any(squared_error(closure, poses) > _EXPECTED for closure in waiting):
             return False
         self._keyframes = len(poses)
         return True
-
-
-def _contradicts(closure: LoopClosure, poses: Sequence[FloatArray]) -> bool:
-    """Whether a closure is farther from the present poses than its own deviation: only then it moves them."""
-    error = log(inverse(poses[closure.first] @ closure.T_first_second) @ poses[closure.second])
-    return float(error @ np.linalg.solve(closure.covariance, error)) > len(error)

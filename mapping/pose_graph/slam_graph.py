@@ -21,22 +21,21 @@ from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
-from lidarslam.mapping.loops.refinement import DenseSubmap, refine
+from lidarslam.mapping.loops.refinement import refine
 from lidarslam.mapping.loops.revisits import as_registered
 from lidarslam.mapping.pose_graph.attitude import Attitude, measured_attitude
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
-from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, drift_covariance, first_connected, trajectory_edges
+from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, first_connected, squared_error, trajectory_edges
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
+from lidarslam.mapping.pose_graph.laid_submaps import LaidSubmaps, connected_with_last
+from lidarslam.mapping.pose_graph.neighbourhoods import REACH, Neighbourhoods
 from lidarslam.mapping.pose_graph.optimizer import optimise, relax
 from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
 from lidarslam.mapping.pose_graph.submap_store import SubmapStore
-
-# A closure is refined on submaps united with so many on either side: one alone is as sparse as the sensor, and over a
-# longer way drift bends them.
-_REACH = 1
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 
 class SlamGraph(Stateful):
@@ -63,6 +62,8 @@ class SlamGraph(Stateful):
     _closures: list[LoopClosure]
     _relaxing: RelaxSchedule
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
+    _laid: LaidSubmaps  # in the running local map
+    _looked_at: int  # closures that the local map has been compared with
     _motion: MotionSinceKeyframe
     _path_m: float
     _segment: int
@@ -83,6 +84,7 @@ class SlamGraph(Stateful):
         self.scan_poses, self.keyframe_ms, self._first_scans = [], [], [0]
         self._keyframes, self._poses, self._edges, self._closures = [], [], [], []
         self._unrefined, self._attitudes, self._relaxing = [], [], RelaxSchedule()
+        self._laid, self._looked_at = LaidSubmaps(local_radius_m), 0
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
     def _after_restore(self) -> None:
@@ -121,6 +123,19 @@ class SlamGraph(Stateful):
             self._begin_keyframe(scan)
             self.keyframe_ms.append(1e3 * (time.perf_counter() - started))
         self._attitudes += measured_attitude(scan, self._keyframes, self.scan_poses, self._first_scans)
+
+    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
+        """The local map drawn anew without the latest scan, in the frame of registration, with cells of that edge.
+
+        None unless loop closures since the last call show that submaps lie elsewhere in the local map, or are missing.
+        """
+        new, self._looked_at = self._closures[self._looked_at :], len(self._closures)
+        if not any(closure.accepted for closure in new):
+            return None
+        certain = [one for one in self._accepted() if squared_error(one, self._poses) < CHI_SQUARED_99]
+        members = connected_with_last(self._keyframes, certain, self._first_scans[-1])
+        T_odom_world = self.scan_poses[self._keyframes[-1].scan] @ inverse(self._poses[-1])
+        return self._laid.redrawn(T_odom_world @ np.array(self._poses), members, cell_m, self._means)
 
     def finish(self) -> Corrected | None:
         """Optimise everything; None when there is no keyframe."""
@@ -195,6 +210,7 @@ class SlamGraph(Stateful):
             self._edges += trajectory_edges(key, T_first_second, motion, last.covariance, scan.covariance)
             self._poses.append(self._poses[-1] @ T_first_second)
             self._segment += motion.lost  # the drift model does not hold across
+        self._laid.follow(scan.T_world_lidar)
         self._keyframes.append(Keyframe(len(self.scan_poses) - 1, self._segment, self._path_m, scan.covariance))
 
     def _close_submap(self) -> None:
@@ -207,7 +223,7 @@ class SlamGraph(Stateful):
         found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
-        self._refine_closures(until=index - _REACH)
+        self._refine_closures(until=index - REACH)
         if self._relaxing.is_due(found, self._poses):
             self._poses = list(relax(np.array(self._poses), self._edges, self._accepted(), self._attitudes))
 
@@ -220,27 +236,11 @@ class SlamGraph(Stateful):
     def _refined(self, closure: LoopClosure) -> LoopClosure:
         """A closure registered on all points of both submaps and their neighbours."""
         cell_m = max(self._detector.cell_m(key) for key in (closure.first, closure.second))
-        target, source = (self._dense_submap(key, cell_m) for key in (closure.first, closure.second))
-        drift = self._drift_around(closure.first) + self._drift_around(closure.second)
-        closure = refine(target, source, closure, drift) or closure
+        near, ends = Neighbourhoods(self._keyframes, self._poses, self._store), (closure.first, closure.second)
+        target, source = (near.submap(key, self._config.loops.max_range_m, cell_m) for key in ends)
+        closure = refine(target, source, closure, near.drift(closure.first) + near.drift(closure.second)) or closure
         first, second = self._keyframes[closure.first], self._keyframes[closure.second]
-        if first.segment != second.segment:
+        if first.segment != second.segment or self._laid.redrawn_between(closure.first, closure.second):
             return closure
         way = np.array(self.scan_poses[first.scan : second.scan + 1])
         return as_registered(closure, way, first.covariance, second.covariance, self._local_radius_m)
-
-    def _dense_submap(self, key: int, cell_m: float) -> DenseSubmap:
-        """A keyframe's submap united with its neighbours' of the same segment."""
-        T_keyframe_world = inverse(self._poses[key])
-        submaps = [(T_keyframe_world @ self._poses[k], means_points(self._store[k])) for k in self._around(key)]
-        return DenseSubmap.join(submaps, self._config.loops.max_range_m, cell_m)
-
-    def _around(self, key: int) -> list[int]:
-        """A keyframe with those beside it in its segment that have submaps by now."""
-        near = range(max(0, key - _REACH), min(len(self._store), key + _REACH + 1))
-        return [k for k in near if self._keyframes[k].segment == self._keyframes[key].segment]
-
-    def _drift_around(self, key: int) -> FloatArray:
-        """(6, 6) of a keyframe's neighbours relative to it; each axis has a third of the squared error."""
-        path_m = self._keyframes[key].path_m
-        return drift_covariance(max(abs(self._keyframes[k].path_m - path_m) for k in self._around(key))) / 3.0

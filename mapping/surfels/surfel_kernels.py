@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
+from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, find_one, middle_of, neighbour_key, other_side
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # A surfel is computed again when its cell has grown by this factor.
@@ -98,7 +98,7 @@ def _gather(row: int, cells: Cells, total: FloatArray) -> None:
                 other = find_one(neighbour_key(key, a, b, c), cells.bits, cells.table_keys, cells.table_rows)
                 if other < 0:
                     continue
-                if cells.others[other] >= 0:
+                if cells.sums[other, OTHER] > 0.0:
                     other = row if a == b == c == 0 else _same_side(own, other, cells)
                 s = cells.sums[other]
                 if own[12] * s[12] + own[13] * s[13] + own[14] * s[14] < 0.0:
@@ -130,7 +130,7 @@ def _gather(row: int, cells: Cells, total: FloatArray) -> None:
 @compiled_part
 def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
     """The row of that side of a cell whose view direction is nearer to that of the sums (15,)."""
-    other = cells.others[row]
+    other = other_side(row, cells.sums)
     if _view_cosine(own, cells.sums[other]) > _view_cosine(own, cells.sums[row]):
         return int(other)
     return row

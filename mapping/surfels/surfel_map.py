@@ -1,8 +1,9 @@
 """Local map of surfels in three sizes of cells, and the point-to-plane correspondences of a scan with it."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import Shape, Stateful
@@ -49,9 +50,7 @@ class SurfelMap(Stateful):
         # The two sides of a thin wall after one another: the second is known by its view then.
         faces_up = normals @ _UNEVEN > 0.0
         for side in (faces_up, ~faces_up):
-            chosen = points[side], elevations[side], normals[side]
-            for grid in surfel_map._grids:
-                grid.insert(*chosen)
+            surfel_map.insert_seen(points[side], elevations[side], normals[side])
         return surfel_map
 
     def _after_restore(self) -> None:
@@ -72,8 +71,7 @@ class SurfelMap(Stateful):
         """
         views = np.empty((len(points), 3), dtype=np.float32)
         write_views(np.ascontiguousarray(points), np.ascontiguousarray(sensor), views)
-        for grid in self._grids:
-            grid.insert(points, elevations, views)
+        self.insert_seen(points, elevations, views)
         if self._centre is None:
             self._centre = sensor
         if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
@@ -84,6 +82,11 @@ class SurfelMap(Stateful):
         if self.scans % _TIDIED_AFTER == 0:
             for grid in self._grids:
                 grid.tidy()
+
+    def insert_seen(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
+        """Insert points (N, 3) of the world, with elevations (N,), seen from along views (N, 3), unit length."""
+        for grid in self._grids:
+            grid.insert(points, elevations, views)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray, level: int = 0) -> Correspondences:
         """Correspondences of points (N, 3) of the world, seen from a pose (4, 4).

@@ -7,8 +7,10 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.surfels.registration import Registration
+from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.fit import Fit
 
@@ -68,6 +70,20 @@ class Attempt:
         """Whether the correction exceeds every motion that the prediction allows for."""
         sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
         return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
+
+    def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:
+        """Velocity (6,) after a jump or a relocalisation from the last scan's state.
+
+        After a relocalisation only the estimate within the sweep is known. After a jump one of two sweeps was bent by a
+        wrong velocity: the mean velocity between the two poses.
+        """
+        interval_s = scan.stamp - last.stamp
+        if not self.relocalised:
+            if interval_s > 0.0:
+                return body_velocity(inverse(last.T_world_lidar) @ self.T_world_lidar, interval_s)
+            return np.zeros(6)
+        assert self.registration is not None
+        return self.registration.velocity if continuous_time and scan.sweep.times is not None else np.zeros(6)
 
     def has_rivals(self, others: Iterable["Attempt"]) -> bool:
         """Whether the scan fits nearly as well at another place."""

@@ -65,6 +65,10 @@ class ScanMatcher:
         """The matcher of the scan with another map."""
         return ScanMatcher(self.scan, self.last, surfel_map, self._config, self._budget)
 
+    def none(self, prediction: Prediction) -> Attempt:
+        """The result without a registration."""
+        return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
+
     def register(self, prediction: Prediction, coarse_first: bool) -> Attempt:
         """Register from the prediction; where that does not fit, by way of coarser cells."""
         attempt = self._attempt(prediction, prediction, coarse_first)
@@ -188,7 +192,7 @@ class ScanMatcher:
         if registration is not None and not (continuous and keypoints.times is not None) and interval_s > 0.0:
             registration = with_mean_velocity(registration, keypoints, start, self.last, self._map, patient)
         if registration is None:
-            return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
+            return self.none(prediction)
         points = keypoints.compensated(registration.velocity)
         fit = measure_fit(points, registration.T_world_lidar, self._map, registration.matcher)
         return Attempt(prediction, self._map, registration, fit, fit.status(self._config.tracking))

@@ -82,7 +82,8 @@ class BirdsEyeMap:
             norm = float(np.linalg.norm(image))
             if norm == 0.0:
                 return np.empty((0, 4, 4))
-            correlation: NDArray[np.float32] = irfft2(spectrum * np.conj(rfft2(image, s=size)), s=size) / norm
+            product = spectrum * np.conj(rfft2(image, s=size))
+            correlation = np.asarray(irfft2(product, s=size) / norm, dtype=np.float32)
             peaks += [
                 (score, yaw, self._position(shift, size, reach_m))
                 for score, shift in _peaks(correlation, peaks_per_yaw)

@@ -13,7 +13,9 @@ class SpreadSearch:
     """
 
     def __init__(self) -> None:
-        self.drop()
+        self._steps: Steps[Attempt | None] | None = None
+        self._begun: Prediction | None = None
+        self._found: Attempt | None = None
 
     @property
     def is_under_way(self) -> bool:
@@ -26,9 +28,7 @@ class SpreadSearch:
 
     def drop(self) -> None:
         """End the search without a result."""
-        self._steps: Steps[Attempt | None] | None = None
-        self._begun: Prediction | None = None
-        self._found: Attempt | None = None
+        self._steps = self._begun = self._found = None
 
     def go_on(self, matcher: ScanMatcher, prediction: Prediction, budget: Budget) -> Attempt | None:
         """Search until the budget is spent; the present scan, relocalised, if that succeeds."""

@@ -7,13 +7,14 @@ inserted into the map. `mapping.tracking` has the cases in which the registratio
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import displacement_m, inverse, log, transform_points
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, transform_points
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import body_velocity
@@ -30,6 +31,17 @@ logger = logging.getLogger(__name__)
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
+_SEARCHING = "the search for its place goes on with the next scan"
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """A scan as it was inserted into the local map."""
+
+    number: int  # of the scan
+    points: Annotated[FloatArray, Shape(None, 3)]  # in the world
+    elevations: Annotated[FloatArray, Shape(None)]  # their angles above the sensor's equator, radians
+    sensor: Annotated[FloatArray, Shape(3)]  # position in the world
 
 
 class SurfelMapper(Stateful):
@@ -37,6 +49,7 @@ class SurfelMapper(Stateful):
 
     Args:
         config: of the mapping.
+        kept_scans: how many of the latest scans are kept, for `redraw`.
         clock: seconds, for the budget of a scan.
     """
 
@@ -45,10 +58,17 @@ class SurfelMapper(Stateful):
     _map: SurfelMap | None
     _last: MotionState | None
     _first: SampledScan | None
+    _scans: int
+    _map_since: int  # number of scans before the present map began, or came back from the archive
+    _recent: list[Insertion]
 
-    def __init__(self, config: MappingConfig, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, config: MappingConfig, kept_scans: int = 0, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         self._config = config
         self._budget = Budget(config.budget_ms, clock)
+        self._kept_scans = kept_scans
+        self._scans, self._map_since, self._recent = 0, 0, []
         self._sampler = Sampler(config)
         self._tracker = Tracker(config, self._budget)
         self._map = None
@@ -60,6 +80,11 @@ class SurfelMapper(Stateful):
         """The map that scans are registered to; None before the first."""
         return self._map
 
+    @property
+    def cell_m(self) -> float | None:
+        """Edge of the map's finest cells; None before the first scan."""
+        return None if self._map is None else self._map.cell_m
+
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
         self._budget.begin(np.inf if self._last is None else scan.stamp - self._last.stamp)
@@ -67,6 +92,7 @@ class SurfelMapper(Stateful):
 
     def process_sampled(self, scan: SampledScan, prior: Prior) -> MappedScan:
         """Register the next scan, thinned already, and insert it."""
+        self._scans += 1
         velocity = np.zeros(6) if prior.velocity is None else prior.velocity
         last = self._last or MotionState(scan.stamp, np.eye(4), velocity, UNKNOWN_VELOCITY)
         first, self._first = self._first, None
@@ -90,14 +116,32 @@ class SurfelMapper(Stateful):
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
+            reason = _SEARCHING if self._tracker.is_searching else reason
             return self._lose(scan, attempt.prediction, surfel_map, attempt.fit, reason)
         # Judge the pose by its fit, and adapt the noise of process and odometry.
         mapped = self._tracker.accept(attempt, scan, prior, prediction, last)
         # Insert the scan into the map that it was registered to, which may be an archived one.
+        if attempt.surfel_map is not surfel_map:
+            self._map_since = self._scans
         self._map = attempt.surfel_map
         if mapped.added:
-            _insert(scan, mapped.state, self._map)
+            self._insert(scan, mapped.state, self._map)
         return mapped
+
+    def redraw(self, drawn: SurfelMap, scans: int) -> bool:
+        """Replace the local map by one drawn anew without the latest scans, so many, which are inserted.
+
+        Returns:
+            False where another map has begun since, and stays.
+        """
+        if self._map is None or self._map_since > self._scans - scans:
+            return False
+        missing = [insertion for insertion in self._recent if insertion.number > self._scans - scans]
+        drawn.scans = self._map.scans - len(missing)
+        for insertion in missing:
+            drawn.insert(insertion.points, insertion.elevations, insertion.sensor)
+        self._map = drawn
+        return True
 
     def _begin(self, scan: SampledScan, prior: Prior, last: MotionState) -> MappedScan:
         """The first scan makes the map."""
@@ -149,14 +193,18 @@ class SurfelMapper(Stateful):
         """A map of one scan."""
         surfel_map = SurfelMap(scan.cell_m, self._config.radius_m)
         logger.info("new surfel map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
-        _insert(scan, state, surfel_map)
+        self._map_since = self._scans
+        self._insert(scan, state, surfel_map)
         return surfel_map
 
-
-def _insert(scan: SampledScan, state: MotionState, surfel_map: SurfelMap) -> None:
-    """Insert a scan, compensated, at its pose."""
-    points = transform_points(state.T_world_lidar, scan.sweep.compensated(state.velocity))
-    surfel_map.insert(points, scan.elevations, state.T_world_lidar[:3, 3])
+    def _insert(self, scan: SampledScan, state: MotionState, surfel_map: SurfelMap) -> None:
+        """Insert a scan, compensated, at its pose."""
+        points = transform_points(state.T_world_lidar, scan.sweep.compensated(state.velocity))
+        surfel_map.insert(points, scan.elevations, state.T_world_lidar[:3, 3])
+        recent = [one for one in self._recent if one.number > self._scans - self._kept_scans]
+        if self._kept_scans:
+            recent.append(Insertion(self._scans, points, scan.elevations, state.T_world_lidar[:3, 3]))
+        self._recent = recent
 
 
 def _sparse_message(scan: SampledScan) -> str:

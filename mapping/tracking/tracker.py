@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, displacement_m, inverse
+from lidarslam.core.geometry import displacement_m, inverse
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import (
     LARGEST_PROCESS_NOISE,
     LOST_MOTION,
@@ -54,6 +53,7 @@ class Tracker(Stateful):
         self._budget = budget or Budget()
         self._search = SpreadSearch()
         self._map_is_due = False  # whether the next search is one of the whole map
+        self._in_vain = False  # whether the last scan ended a search that found nothing
         self._state = TrackingState()
         self._archive = ArchivedMaps()
         self._process_noise = ProcessNoise()
@@ -64,6 +64,11 @@ class Tracker(Stateful):
     def is_unconfirmed(self) -> bool:
         """Whether the sensor was relocalised, and the next scans have not confirmed it yet."""
         return self._state.is_unconfirmed
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether a search is under way that goes on with the next scan."""
+        return self._search.is_under_way
 
     def begin_at(self, stamp: float, quality: float) -> None:
         """Begin with a scan whose pose was found and whose velocity is known; the next scans must confirm it."""
@@ -83,6 +88,10 @@ class Tracker(Stateful):
     ) -> Attempt:
         """Register a scan near its prediction, else relocalise it; the status is lost where neither is reliable."""
         matcher = ScanMatcher(scan, last, surfel_map, self._config, self._budget)
+        if self._state.is_lost and self.is_searching:  # which has all the time of a lost scan
+            found = self._found(matcher, prediction)
+            self._in_vain = found is None and not self.is_searching
+            return found or matcher.none(prediction)
         uncertain = self._state.is_uncertain(scan.stamp - last.stamp)
         near = matcher.register(prediction, self._begins_coarse(scan))
         if not (uncertain or self._budget.is_spent):
@@ -91,12 +100,15 @@ class Tracker(Stateful):
         if near.status is Status.LOST or ((uncertain or unconfirmed) and not near.is_reliable):
             best = self._relocalise(matcher, near)
         elif near.status is Status.DEGRADED and self._state.searches_nearby:
-            best = best_of(filter(None, (near, self._found(matcher, near.prediction))))
+            best = best_of(filter(None, (near, self._found(matcher, near.prediction, nearby=True))))
         elif near.status is Status.OK and not unconfirmed:
             best = self._archive.relocalise(matcher, near.prediction, self._budget) or near
         else:
             best = near
-        rejected = best is near and unconfirmed and self._contradicts_motion(near, prior, last)
+        # After a relocalisation an improbable motion contradicts that.
+        motion = inverse(last.T_world_lidar) @ near.T_world_lidar
+        improbable = near.has_jumped or self._odometry_noise.rejects(prior, motion, self._config)
+        rejected = best is near and unconfirmed and improbable
         return replace(near, status=Status.LOST) if best is None or rejected else best
 
     def accept(
@@ -118,7 +130,8 @@ class Tracker(Stateful):
             covariance = registration.covariance
             state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
         else:
-            state = MotionState(scan.stamp, T_world_lidar, self._uncertain_velocity(attempt, scan, last), LOST_MOTION)
+            velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
+            state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
@@ -147,7 +160,7 @@ class Tracker(Stateful):
         """Update with a scan that was not registered; true after so many that the map is to be given up."""
         self._prediction_error_m = _UNKNOWN_ERROR_M
         self._state.lost(has_points)
-        return has_points and self._state.gives_up
+        return has_points and self._state.gives_up and not self.is_searching
 
     def snapshot(self) -> "Tracker":
         """A copy to `rewind` to."""
@@ -204,16 +217,19 @@ class Tracker(Stateful):
     def _relocalise(self, matcher: ScanMatcher, near: Attempt) -> Attempt | None:
         """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none.
 
-        The nearby attempt does not count before the search is done.
+        The nearby attempt does not count before a search is done.
         """
-        self._map_is_due |= self._state.searches_map
-        found = self._found(matcher, near.prediction)
         sufficient = near.is_reliable if self._state.is_unconfirmed else near.is_plausible
-        counts = near.status is not Status.LOST and sufficient and not self._search.is_under_way
-        return best_of(filter(None, (near if counts else None, found)))
+        counts, in_vain = near.status is not Status.LOST and sufficient, self._in_vain
+        self._in_vain = False
+        if counts and in_vain:
+            return near
+        found = self._found(matcher, near.prediction)
+        return best_of(filter(None, (near if counts and not self.is_searching else None, found)))
 
-    def _found(self, matcher: ScanMatcher, prediction: Prediction) -> Attempt | None:
+    def _found(self, matcher: ScanMatcher, prediction: Prediction, nearby: bool = False) -> Attempt | None:
         """The scan, relocalised by the search that is under way or a new one; None where that is not done or fails."""
+        self._map_is_due |= self._state.searches_map and not nearby
         if not self._search.is_under_way:
             self._search.begin(matcher.search(prediction, self._map_is_due), prediction)
             self._map_is_due = False
@@ -221,12 +237,7 @@ class Tracker(Stateful):
 
     def _end_search(self) -> None:
         self._search.drop()
-        self._map_is_due = False
-
-    def _contradicts_motion(self, attempt: Attempt, prior: Prior, last: MotionState) -> bool:
-        """Whether the motion since the last scan is improbable, which contradicts the relocalisation before."""
-        motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
-        return attempt.has_jumped or self._odometry_noise.rejects(prior, motion, self._config)
+        self._map_is_due = self._in_vain = False
 
     def _update_noise(self, attempt: Attempt, prior: Prior, last: MotionState, interval_s: float) -> None:
         assert attempt.registration is not None
@@ -236,18 +247,3 @@ class Tracker(Stateful):
             self._process_noise = self._process_noise.updated(change, interval_s, variance)
         motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
         self._odometry_noise = self._odometry_noise.updated(prior, motion, self._config)
-
-    def _uncertain_velocity(self, attempt: Attempt, scan: SampledScan, last: MotionState) -> FloatArray:
-        """Velocity (6,) after a jump or a relocalisation.
-
-        After a relocalisation only the estimate within the sweep is known. After a jump one of two sweeps was bent by a
-        wrong velocity: the mean velocity between the two poses.
-        """
-        interval_s = scan.stamp - last.stamp
-        if not attempt.relocalised:
-            if interval_s > 0.0:
-                return body_velocity(inverse(last.T_world_lidar) @ attempt.T_world_lidar, interval_s)
-            return np.zeros(6)
-        assert attempt.registration is not None
-        observed = self._config.continuous_time and scan.sweep.times is not None
-        return attempt.registration.velocity if observed else np.zeros(6)

@@ -43,7 +43,7 @@ class InferenceColumns(nn.Module):
 
 def _channels(image: Tensor) -> tuple[Tensor, Tensor]:
     """`column_channels` of points and normals (B, 6, H, W): (B, 8, H, W), and (B, 1, H, W) which pixels are seen."""
-    x, y, z, u, v, w = image.split(1, dim=1)
+    x, y, z, u, v, w = image.chunk(6, dim=1)
     level = (x * x + y * y).sqrt()
     r = (level * level + z * z).sqrt()
     seen = r.sign()
@@ -70,24 +70,22 @@ def _folded(layer: nn.Module) -> nn.Conv2d:
     if norm.running_mean is None or norm.running_var is None:
         raise TypeError("expected a normalisation with statistics")
     gain = norm.weight / (norm.running_var + norm.eps).sqrt()
-    size = conv.kernel_size
-    folded = nn.Conv2d(conv.in_channels, conv.out_channels, size, conv.stride, (size[0] // 2, size[1] // 2))
-    folded.weight.data = conv.weight.detach() * gain.detach()[:, None, None, None]
-    folded.bias.data = (norm.bias - norm.running_mean * gain).detach()
-    return folded
+    return _convolution(conv.weight * gain[:, None, None, None], norm.bias - norm.running_mean * gain, conv)
 
 
-def _divided(convolution: nn.Conv2d) -> tuple[nn.Conv2d, nn.Conv2d]:
-    """Two convolutions, one of them of `seen` alone, whose sum is this one."""
-    divided = []
-    for is_seen in (False, True):
-        chosen = [channel for channel in range(convolution.in_channels) if (channel == _SEEN) == is_seen]
-        part = nn.Conv2d(
-            len(chosen), convolution.out_channels, convolution.kernel_size, convolution.stride, convolution.padding,
-            bias=not is_seen,
-        )  # fmt: skip
-        part.weight.data = convolution.weight.detach()[:, chosen]
-        if part.bias is not None:
-            part.bias.data = convolution.bias.detach()
-        divided.append(part)
-    return divided[0], divided[1]
+def _divided(whole: nn.Conv2d) -> tuple[nn.Conv2d, nn.Conv2d]:
+    """Two convolutions, the second of `seen` alone, whose sum is this one."""
+    others = [channel for channel in range(whole.in_channels) if channel != _SEEN]
+    first = _convolution(whole.weight[:, others], whole.bias, whole)
+    return first, _convolution(whole.weight[:, [_SEEN]], None, whole)
+
+
+def _convolution(weight: Tensor, bias: Tensor | None, like: nn.Conv2d) -> nn.Conv2d:
+    """A convolution with these weights (C', C, rows, columns) and the stride of another."""
+    rows, columns = weight.shape[2:]
+    size, stride, around = (rows, columns), (like.stride[0], like.stride[1]), (rows // 2, columns // 2)
+    made = nn.Conv2d(weight.shape[1], weight.shape[0], size, stride, around, bias=bias is not None)
+    made.weight.data = weight.detach()
+    if made.bias is not None and bias is not None:
+        made.bias.data = bias.detach()
+    return made

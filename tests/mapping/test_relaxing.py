@@ -27,7 +27,7 @@ def test_a_small_graph_is_optimised_at_every_closure_that_contradicts_it():
 def test_the_wait_grows_with_the_graph():
     found = dues(range(4000, 4200))
     assert found[0] == 4000
-    assert set(np.diff(found).tolist()) == {21}
+    assert set(np.diff(found).tolist()) <= {41, 42}
 
 
 def test_a_closure_that_had_to_wait_is_not_forgotten():
@@ -35,4 +35,4 @@ def test_a_closure_that_had_to_wait_is_not_forgotten():
     assert schedule.is_due([closure(3999, 1.0)], poses[:4000])
     assert not schedule.is_due([closure(4000, 1.0)], poses[:4001])
     due = [n for n in range(4002, 4100) if schedule.is_due([], poses[:n])]
-    assert due == [4021]
+    assert due == [4041]

@@ -19,8 +19,10 @@ from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 VOXEL_M = 0.1
+CELL_M = 0.25
 CONFIG = PoseGraphConfig(enabled=True)
 # At every 40 cm 0.02 degrees of heading too much. (Of a way that is too long by a part of it, a round does not tell.)
 DRIFT = exp([0.0, 0.0, np.deg2rad(0.02), 0.0, 0.0, 0.0])
@@ -215,6 +217,52 @@ def test_the_map_is_drawn_where_the_scans_have_gone(walk: Walk, closed: tuple[Sl
 
 def loops_of(result: Corrected) -> list[RelativePose]:
     return [edge for edge in result.edges if isinstance(edge, LoopClosure)]
+
+
+@pytest.fixture(scope="module")
+def redrawn(walk: Walk) -> list[tuple[int, SurfelMap]]:
+    """The local maps that are drawn anew on the way, with the scans after which they are."""
+    graph, drawn = SlamGraph(CONFIG, local_radius_m=8.0), []
+    for i, scan in enumerate(walk.scans()):
+        graph.add(scan)
+        local_map = graph.redrawn_local_map(CELL_M)
+        if local_map is not None:
+            drawn.append((i, local_map))
+        graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
+    graph.close()
+    return drawn
+
+
+def test_the_local_map_is_drawn_anew_where_the_second_round_is(
+    walk: Walk, redrawn: list[tuple[int, SurfelMap]]
+) -> None:
+    """Surfaces of the first round lie where the truth has them relative to the sensor, which has drifted away."""
+    assert 1 <= len(redrawn) <= 3
+    first_round = np.concatenate([transform_points(walk.truth[i], walk.points[i]) for i in range(8)])
+    for i, local_map in redrawn:
+        due = transform_points(walk.estimate[i] @ inverse(walk.truth[i]), first_round)
+        is_near = np.linalg.norm(due - walk.estimate[i][:3, 3], axis=1) < 5.0
+        assert np.median(np.linalg.norm(due - first_round, axis=1)[is_near]) > CELL_M, "the drift is visible"
+        due = due[is_near]
+        matches = local_map.match(due, walk.estimate[i])
+        assert len(np.unique(matches.index)) > 0.6 * len(due)  # walls of the block are transparent
+        assert np.median(np.abs(matches.residuals(due[matches.index]))) < 0.02
+        distances, _ = cKDTree(local_map.means()).query(due)
+        assert np.percentile(distances, 95) < 2.0 * CELL_M
+
+
+def test_a_local_map_that_is_right_is_left_alone(walk: Walk) -> None:
+    """Loops are closed, but the poses were right, and all is within the radius."""
+    graph = SlamGraph(CONFIG, local_radius_m=60.0)
+    right = replace(walk, estimate=walk.truth)
+    for scan in right.scans():
+        graph.add(scan)
+        assert graph.redrawn_local_map(CELL_M) is None
+        graph.draw(scan.points, scan.T_world_lidar, VOXEL_M)
+    result = graph.finish()
+    assert result is not None
+    assert any(result.inliers)
+    graph.close()
 
 
 def test_edges_are_of_trajectory_odometry_and_loops(closed: tuple[SlamGraph, Corrected]) -> None:

@@ -66,7 +66,7 @@ def test_a_car_goes_round_and_round(small):
     way = np.linalg.norm(np.diff(motion.base[:, :2], axis=0), axis=1)
     assert way.max() * (len(way) / motion.duration_s) < 14.5
     start, again = motion.pose_at(np.array([0.0, motion.duration_s]))
-    assert np.allclose(start, again, atol=1e-6)
+    assert np.allclose(start, again, atol=0.02)  # but for its suspension
 
 
 def test_the_seed_makes_the_town(small, monkeypatch):

@@ -1,0 +1,201 @@
+"""The running local map after loop closures: how far two rounds of a place lie apart in it, and what it costs.
+
+    python benchmarks/local_map_correction.py --cases office/handheld/2 --scans 1200
+    python benchmarks/local_map_correction.py recordings/streets --step 2 --radius-m 40
+
+A case is WORLD/MOTION or WORLD/MOTION/STEP, where every STEP-th scan is taken. Prints a Markdown table with two rows
+for each recording, the second one where the local map is drawn anew after loop closures:
+
+- apart: each scan of a later round is compared with the scan of the first one nearest to it by ground truth; by how
+  much surfaces, as far away as the median range, are apart in the local map of that moment; root mean square and 95 %,
+  over scans after the first accepted loop closure;
+- ATE in metres after SE(3) alignment, of the poses as registered and as the graph corrects them in the end;
+- loop closures; how often the map was drawn, the milliseconds of it (on the graph's thread), and those of the exchange
+  (on the thread of registration), of the processor: median and most.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from imu import simulate
+from mapping_accuracy import BEYOND_TRUTH_S, print_row
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lidarslam.config.settings import Config
+from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
+from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.pipeline.map_correction import SCANS_LATER
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.scan_stream import in_order
+
+# Scans of another round are within this part of the median range, and at least so much of the way away.
+_SAME_PLACE_RANGES, _LATER_M = 0.5, 30.0
+
+
+class _Graph(SlamGraph):
+    """Writes down when the local map was drawn anew, and where submaps lie in it."""
+
+    def __init__(self, config: PoseGraphConfig, radius_m: float, redraws: bool) -> None:
+        super().__init__(config, local_radius_m=radius_m)
+        self._redraws = redraws
+        self.drawn_ms: list[float] = []
+        self.laid: list[tuple[int, FloatArray]] = []  # first scan registered to it, poses of the keyframes so far
+        self.first_closure: int | None = None  # scans before it was found
+
+    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
+        if self.first_closure is None and any(closure.accepted for closure in self._closures):
+            self.first_closure = len(self.scan_poses)
+        if not self._redraws:
+            return None
+        started = time.thread_time()
+        drawn = super().redrawn_local_map(cell_m)
+        if drawn is not None:
+            self.drawn_ms.append(1e3 * (time.thread_time() - started))
+            self.laid.append((len(self.scan_poses) - 1 + SCANS_LATER, np.array(self._laid._poses)))
+        return drawn
+
+    def place_in_map(self, scan: int, at: int) -> FloatArray:
+        """(4, 4) where a scan's surfaces lie in the map that another one was registered to."""
+        T, keys = self.scan_poses[scan], [keyframe.scan for keyframe in self._keyframes]
+        laid = [poses for since, poses in self.laid if since <= at]
+        key = int(np.searchsorted(keys, scan, side="right")) - 1
+        if not laid or not 0 <= key < len(laid[-1]):
+            return T
+        return np.asarray(laid[-1][key] @ inverse(self.scan_poses[keys[key]]) @ T)
+
+
+class _Mapper(SurfelMapper):
+    def redraw(self, drawn: SurfelMap, scans: int) -> bool:
+        started = time.thread_time()
+        done = super().redraw(drawn, scans)
+        self.exchange_ms = [*getattr(self, "exchange_ms", []), 1e3 * (time.thread_time() - started)]
+        return done
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A recording with or without the correction."""
+
+    trajectory: Trajectory
+    corrected: Trajectory
+    graph: _Graph
+    closures: int
+    exchange_ms: list[float] = field(default_factory=list)
+
+
+def take(scans: Sequence[Scan], config: Config, redraws: bool) -> Outcome:
+    """All scans through the pipeline."""
+    odometry = make_odometry(config.odometry)
+    graph = _Graph(config.pose_graph, config.mapping.radius_m, redraws)
+    mapper = _Mapper(config.mapping, SCANS_LATER)
+    results = list(Pipeline(odometry, ScanToMap(mapper), config.global_map, graph).run(scans))
+    odometry.close()
+    stamps = np.array([result.stamp for result in results])
+    final = graph.finish()
+    assert final is not None
+    graph.close()
+    return Outcome(
+        Trajectory(stamps, np.array([result.T_world_lidar for result in results])),
+        Trajectory(stamps, final.T_world_lidar),
+        graph,
+        sum(final.inliers),
+        getattr(mapper, "exchange_ms", []),
+    )
+
+
+def rounds(truth: Trajectory, range_m: float) -> NDArray[np.intp]:
+    """(L, 2) pairs of scans: the nearest one of the first visit, and one of a later visit."""
+    positions, way = truth.positions, truth.distances
+    tree, pairs = cKDTree(positions), []
+    for late, position in enumerate(positions):
+        near = tree.query_ball_point(position, _SAME_PLACE_RANGES * range_m)
+        early = [scan for scan in near if way[late] - way[scan] > _LATER_M]
+        early = [scan for scan in early if way[scan] - way[min(early)] < _LATER_M]  # of the first visit
+        if early:
+            pairs.append((min(early, key=lambda s: float(np.linalg.norm(positions[s] - position))), late))
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+
+def apart_m(outcome: Outcome, truth: Trajectory, pairs: NDArray[np.intp], range_m: float, since: int) -> FloatArray:
+    """(L,) how far surfaces of both rounds lie apart in the running local map."""
+    apart = []
+    for early, late in pairs[pairs[:, 1] >= since]:
+        T = inverse(outcome.graph.place_in_map(early, late)) @ outcome.trajectory.T_world_lidar[late]
+        true = inverse(truth.T_world_lidar[early]) @ truth.T_world_lidar[late]
+        apart.append(displacement_m(log(inverse(true) @ T), range_m))
+    return np.array(apart)
+
+
+def measure(name: str, scans: Sequence[Scan], truth: Trajectory, config: Config) -> None:
+    """The rows of a recording."""
+    stamps = np.array([scan.stamp for scan in scans])
+    true = Trajectory(stamps, truth.at(stamps, BEYOND_TRUTH_S))
+    range_m = float(np.median(np.linalg.norm(scans[0].points, axis=1)))
+    pairs = rounds(true, range_m)
+    outcomes = [take(scans, config, redraws) for redraws in (False, True)]
+    since = (outcomes[0].graph.first_closure or len(scans)) + SCANS_LATER
+    for outcome, label in zip(outcomes, ("as it was", "drawn anew"), strict=True):
+        apart = apart_m(outcome, true, pairs, range_m, since)
+        errors = [evaluate_trajectory(one, true).errors.ate_rmse_m for one in (outcome.trajectory, outcome.corrected)]
+        print_row([
+            f"{name}, {true.distances[-1]:.0f} m", label, str(len(apart)),
+            f"{np.sqrt((apart**2).mean()):.3f}, {np.percentile(apart, 95):.3f}" if len(apart) else "-",
+            *(f"{error:.3f}" for error in errors), str(outcome.closures), str(len(outcome.graph.drawn_ms)),
+            _most(outcome.graph.drawn_ms), _most(outcome.exchange_ms),
+        ])  # fmt: skip
+
+
+def _most(milliseconds: Sequence[float]) -> str:
+    return f"{np.median(milliseconds):.0f}, {max(milliseconds):.0f}" if milliseconds else "-"
+
+
+def main() -> None:
+    """Parse the command line and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
+    parser.add_argument("--cases", nargs="*", default=[], metavar="WORLD/MOTION[/STEP]", help="simulated recordings")
+    parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--scans", type=int, default=1000)
+    parser.add_argument("--step", type=int, default=1, help="of recordings")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--odometry", default="constant-velocity")
+    parser.add_argument("--radius-m", type=float, default=100.0, help="of the local map")
+    options = parser.parse_args()
+    config = Config(
+        odometry=OdometryConfig(method=options.odometry),
+        mapping=MappingConfig(radius_m=options.radius_m),
+        pose_graph=PoseGraphConfig(enabled=True),
+    )
+    print_row([
+        "recording", "local map", "scans of later rounds", "apart, RMS / 95 %, m", "ATE as registered, m",
+        "ATE in the end, m", "closures", "drawn", "drawing, ms", "exchange, ms",
+    ])  # fmt: skip
+    print_row(["---"] * 10)
+    for case in options.cases:
+        recorded = simulate(case, options.sensor, options.scans, options.seed)
+        measure(recorded.name, recorded.scans, recorded.truth, config)
+    for source in options.sources:
+        recording = open_recording(source)
+        truth = recording.ground_truth
+        assert truth is not None, f"{source}: has no ground truth"
+        scans = list(in_order(recording.scans(stop=options.scans, step=options.step)))
+        measure(recording.name, scans, truth, config)
+
+
+if __name__ == "__main__":
+    main()

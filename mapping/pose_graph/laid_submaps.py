@@ -1,0 +1,118 @@
+"""The running local map, drawn anew after a loop closure: submaps at their corrected places around the sensor.
+
+Scans are registered in a frame without jumps, in which the first visit of a place lies where drift has put it, or is
+forgotten. After a closure the submaps around the sensor are laid where the corrected graph has them relative to the
+latest keyframe, so that the surfaces of both visits coincide.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
+from lidarslam.core.state.stateful import Stateful
+from lidarslam.mapping.global_map.global_map import VoxelMeans
+from lidarslam.mapping.global_map.voxel_rows import POSITION, VIEW, Rows
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.edges import first_connected
+from lidarslam.mapping.pose_graph.keyframes import Keyframe
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+# A submap is off when its place in the local map differs from the corrected one by more than so many cells, or by more
+# than this angle: half the width of a surfel, and what displaces a surface by it at the median range of 30 cells.
+_OFF_CELLS, _OFF_RAD = 0.5, np.deg2rad(1.0)
+# Submaps within these parts of the radius of the local map must be in it, and not be off.
+_HELD_WITHIN, _RIGHT_WITHIN = 0.5, 0.25
+# Points of a drawn map, to bound its time; submaps overlap, so that fewer of each are enough.
+_MOST_POINTS = 1_500_000
+
+
+class LaidSubmaps(Stateful):
+    """Where the submaps of keyframes lie in the running local map, and which of them it still holds.
+
+    Args:
+        radius_m: of the local map.
+    """
+
+    _poses: list[FloatArray]  # T_odom_keyframe
+    _held: list[int]  # keyframes whose submaps it holds
+    _redraws: list[int]  # numbers of keyframes when it was drawn anew
+
+    def __init__(self, radius_m: float) -> None:
+        self._radius_m = radius_m
+        self._poses, self._held, self._redraws = [], [], []
+
+    def _after_restore(self) -> None:
+        if not all(0 <= key < len(self._poses) for key in self._held):
+            raise ValueError(f"{len(self._held)} of {len(self._poses)} submaps are held, {self._held[:3]} among them")
+
+    def follow(self, T_odom_keyframe: FloatArray) -> None:
+        """The next keyframe begins; what is beyond the radius is forgotten."""
+        self._held.append(len(self._poses))
+        self._poses.append(T_odom_keyframe)
+        near = self._distances(np.array([self._poses[key] for key in self._held])) < self._radius_m
+        self._held = [key for key, is_near in zip(self._held, near, strict=True) if is_near]
+
+    def redrawn(
+        self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans]
+    ) -> SurfelMap | None:
+        """The map drawn anew; None unless a submap near the sensor is missing, or lies elsewhere than it should.
+
+        Args:
+            targets: (K, 4, 4) T_odom_keyframe as corrected; that of the last keyframe is as it was.
+            members: (K,) which submaps are connected with the last one.
+            cell_m: edge of the finest cells.
+            submap: of a keyframe.
+        """
+        relative = np.where(members, self._distances(targets) / self._radius_m, np.inf)
+        is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()
+        if not is_missing and not self._is_off(targets, np.flatnonzero(relative < _RIGHT_WITHIN), cell_m):
+            return None
+        self._poses, self._held = list(targets), np.flatnonzero(relative < 1.0).tolist()
+        self._redraws.append(len(targets))
+        step = 1 + sum(len(submap(key)) for key in self._held) // _MOST_POINTS
+        submaps = ((targets[key], submap(key).rows[::step]) for key in self._held)
+        return draw_local_map(submaps, cell_m, self._radius_m)
+
+    def _is_off(self, targets: FloatArray, near: NDArray[np.intp], cell_m: float) -> bool:
+        """Whether one of the submaps of keyframes (N,) lies elsewhere than it should."""
+        if not len(near):
+            return False
+        off = inverse(np.array([self._poses[key] for key in near])) @ targets[near]
+        is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cell_m
+        return bool((is_far | (rotation_angle(off) > _OFF_RAD)).any())
+
+    def redrawn_between(self, first: int, second: int) -> bool:
+        """Whether the map was drawn anew between two keyframes."""
+        return any(first < count <= second for count in self._redraws)
+
+    def _distances(self, poses: FloatArray) -> FloatArray:
+        """(K,) of poses (K, 4, 4) from the last keyframe."""
+        return np.asarray(np.linalg.norm(poses[:, :3, 3] - self._poses[-1][:3, 3], axis=1), dtype=np.float64)
+
+
+def connected_with_last(
+    keyframes: Sequence[Keyframe], closures: Iterable[RelativePose], first_scan: int
+) -> NDArray[np.bool_]:
+    """(K,) the keyframes of the recording that begins with a scan, as far as their poses follow from the last one's.
+
+    Those of a segment do; loop closures join segments.
+    """
+    segments = np.array([keyframe.segment for keyframe in keyframes])
+    pairs = [(int(key), int(key) + 1) for key in np.flatnonzero(np.diff(segments) == 0)]
+    component = first_connected(len(keyframes), pairs + [(closure.first, closure.second) for closure in closures])
+    is_own = np.array([keyframe.scan >= first_scan for keyframe in keyframes])
+    return np.asarray((component == component[-1]) & is_own)
+
+
+def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, radius_m: float) -> SurfelMap:
+    """Surfels of submaps, each with `T_odom_keyframe` (4, 4) and its rows; full cells are those of the first ones."""
+    drawn = SurfelMap(cell_m, radius_m)
+    for T_odom_keyframe, rows in submaps:
+        views = rows[:, VIEW].astype(np.float64)
+        lengths = np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)
+        elevations = -np.arcsin(np.clip(views[:, 2] / lengths[:, 0], -1.0, 1.0))
+        points = transform_points(T_odom_keyframe, rows[:, POSITION].astype(np.float64))
+        drawn.insert_seen(points, elevations, views / lengths @ T_odom_keyframe[:3, :3].T)
+    return drawn
