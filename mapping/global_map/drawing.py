@@ -30,6 +30,10 @@ class TiledMap:
         """How many points there are."""
         return sum(self.points.values())
 
+    def to_json(self) -> dict[str, float | int]:
+        """The entry of summary.json."""
+        return {"tiles": len(self.points), "points": self.total, "voxel_size_m": self.tiling.voxel_size_m}
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnMap:
