@@ -53,7 +53,9 @@ def take_step(
         step[i] *= shortened
     _exp(step, change)
     _multiply(change, T, moved)
-    T[:] = moved
+    for i in range(4):
+        for j in range(4):
+            T[i, j] = moved[i, j]
     return largest * -shortened
 
 
