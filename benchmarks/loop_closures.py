@@ -267,7 +267,12 @@ def laps(arguments: argparse.Namespace) -> Iterator[Lap]:
 def main() -> None:
     """Parse the command line and print the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", nargs="+", choices=[*WORLDS, ROOMS], default=[*WORLDS, ROOMS])
+    parser.add_argument(
+        "--worlds",
+        nargs="+",
+        choices=[*WORLDS, ROOMS],
+        default=[*(world for world in WORLDS if world != "town"), ROOMS],
+    )
     parser.add_argument("--motions", nargs="+", choices=list(CARRIERS), help="default: one that suits the world")
     parser.add_argument("--sensor", choices=list(SENSORS), default="vlp-16")
     parser.add_argument("--seed", type=int, default=0)

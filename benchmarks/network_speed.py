@@ -1,26 +1,40 @@
-"""How long the learned odometry takes for a scan, stage by stage, beside DeLORA's network in the same run.
+"""Where the milliseconds of the learned odometry go, and its network beside DeLORA's in the same run.
 
     python benchmarks/network_speed.py --threads 1 --sensors vlp-16 hdl-64e
+    python benchmarks/network_speed.py --recordings KITTI/sequences/04 vlp16_loop --sensors os1-128 --scans 50
 
-Prints a table of networks, a pair of images of 16 x 720 each, and one of the stages of a scan of each sensor: medians
-over `--repeats`, wall time and processor time. A network is timed as it is used: what is kept of the scan before is not
-computed again. Scans are simulated, a car in a street.
+Prints a table of networks, a pair of images of 16 x 720 each: medians over `--repeats`, wall time and processor time. A
+network is timed as it is used: what is kept of the scan before is not computed again. Then a table of stages, a column
+for each recording: processor milliseconds of the odometry's thread, without those of the stages inside, from scan to
+scan through the first `--scans` of the recording. Of `--rounds` passes the shortest time of every scan and stage is
+taken, because other work on the machine only adds to it; then the mean over all scans. The sensors' recordings are
+simulated, a car in a street.
 """
 
 import argparse
+import functools
+import itertools
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
-from statistics import median
+from contextlib import ExitStack
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+from unittest.mock import patch
 
-import numpy as np
 import torch
 from mapping_accuracy import simulate
 
 from lidarslam.core.scan import Scan
-from lidarslam.odometry.alignment.alignment import InitialEstimate, align
-from lidarslam.odometry.alignment.sweep_motion import SweepPair
+from lidarslam.datasets.registry import open_recording
+from lidarslam.odometry.alignment import alignment
+from lidarslam.odometry.alignment.point_to_plane import PointToPlane
 from lidarslam.odometry.config import ImageConfig, LearnedConfig, NetworkConfig, OdometryConfig
+from lidarslam.odometry.images import sweep_images
 from lidarslam.odometry.images.sweep_images import Imager, SweepImages
+from lidarslam.odometry.methods import learned
+from lidarslam.odometry.network import candidates
 from lidarslam.odometry.network.candidates import Described, Search
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
 from lidarslam.odometry.network.exported import onnx_search, read_exported
@@ -28,8 +42,32 @@ from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.shipped import default_weights, shipped_folder
 from lidarslam.odometry.network.torch_graphs import torch_search
 from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.scan_stream import in_order
 
 SCANS = 12
+# The first scan is not compared with any, and the second without a motion before.
+_WARM_UP = 2
+
+_STAGES: dict[str, list[tuple[Any, str]]] = {
+    "projection": [(sweep_images, "project")],
+    "normals": [(sweep_images, "surface_normals")],
+    "images, rest": [(sweep_images.Imager, "images")],
+    "graph of columns": [],
+    "graph of turns": [],
+    "bird's-eye grid": [(candidates, "bird_eye")],
+    "graph of the bird's-eye grid": [],
+    "graph of peaks": [],
+    "network, rest": [(candidates.CorrelationSearch, "compare")],
+    "alignment: points and planes": [(alignment, "PointToPlane")],
+    "alignment: normal equations": [(PointToPlane, "normal_equations"), (PointToPlane, "fit")],
+    "alignment, rest": [(learned, "align_best"), (learned, "align")],
+}
+_GRAPHS = {
+    "columns": "graph of columns",
+    "turns": "graph of turns",
+    "bird": "graph of the bird's-eye grid",
+    "peaks": "graph of peaks",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -37,10 +75,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--sensors", nargs="+", default=["vlp-16", "hdl-64e"])
+    parser.add_argument("--sensors", nargs="+", default=["vlp-16", "hdl-64e"], help="simulated")
+    parser.add_argument("--recordings", nargs="+", type=Path, default=[])
+    parser.add_argument("--scans", type=int, default=SCANS)
+    parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
-    recordings = {sensor: simulate("street", "car", sensor, SCANS, 0).scans for sensor in options.sensors}
+    recordings = {sensor: list(simulate("street", "car", sensor, options.scans, 0).scans) for sensor in options.sensors}
     imager = Imager(ImageConfig())
     pair = [imager.images(scan).network for scan in recordings[options.sensors[0]][-2:]]
     print(f"A pair of 16 x 720 images, threads: {options.threads}\n")
@@ -51,11 +92,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         wall, cpu = _timed(_comparison(search, before, pair[1]), options.repeats)
         slowest = slowest or wall
         print(f"| {label} | {parameters:,} | {wall:.1f} | {cpu:.1f} | {slowest / wall:.1f} |", flush=True)
-    for sensor, scans in recordings.items():
-        print(f"\nA scan of {sensor}\n\n| stage | wall, ms | CPU, ms |\n| --- | --- | --- |")
-        for label, stage in _stages(scans, options.threads).items():
-            wall, cpu = _timed(stage, options.repeats)
-            print(f"| {label} | {wall:.1f} | {cpu:.1f} |", flush=True)
+    for source in options.recordings:
+        recorded = open_recording(source)
+        recordings[recorded.name] = list(itertools.islice(in_order(recorded.scans()), options.scans))
+    _print_stages(recordings, options.threads, options.rounds)
 
 
 def _networks(threads: int) -> list[tuple[str, Search, int]]:
@@ -74,32 +114,61 @@ def _comparison(search: Search, before: Described, images: SweepImages) -> Calla
     return lambda: search.compare(before, images.points, images.normals)
 
 
-def _stages(scans: Sequence[Scan], threads: int) -> dict[str, Callable[[], object]]:
-    imager, search = Imager(ImageConfig()), onnx_search(read_exported(shipped_folder()), threads)
-    previous, current = (imager.images(scan) for scan in scans[-2:])
-    before = search.describe(previous.network.points, previous.network.normals)
-    candidates, _ = search.compare(before, current.network.points, current.network.normals)
-    information = np.asarray(np.linalg.inv(candidates[0].covariance), dtype=np.float64)
-    start = InitialEstimate(candidates[0].T_prev_curr, information)
-    sweeps = SweepPair(current.alignment, previous.alignment, scans[-1].stamp - scans[-2].stamp)
+class _Stopwatch:
+    """Processor time of the calling thread in each stage, without the stages inside it."""
+
+    def __init__(self) -> None:
+        self.spent: defaultdict[str, float] = defaultdict(float)
+        self._inside: list[float] = [0.0]
+
+    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, whose time counts for the stage."""
+
+        @functools.wraps(function, updated=())
+        def call(*arguments: Any, **named: Any) -> Any:
+            self._inside.append(0.0)
+            begin = time.thread_time()
+            try:
+                return function(*arguments, **named)
+            finally:
+                whole = time.thread_time() - begin
+                self.spent[stage] += 1e3 * (whole - self._inside.pop())
+                self._inside[-1] += whole
+
+        return call
+
+
+def _print_stages(recordings: dict[str, list[Scan]], threads: int, rounds: int) -> None:
+    found = {name: _stage_times(scans, threads, rounds) for name, scans in recordings.items()}
+    print(f"\n| stage, ms | {' | '.join(recordings)} |\n| --- |{' ---: |' * len(recordings)}")
+    for stage in (*_STAGES, "rest"):
+        print(f"| {stage} | {' | '.join(f'{times.get(stage, 0.0):.2f}' for times in found.values())} |")
+    print(f"| all of the odometry | {' | '.join(f'{sum(times.values()):.2f}' for times in found.values())} |")
+
+
+def _stage_times(scans: Sequence[Scan], threads: int, rounds: int) -> dict[str, float]:
+    """Milliseconds a scan of each stage."""
+    passes = []
+    for _ in range(rounds):
+        odometry = make_odometry(OdometryConfig(method="learned", learned=LearnedConfig(threads=threads)))
+        watch = _Stopwatch()
+        with ExitStack() as stack:
+            for stage, places in _STAGES.items():
+                for owner, name in places:
+                    stack.enter_context(patch.object(owner, name, watch.timed(stage, getattr(owner, name))))
+            search: Any = getattr(odometry, "_search")  # noqa: B009
+            graphs = {name: watch.timed(stage, getattr(search._parts, name)) for name, stage in _GRAPHS.items()}
+            search._parts = search._parts._replace(**graphs)
+            estimate, each = watch.timed("rest", odometry.estimate), []
+            for scan in scans:
+                watch.spent.clear()
+                estimate(scan)
+                each.append(dict(watch.spent))
+        passes.append(each[_WARM_UP:])
+    stages = {stage for each in passes for one in each for stage in one}
     return {
-        "images and normals": lambda: imager.images(scans[-1]),
-        "network": _comparison(search, before, current.network),
-        "alignment": lambda: align(start, sweeps),
-        "all of the odometry": _whole(scans, threads),
+        stage: mean(min(one.get(stage, 0.0) for one in scan) for scan in zip(*passes, strict=True)) for stage in stages
     }
-
-
-def _whole(scans: Sequence[Scan], threads: int) -> Callable[[], object]:
-    """The next scan of the recording, over and over; the jump from its end to its beginning is not timed apart."""
-    odometry = make_odometry(OdometryConfig(method="learned", learned=LearnedConfig(threads=threads)))
-    state = {"next": 0}
-
-    def step() -> None:
-        odometry.estimate(scans[state["next"] % len(scans)])
-        state["next"] += 1
-
-    return step
 
 
 def _timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:

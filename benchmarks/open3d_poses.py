@@ -18,6 +18,7 @@ from lidarslam.mapping.loops.refinement import DenseSubmap, refine
 from lidarslam.mapping.loops.registration import register
 from lidarslam.mapping.loops.verification import verify
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
+from lidarslam.mapping.tracking.budget import complete
 
 Calls = dict[str, Callable[[], Any]]
 Rows = Iterator[list[str]]
@@ -164,7 +165,9 @@ def relocalisation_rows(k: Keyframes) -> Rows:
             return [float(right[0]), float(right.any())]
 
         calls: Calls = {
-            "bird's-eye map (ours)": lambda: BirdsEyeMap.of(mapped, up, cell_m).find(scan, turned, reach_m, _PLACES)
+            "bird's-eye map (ours)": lambda: complete(
+                BirdsEyeMap.of(mapped, up, cell_m).find(scan, turned, reach_m, _PLACES)
+            )
         }
         size_m = _FEATURE_CELLS * submap.cell_m
         return calls | {

@@ -1,40 +1,61 @@
-"""How long a whole run takes a scan, beside KISS-ICP's own loop on the same scans.
+"""How long a whole run takes a scan, beside KISS-ICP's own loop and other peers on the same scans.
 
     python benchmarks/pipeline_speed.py KITTI/sequences/04
-    python benchmarks/pipeline_speed.py --simulate hdl-64e:street:car --scans 100
-    python benchmarks/pipeline_speed.py --simulate vlp-16:office:handheld --scans 400
+    python benchmarks/pipeline_speed.py --simulate hdl-64e:street:car vlp-16:street:car os1-128:street:car --scans 100
+    python benchmarks/pipeline_speed.py --simulate vlp-16:office:handheld --scans 400 --peers mad-icp small-gicp
 
-Methods are named as for `lidarslam compare`. Ours go through the pipeline of `lidarslam run`, odometry on one thread
-and mapping on another, scans from memory; the global map, which KISS-ICP does not make, is included. KISS-ICP's
-`register_frame` runs in a plain loop, in a process of its own, with its defaults, on as many threads as it likes.
-Methods take turns for `--rounds` rounds. Wall time and processor time of all threads are over all scans but the first
-`--warm-up`, divided by their number; the ratio is to the KISS-ICP of the same round: its median, smallest and largest.
+Methods are named as for `lidarslam compare`. Ours go through the pipeline of `lidarslam run`, each stage on a thread of
+its own; the global map, which the others do not make, is included, and for recordings so is reading the files.
+KISS-ICP's `register_frame` runs in a plain loop over scans in memory, in a process of its own, with its defaults, on as
+many threads as it likes; so do the peers (`pip install 'lidarslam[peers]'`), of which the registration alone is timed.
+
+Methods take turns for `--rounds` rounds. Wall and processor time are over all scans but the first `--warm-up`, divided
+by their number; the ratio is to the KISS-ICP of the same round: its median, smallest and largest. The median and the
+99th percentile are of single scans: of ours the sum of the stages, which work on several scans at once; below the table
+is the median of each stage.
 """
 
 import argparse
+import json
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mapping_accuracy import make_simulation, print_row
+from numpy.typing import NDArray
 
 from lidarslam.compare.methods.names import parse_method
 from lidarslam.config.settings import load_config
 from lidarslam.core.scan import Scan
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
-from lidarslam.pipeline.scan_stream import in_order
+from lidarslam.pipeline.scan_stream import in_order, prefetch
 from lidarslam.run.loop_closing import FinishedGraph, begin_graph
 
 _KISS = "KISS-ICP's own loop"
 _FEW = 8
 Timer = Callable[[], tuple[float, float]]
+Scans = Callable[[], Iterable[Scan]]
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of one run after its first few scans."""
+
+    wall: float
+    processor: float  # of all threads; NaN where it cannot be told from other work
+    scan_ms: list[float]  # of single scans
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)  # of the stages of ours, of single scans
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -43,77 +64,114 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
     parser.add_argument("--methods", nargs="+", default=["learned+map", "constant-velocity+map", "learned+map+graph"])
+    parser.add_argument("--peers", nargs="*", default=[])
     parser.add_argument("--scans", type=int, default=100)
     parser.add_argument("--warm-up", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args(arguments)
     for source in options.sources:
         recording = open_recording(source)
-        _measure(recording.name, list(in_order(recording.scans(0, options.scans))), options)
+        scans = list(in_order(recording.scans(0, options.scans)))
+        _measure(recording.name, scans, partial(_read, recording, options.scans), options)
     for named in options.simulate:
         sensor, world, motion = named.split(":")
-        _measure(named, list(make_simulation(world, motion, sensor, options.scans, 0).scans()), options)
+        scans = list(make_simulation(world, motion, sensor, options.scans, 0).scans())
+        _measure(named, scans, partial(iter, scans), options)
 
 
-def _measure(name: str, scans: Sequence[Scan], options: argparse.Namespace) -> None:
-    methods = [_KISS, *options.methods]
+def _read(recording: Recording, count: int) -> Iterator[Scan]:
+    """The scans as a run reads them."""
+    return prefetch(in_order(recording.scans(0, count)))
+
+
+def _measure(name: str, scans: Sequence[Scan], source: Scans, options: argparse.Namespace) -> None:
     for method in options.methods:  # loops are compiled when they are first called on a machine
         _run_ours(method, scans[:_FEW], 1)
-    seconds: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
-    for _ in range(options.rounds):
-        for method in methods:
-            is_kiss = method == _KISS
-            seconds[method].append(
-                _run_kiss(scans, options.warm_up) if is_kiss else _run_ours(method, scans, options.warm_up)
-            )
+    with tempfile.TemporaryDirectory() as folder:
+        file = _saved(scans, Path(folder))
+        runs: dict[str, Callable[[], Times]] = {_KISS: partial(_run_loop, "kiss_loop.py", [], file, options.warm_up)}
+        runs |= {method: partial(_run_source, method, source, options.warm_up) for method in options.methods}
+        runs |= {peer: partial(_run_loop, "peer_loop.py", [peer], file, options.warm_up) for peer in options.peers}
+        rounds = [{method: run() for method, run in runs.items()} for _ in range(options.rounds)]
     points = int(np.mean([len(scan) for scan in scans]))
     print(f"\n{name}: {len(scans)} scans of {points:,} points, {options.rounds} rounds\n")
-    print_row(["method", "wall, ms a scan", "CPU, ms a scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"])
-    print_row(["---"] * 5)
+    print_row(["method", "wall, ms a scan", "median", "p99", "CPU, ms a scan", "wall / KISS-ICP's", "CPU / KISS-ICP's"])
+    print_row(["---"] * 7)
     counted = len(scans) - options.warm_up
-    kiss = np.array(seconds[_KISS])
-    for method in methods:
-        taken = np.array(seconds[method])
+    for method in runs:
+        taken = np.array([[times[method].wall, times[method].processor] for times in rounds])
+        kiss = np.array([[times[_KISS].wall, times[_KISS].processor] for times in rounds])
+        of_scans = np.median([np.percentile(times[method].scan_ms, [50, 99]) for times in rounds], axis=0)
+        wall, processor = 1e3 * np.median(taken, axis=0) / counted
         ratios = [f"{np.median(r):.2f} [{r.min():.2f}, {r.max():.2f}]" for r in (taken / kiss).T]
-        print_row([method, *(f"{1e3 * value / counted:.1f}" for value in np.median(taken, axis=0)), *ratios])
+        shown = [wall, *of_scans, processor]
+        print_row([method, *(_blank_nan(f"{value:.1f}") for value in shown), *(_blank_nan(ratio) for ratio in ratios)])
+    for method in options.methods:
+        stages = {stage: [times[method].stage_ms[stage] for times in rounds] for stage in rounds[0][method].stage_ms}
+        medians = (f"{stage} {np.median(np.concatenate(ms)):.1f}" for stage, ms in stages.items())
+        print(f"\n{method}, ms: {', '.join(medians)}")
 
 
-def _run_ours(method: str, scans: Sequence[Scan], warm_up: int) -> tuple[float, float]:
+def _blank_nan(text: str) -> str:
+    return "" if "nan" in text else text
+
+
+def _run_source(method: str, source: Scans, warm_up: int) -> Times:
+    return _run_ours(method, source(), warm_up)
+
+
+def _run_ours(method: str, scans: Iterable[Scan], warm_up: int) -> Times:
     config = load_config(None, parse_method(method).settings)
     odometry, graph = make_odometry(config.odometry), begin_graph(config)
     pipeline = Pipeline(odometry, make_localiser(config), config.global_map, graph)
-    clock = _clock()
-    for number, _ in enumerate(pipeline.run(scans)):
-        if number + 1 == warm_up:
+    clock, results = _clock(), []
+    for result in pipeline.run(scans):
+        results.append(result.stage_ms)
+        if len(results) == warm_up:
             clock = _clock()
     if pipeline.map.global_map is not None:
         pipeline.map.global_map.points()  # what waits to be merged is part of the work
     if graph is not None and pipeline.map.global_map is not None:
-        finished = FinishedGraph.of_recordings(graph, [len(scans)], pipeline.map.global_map.voxel_size_m)
+        finished = FinishedGraph.of_recordings(graph, [len(results)], pipeline.map.global_map.voxel_size_m)
         assert finished is not None
         finished.outcome([0])
         graph.close()
     odometry.close()
-    return clock()
+    counted = results[warm_up:]
+    stage_ms = {stage: [times[stage] for times in counted] for stage in counted[0]} if counted else {}
+    return Times(*clock(), [sum(times.values()) - times["read"] for times in counted], stage_ms)
 
 
-def _run_kiss(scans: Sequence[Scan], warm_up: int) -> tuple[float, float]:
-    """In a process of its own, where it has all the cores."""
-    arrays = {f"points_{i}": scan.points for i, scan in enumerate(scans)}
+def _saved(scans: Sequence[Scan], folder: Path) -> Path:
+    """The scans in a file, for processes of their own."""
+    arrays: dict[str, NDArray[Any]] = {f"points_{i}": scan.points for i, scan in enumerate(scans)}
     none = np.empty(0)
     arrays |= {f"times_{i}": none if scan.time_offsets is None else scan.time_offsets for i, scan in enumerate(scans)}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "scans.npz"
-        np.savez(file, **arrays)  # type: ignore[arg-type] # the stub takes them all for allow_pickle
-        command = [sys.executable, str(Path(__file__).with_name("kiss_loop.py")), str(file), str(warm_up)]
-        wall, cpu = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
-    return float(wall), float(cpu)
+    arrays |= {f"rings_{i}": none if scan.rings is None else scan.rings for i, scan in enumerate(scans)}
+    arrays["stamps"] = np.array([scan.stamp for scan in scans])
+    np.savez(folder / "scans.npz", **arrays)  # type: ignore[arg-type] # the stub takes them all for allow_pickle
+    return folder / "scans.npz"
+
+
+def _run_loop(script: str, names: list[str], file: Path, warm_up: int) -> Times:
+    """A loop in a process of its own, where it has all the cores."""
+    command = [sys.executable, str(Path(__file__).with_name(script)), *names, str(file), str(warm_up)]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return Times(**json.loads(printed.splitlines()[-1]))
 
 
 def _clock() -> Timer:
     """Tells wall and processor seconds since now."""
     wall, cpu = time.perf_counter(), time.process_time()
     return lambda: (time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def saved_scans(file: Path) -> Iterator[Scan]:
+    """The scans of a file as of `_saved`."""
+    arrays = np.load(file)
+    for i, stamp in enumerate(arrays["stamps"].tolist()):
+        times, rings = arrays[f"times_{i}"], arrays[f"rings_{i}"]
+        yield Scan(arrays[f"points_{i}"], stamp, times if len(times) else None, rings if len(rings) else None)
 
 
 if __name__ == "__main__":

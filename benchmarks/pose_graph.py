@@ -1,7 +1,7 @@
 """The pose graph on KITTI 00 with true and false loops, and how long it takes.
 
     python benchmarks/pose_graph.py --kitti-00 kiss_icp_kitti_00
-    python benchmarks/pose_graph.py --keyframes 5000 --loops 500
+    python benchmarks/pose_graph.py --keyframes 10000 --loops 1000
 
 Prints a Markdown table for each:
 
@@ -10,6 +10,8 @@ Prints a Markdown table for each:
   alignment, over all scans, without and with false loops between random pairs. The folder holds
   `estimate_kitti.txt` and `ground_truth_kitti.txt`;
 - a simulated drive round and round the blocks of a town, added keyframe by keyframe.
+
+Seconds and milliseconds are of the processor.
 """
 
 import argparse
@@ -27,9 +29,10 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle
 from lidarslam.core.text.trajectory_io import read_kitti_poses
 from lidarslam.core.trajectory import Trajectory, chain
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
-from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph.correction import corrected
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise, relax
+from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
 
 SCAN_S = 0.1
 # KISS-ICP's drift on KITTI 00, 0.53 % and 0.0019 degrees a metre, mostly over some 300 m, as a random walk.
@@ -105,9 +108,9 @@ def timed_optimise(
     poses: FloatArray, edges: Sequence[RelativePose], loops: Sequence[RelativePose]
 ) -> tuple[Optimised, float]:
     """The optimised graph, and the seconds it took."""
-    start = time.perf_counter()
+    start = time.process_time()
     optimised = optimise(poses, edges, loops)
-    return optimised, time.perf_counter() - start
+    return optimised, time.process_time() - start
 
 
 def close_kitti(folder: Path, step_m: float, seed: int, false_percents: Sequence[float]) -> None:
@@ -146,21 +149,24 @@ def ate(poses: FloatArray, truth: FloatArray) -> float:
 def grow(
     scene: Scene, loops: Sequence[RelativePose], looser: float | None
 ) -> tuple[FloatArray, list[RelativePose], FloatArray]:
-    """Poses (N, 4, 4) grown keyframe by keyframe, relaxed at each loop, their edges, and the seconds (N,) of each."""
-    edges = scene.chain_edges(looser)
+    """Poses (N, 4, 4) grown keyframe by keyframe, relaxed as in a run, their edges, and the seconds (N,) of each."""
+    edges, schedule = scene.chain_edges(looser), RelaxSchedule()
     first_edges = {edge.second: edge for edge in reversed(edges)}
     ends = np.array([edge.second for edge in edges])
-    closing: dict[int, list[RelativePose]] = {}
+    closing: dict[int, list[LoopClosure]] = {}
     for edge in loops:
-        closing.setdefault(edge.second, []).append(edge)
-    poses, closed, seconds = [scene.poses[0]], [], np.zeros(len(scene.poses))
+        closure = LoopClosure(**vars(edge), overlap=1.0, residual_m=0.0, inlier_ratio=1.0, by_appearance=False,
+                              consistent=2, reason="")  # fmt: skip
+        closing.setdefault(edge.second, []).append(closure)
+    poses, seconds = [scene.poses[0]], np.zeros(len(scene.poses))
+    closed: list[LoopClosure] = []
     for key in range(1, len(scene.poses)):
-        start = time.perf_counter()
+        start = time.process_time()
         poses.append(poses[-1] @ first_edges[key].T_first_second)
-        if key in closing:
-            closed += closing[key]
+        closed += (found := closing.get(key, []))
+        if schedule.is_due(found, poses):
             poses = list(relax(np.array(poses), edges[: np.searchsorted(ends, key, side="right")], closed))
-        seconds[key] = time.perf_counter() - start
+        seconds[key] = time.process_time() - start
     return np.array(poses), edges, seconds
 
 
@@ -202,7 +208,8 @@ def measure_time(keyframes: int, loops: int, seed: int) -> None:
         "edges": str(2 * (keyframes - 1) + len(pairs)),
         "loops": str(len(pairs)),
         "online in all, s": f"{seconds.sum():.1f}",
-        "a loop, ms: median, most": f"{1e3 * np.median(seconds[seconds > 1e-3]):.1f}, {1e3 * seconds.max():.1f}",
+        "optimised on the way": f"{(seconds > 1e-2).sum()}",
+        "each, ms: median, most": f"{1e3 * np.median(seconds[seconds > 1e-2]):.1f}, {1e3 * seconds.max():.1f}",
         "optimise, s": f"{batch_s:.1f}",
         "loops kept": f"{optimised.inliers.sum():.0f}",
         "wrong before, m": f"{rms(scene.poses, scene.truth):.2f}",

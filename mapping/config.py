@@ -1,7 +1,7 @@
 """Settings of the maps; light, so that reading a configuration imports no Open3D."""
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
@@ -13,6 +13,8 @@ MapField = Literal["intensity", "rgb", "ring", "time"]
 """An attribute of the points of a map."""
 MapFormat = Literal["pcd", "laz", "e57"]
 """What a map can be written as beside .ply."""
+BudgetMs = Annotated[float, Field(gt=0.0)] | Literal["auto"] | None
+"""Milliseconds that a scan may take; auto: half of the time between scans; None: not bounded."""
 
 
 class TrackingConfig(BaseModel):
@@ -70,6 +72,11 @@ class MappingConfig(BaseModel):
         gt=0.0,
         description="factor on the standard deviations of an odometry: its errors are correlated in time",
     )
+    budget_ms: BudgetMs = Field(
+        None,
+        description="surfels only: time of a scan after which no further attempt begins, and searches go on with the"
+        " next scan; auto: half of the time between scans; null: no limit (live: auto)",
+    )
     tracking: TrackingConfig = TrackingConfig()
 
     @property
@@ -112,6 +119,12 @@ class GlobalMapConfig(BaseModel):
     min_hits: int = Field(1, ge=1, description="scans' points a voxel needs before it is written")
     leave_out_moved: bool = Field(
         True, description="leave out what other scans saw through where it was: people and vehicles that passed"
+    )
+    most_points: int | None = Field(
+        20_000_000,
+        ge=1000,
+        description="a larger map lies on disk, is written in tiles, map/, and map.ply is thinned to so many points;"
+        " null: any number",
     )
     fields: tuple[MapField, ...] = Field(
         ("intensity", "rgb"),
@@ -161,5 +174,8 @@ class PoseGraphConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     enabled: bool = Field(False, description="build a pose graph, close loops, and correct trajectory and map")
+    corrects_local_map: bool = Field(
+        False, description="surfels only: draw the local map anew after a loop closure, while the run goes on"
+    )
     keyframes: KeyframeConfig = KeyframeConfig()
     loops: LoopConfig = LoopConfig()

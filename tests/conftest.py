@@ -1,8 +1,9 @@
 """Shared fixtures: random numbers, real recordings, and a room whose scans are known exactly."""
 
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,14 @@ settings.load_profile("patient")
 def rng() -> np.random.Generator:
     """A seeded source of random numbers."""
     return np.random.default_rng(2021)
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C works in this process and its children, even where the tests were started with it ignored (nohup)."""
+    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, earlier)
 
 
 @pytest.fixture(scope="session")

@@ -56,9 +56,10 @@ class MethodResult:
     map_metrics: Mapping[str, object] | None = None  # the content of metrics.json's "map"
     map_errors: MapErrors | None = None  # for the figure
     map_entropy: float | None = None  # mean map entropy of its map, which needs no reference
-    # ms_per_scan_median, ms_per_scan_p95: wall time from one finished scan to the next
+    # ms_per_scan_median, ms_per_scan_p95, ms_per_scan_p99: wall time from one finished scan to the next
     ms_per_scan_median: float | None = None
     ms_per_scan_p95: float | None = None
+    ms_per_scan_p99: float | None = None
     # median wall time of each stage; stages run beside one another
     stage_ms: Mapping[str, float] = field(default_factory=dict)
     peak_rss_mb: float | None = None  # of its process and its children
@@ -80,6 +81,7 @@ class MethodResult:
             "metrics": self._metrics_json(),
             "ms_per_scan_median": self.ms_per_scan_median,
             "ms_per_scan_p95": self.ms_per_scan_p95,
+            "ms_per_scan_p99": self.ms_per_scan_p99,
             "stage_ms": dict(self.stage_ms),
             "scans": self.scans,
             "lost_scans": self.lost_scans,

@@ -36,6 +36,7 @@ FIGURES: dict[str, str] = {
     "loops": "summary/loop_closures",
     "ms_per_scan": "summary/ms_per_scan/total/median",
     "ms_per_scan_p95": "summary/ms_per_scan/total/p95",
+    "ms_per_scan_p99": "summary/ms_per_scan/total/p99",
     "realtime_factor": "summary/realtime_factor",
     "memory_mb": "summary/peak_rss_mb",
 }

@@ -80,6 +80,7 @@ QUANTITIES: dict[str, Quantity] = {
     "map_entropy": Quantity("map_entropy", "map entropy", "", 2),
     "ms_per_scan_median": Quantity("ms_per_scan_median", "time", "ms/scan", 1),
     "ms_per_scan_p95": Quantity("ms_per_scan_p95", "time (95 %)", "ms/scan", 1),
+    "ms_per_scan_p99": Quantity("ms_per_scan_p99", "time (99 %)", "ms/scan", 1),
     "odometry_ms_median": Quantity("stage_ms/odometry", "odometry", "ms/scan", 1),
     "peak_rss_mb": Quantity("peak_rss_mb", "memory", "MB", 0),
     "wall_s": Quantity("wall_s", "wall time", "s", 1),

@@ -21,7 +21,7 @@ _SUMMARY = (
     "ms_per_scan_median",
     "peak_rss_mb",
 )
-_TIME = ("ms_per_scan_median", "ms_per_scan_p95", "peak_rss_mb", "wall_s")
+_TIME = ("ms_per_scan_median", "ms_per_scan_p95", "ms_per_scan_p99", "peak_rss_mb", "wall_s")
 _SYMBOLS = {"ok": "✓", "lost": "△", "stopped": "◐"}
 _MOST_INTERVALS = 40
 

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator
 from os import PathLike
-from pathlib import Path
 
 from lidarslam.config.settings import make_config
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
+from lidarslam.datasets.published.fetched import fetched
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 
@@ -67,7 +67,7 @@ def open(
     """Open a recording: anything that `lidarslam run` takes.
 
     Args:
-        source: a bag, a folder of scans, a data set's folder, or evalio:DATASET/SEQUENCE.
+        source: a bag, a folder of scans, a data set's folder, evalio:DATASET/SEQUENCE, or the URL of one of these.
         topic: point cloud topic of a bag that has several.
         sequence: sequence of a KITTI odometry root, such as "04".
         reader: name of the reader; None: the one that recognises the source.
@@ -78,5 +78,5 @@ def open(
     """
     given = {"topic": topic, "sequence": sequence, "name": reader}
     config = make_config({"reader": {key: value for key, value in given.items() if value is not None}})
-    recording = open_recording(Path(source), config.reader)
+    recording = open_recording(fetched(source), config.reader)
     return OpenRecording(recording, range(len(recording))[start:stop:step])

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import LidarSlamError
 from lidarslam.datasets.faults import Faults
+from lidarslam.mapping.global_map.drawing import DrawnMap
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.run.loop_closing import GraphOutcome, loops_so_far
-from lidarslam.run.results import DrawnMap, final_map, write_results
+from lidarslam.run.results import final_map, write_results
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import Tracked
 from lidarslam.storage.directory import RunDirectory
@@ -35,10 +36,10 @@ class Built:
     map: MapBuilder  # the global map, and what is kept beside it
     graph: "SlamGraph | None"  # the pose graph
 
-    def correct(self) -> tuple[GraphOutcome | None, DrawnMap]:
-        """Correct the log by the loops that are closed, and draw the map."""
+    def correct(self, directory: RunDirectory | None = None) -> tuple[GraphOutcome | None, DrawnMap]:
+        """Correct the log by the loops that are closed, and draw the map, with tiles in the directory."""
         closed = loops_so_far(self.graph, self.map.global_map, self.log)
-        return closed, final_map(self.tracked(), closed, self.config.global_map)
+        return closed, final_map(self.tracked(), closed, self.config.global_map, directory)
 
     def tracked(self) -> Tracked:
         """The same as a recording after the pipeline."""
@@ -64,7 +65,7 @@ def save_run(path: Path, overwrite: bool, config: Config, built: Built) -> None:
     """
     described = {"version": version("lidarslam"), "source": None}
     with python_names(), RunDirectory.create(path, overwrite) as directory:
-        closed, drawn = built.correct()
+        closed, drawn = built.correct(directory)
         write_results(directory, config, described, built.tracked(), closed, drawn)
 
 

@@ -7,6 +7,7 @@ import click
 from click.core import ParameterSource
 
 from lidarslam.commands.shared.gates import gate_options
+from lidarslam.commands.shared.jobs import jobs_options, take_where
 from lidarslam.commands.shared.names import ShippedFile
 from lidarslam.commands.shared.options import (
     FILE,
@@ -30,7 +31,8 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
     lidarslam compare office.mcap --methods learned+map,kiss-icp-no-deskew,ct-icp,kiss-slam,small-gicp
     lidarslam compare office.mcap --methods kiss-icp,prior --prior wheel_odometry.tum
     lidarslam compare office.mcap --max learned+map:ate=0.1 --max lost=0
-    lidarslam compare --benchmark kitti --data KITTI""",
+    lidarslam compare --benchmark kitti --data KITTI
+    lidarslam compare --benchmark simulated --jobs 4""",
 )
 @click.argument("sources", type=PATH, nargs=-1, metavar="[SOURCE]...")
 @out_option("Folder for runs and report.", "compared/SOURCE_TIME, after the first, or the benchmark")
@@ -54,6 +56,7 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
 @click.option("--timeout-s", type=POSITIVE, help="Time limit of a method.")
 @scan_options
 @gate_options(with_method=True)
+@jobs_options
 @click.option("--reuse", is_flag=True, help="Keep finished runs in DIR with the same settings.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier comparison in DIR.")
 @reader_options
@@ -64,9 +67,9 @@ def compare(
 ) -> None:
     """Compare several methods on one or more recordings in one report.
 
-    Each method runs in a process of its own, one after another. A method that crashes or gets lost is a row of the
-    table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes the report so far;
-    else 4 if a bound of --max or --min is not met.
+    Each method runs in a process of its own, one after another, or --jobs at a time. A method that crashes or gets
+    lost is a row of the table; the exit status is 1 only when no method has a result, or after Ctrl-C, which writes
+    the report so far; else 4 if a bound of --max or --min is not met.
     """
     from lidarslam.compare.command import run_compare
     from lidarslam.storage.default_places import source_name
@@ -84,8 +87,9 @@ def compare(
     if out is None:
         name = source_name(sources[0], options["sequence"]) if benchmark is None else benchmark.stem
         out = default_out("compared", name)
+    where = take_where(options)
     gates = (*options.pop("maxima"), *options.pop("minima"))
-    ending = run_compare(say, note, sources=sources, benchmark=benchmark, out=out, gates=gates, **options)
+    ending = run_compare(say, note, sources=sources, benchmark=benchmark, out=out, gates=gates, where=where, **options)
     if not ending.has_results:
         ctx.exit(EXIT_MENDABLE)
     if not ending.gates_passed:

@@ -13,7 +13,9 @@ from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.tasks.start import open_tasks
 from lidarslam.datasets.published.evalio_names import located
+from lidarslam.datasets.published.fetched import fetched, is_url
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 from lidarslam.evaluation.comparison.quantities import find_quantity
 from lidarslam.evaluation.comparison.table import TableCell, TableRow
@@ -165,10 +167,24 @@ def make_recordings(
     Raises:
         LidarSlamError: one cannot be made.
     """
-    for entry in request.recordings:
-        if entry.simulate is not None and entry.source is not None and not (entry.source / README).is_file():
-            with counting(f"recording {entry.name}") as counter:
-                record(RecordRequest(entry.source, **entry.simulate.model_dump()), counter)
+    wanted = [
+        RecordRequest(entry.source, **entry.simulate.model_dump())
+        for entry in request.recordings
+        if entry.simulate is not None and entry.source is not None and not (entry.source / README).is_file()
+    ]
+    if request.where.jobs == 1 or len(wanted) < 2:  # a cluster may have other disks
+        for one in wanted:
+            with counting(f"recording {one.out.name}") as counter:
+                record(one, counter)
+        return
+    with counting(f"{len(wanted)} recordings side by side") as counter, open_tasks(request.where) as tasks:
+        scans = [one.scans or 0 for one in wanted]
+        for number, _ in enumerate(tasks.run(_record, wanted), start=1):
+            counter(sum(scans[:number]), sum(scans))
+
+
+def _record(request: RecordRequest) -> None:
+    record(request, lambda *_: None)
 
 
 def _located(entry: RecordingEntry, benchmark: Benchmark, data: Path | None, out: Path) -> RecordingEntry:
@@ -181,11 +197,15 @@ def _located(entry: RecordingEntry, benchmark: Benchmark, data: Path | None, out
         reference = str(root / entry.reference)
     return replace(
         entry,
-        source=simulated if entry.source is None else root / located(entry.source),
+        source=simulated if entry.source is None else _found(root, entry.source),
         prior=None if entry.prior is None else root / entry.prior,
         reference=reference,
         reference_map=reference_map or (simulated / REFERENCE_MAP if entry.source is None else None),
     )
+
+
+def _found(root: Path, source: Path) -> Path:
+    return fetched(source) if is_url(source) else root / located(source)
 
 
 def _method(method: str | BenchmarkMethod) -> Method:

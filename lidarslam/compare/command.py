@@ -14,6 +14,7 @@ from lidarslam.compare.supervised import Limits
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import reader_settings
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.evaluation.comparison.gates import Gate, format_gates, judge_comparison, require_methods
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.progress import show_count
@@ -57,6 +58,7 @@ def run_compare(
     config_file: Path | None,
     settings: tuple[str, ...],
     gates: Sequence[Gate] = (),
+    where: Where = SERIAL,
 ) -> Ending:
     """Compare, and print the tables and the gates.
 
@@ -75,6 +77,7 @@ def run_compare(
         config_file=config_file,
         settings=(*settings, *reader_settings(name=reader, topic=topic, sequence=sequence)),
         limits=Limits(memory_limit_mb, timeout_s),
+        where=where,
         overwrite=overwrite,
         reuse=reuse,
         command=shlex.join(["lidarslam", *sys.argv[1:]]),

@@ -1,17 +1,20 @@
-"""A comparison: every method on every recording, one after another, each in its own process; one result for all."""
+"""A comparison: every method on every recording, each in its own process; one result for all."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 from lidarslam.compare.methods.process import MethodRun
 from lidarslam.compare.methods.run import COMMAND, finished_before, obstacle, run_method
 from lidarslam.compare.metrics import measure
 from lidarslam.compare.plan import REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
 from lidarslam.compare.request import CompareRequest
+from lidarslam.compare.side_by_side import run_side_by_side
 from lidarslam.compare.text import format_result
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
+from lidarslam.core.text.plain_text import count
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.mean_table import mean_table
 from lidarslam.run.summary.machine import machine, versions
@@ -69,6 +72,8 @@ def compare(request: CompareRequest, narrator: Narrator, command: Sequence[str] 
     turns, directory = _Turns(request, narrator, command), RunDirectory(request.out)
     sequences: list[SequenceComparison] = []
     with only_writer(request.out):
+        if not request.where.is_serial:
+            turns.take_together(recordings)
         for planned in recordings:
             sequences.append(turns.measured(planned))
             if len(recordings) > 1:
@@ -98,11 +103,40 @@ class _Turns:
     narrator: Narrator
     command: Sequence[str]
     interrupted: bool = False
+    # of those that ran side by side, by their directories
+    _done: dict[Path, MethodResult] = field(default_factory=dict)
+
+    def take_together(self, recordings: Sequence[PlannedRecording]) -> None:
+        """Run all methods on all recordings side by side."""
+        wanted = [(planned, run) for planned in recordings for run in planned.runs if self._has_to_run(planned, run)]
+        scans = [len(range(len(p.recording))[p.entry.start : p.entry.stop : p.entry.step]) for p, _ in wanted]
+        counted = 0
+
+        def take(index: int, result: MethodResult) -> None:
+            nonlocal counted
+            counted += scans[index]
+            counter(counted, sum(scans))
+            planned, run = wanted[index]
+            self._done[run.request.out] = result
+            self.narrator.tell(format_result(planned.name, result))
+
+        runs = [run for _, run in wanted]
+        if not runs:
+            return
+        with self.narrator.counting(f"{count(len(runs), 'run')} side by side") as counter:
+            self.interrupted = run_side_by_side(runs, self.request.limits, self.command, self.request.where, take)
+
+    def _has_to_run(self, planned: PlannedRecording, run: MethodRun) -> bool:
+        is_reused = self.request.reuse and finished_before(run) is not None
+        return not is_reused and obstacle(run, planned.recording) is None
 
     def measured(self, planned: PlannedRecording) -> SequenceComparison:
         """All methods on one recording, with their errors."""
         results = []
         for run in planned.runs:
+            if run.request.out in self._done:
+                results.append(self._done[run.request.out])
+                continue
             earlier = finished_before(run) if self.request.reuse and not self.interrupted else None
             results.append(earlier or self._run(planned, run))
             self.narrator.tell(format_result(planned.name, results[-1], reused=earlier is not None))

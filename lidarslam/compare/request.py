@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lidarslam.compare.methods.names import Method
 from lidarslam.compare.supervised import Limits
+from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.evaluation.comparison.mean_table import TablePlan
 
 
@@ -56,6 +57,7 @@ class CompareRequest:
     config_file: Path | None = None
     settings: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)  # of each method on each recording
+    where: Where = SERIAL  # whether methods run one after another or side by side
     overwrite: bool = False  # whether an earlier comparison in `out` is replaced
     reuse: bool = False  # whether finished runs in `out` with the same settings are kept
     skip_missing: bool = False  # whether recordings that are not there are left out and named, instead of an error

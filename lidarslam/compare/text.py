@@ -18,6 +18,7 @@ _SHOWN = (
     "ate_rotation_rmse_deg",
     "rpe_translation_rmse_m",
     "ms_per_scan_median",
+    "ms_per_scan_p99",
     "peak_rss_mb",
     "map_chamfer_m",
     "lost_scans",

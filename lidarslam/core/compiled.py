@@ -47,10 +47,12 @@ def compiled(function: Function) -> Function:
 
 def compiled_part(function: Function) -> Function:
     """A part of compiled functions: compiled and kept along with them, and never called from the interpreter."""
-    dispatcher: Any = _njit(function, no_cpython_wrapper=True, **_OPTIONS)
-    if hasattr(dispatcher, "_cache"):
-        _watch_callees(dispatcher)
-    return cast(Function, dispatcher)
+    return _part(function)
+
+
+def compiled_sums(function: Function) -> Function:
+    """As `compiled_part`, with sums in any order, which a processor takes several numbers at once of."""
+    return _part(function, fastmath={"reassoc", "contract", "nsz"})
 
 
 def is_compiled(module: ModuleType) -> bool:
@@ -85,6 +87,13 @@ def _temporary_folder() -> str:
         return ""
     is_own = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
     return str(folder) if is_own and not folder.is_symlink() else ""
+
+
+def _part(function: Function, **options: Any) -> Function:
+    dispatcher: Any = _njit(function, no_cpython_wrapper=True, **_OPTIONS, **options)
+    if hasattr(dispatcher, "_cache"):
+        _watch_callees(dispatcher)
+    return cast(Function, dispatcher)
 
 
 def _watch_callees(dispatcher: Any) -> None:

@@ -8,11 +8,12 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state.stateful import Saved, Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
 from lidarslam.mapping.global_map.moved_points import Views
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.slides.slides import SlideCheck
 from lidarslam.pipeline.estimates import Localised, SweepMotion
 
@@ -35,7 +36,12 @@ class PendingScan:
 
 
 class MapBuilder(Stateful):
-    """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration."""
+    """Adds scans to the global map, and keeps data for the detection of moving objects and slips of registration.
+
+    Args:
+        config: of the map.
+        store: where tiles of the map lie that do not fit into memory; None: in a temporary file.
+    """
 
     # of the map; derived from the first scan with points unless it is configured, None until then
     voxel_size_m: float | None
@@ -45,14 +51,27 @@ class MapBuilder(Stateful):
     _pending: PendingScan | None
     _scans: int
 
-    def __init__(self, config: GlobalMapConfig) -> None:
+    def __init__(self, config: GlobalMapConfig, store: TileStore | None = None) -> None:
         self._config = config
+        self._store = store
         self._pending = None
         self._scans = 0
         self.voxel_size_m = config.voxel_size_m
         self.global_map = None
         self.views = Views()
         self.slides = SlideCheck()
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state.
+
+        Raises:
+            InputError: it is damaged, or the file of the tiles is.
+        """
+        self.global_map = self._new_map(1.0) if saved.has("global_map") else None
+        super().restore(saved)
+
+    def _new_map(self, voxel_size_m: float) -> GlobalMap:
+        return GlobalMap(voxel_size_m, self._config.most_points, self._store)
 
     def thin(self, scan: Scan) -> Scan:
         """The points within the map's range, one a voxel of the map: more would not change it."""
@@ -84,7 +103,7 @@ class MapBuilder(Stateful):
             return None
         points = SweepMotion(scan.motion.before, None).compensate(scan.thinned) if next_is_lost else scan.points
         if self.global_map is None:
-            self.global_map = GlobalMap(self.voxel_size_m)
+            self.global_map = self._new_map(self.voxel_size_m)
         attributes = scan.thinned.attributes(self._config.fields)
         self.global_map.add(points, scan.T_world_lidar, attributes)
         self.slides.add(points, scan.number, scan.T_world_lidar)

@@ -1,7 +1,8 @@
 """The way of a scan: odometry, scan-to-map registration, global map, pose graph. No files, no printing, no window.
 
-Three threads: odometry on the caller's, as one scan's motion is needed for the next; registration and map on a second,
-one scan behind, because deskewing needs the motion after the stamp as well; the pose graph on a third.
+Four threads: odometry on the caller's, as one scan's motion is needed for the next; registration on a second, one scan
+behind, because deskewing needs the motion after the stamp as well; the global map on a third, the pose graph on a
+fourth.
 """
 
 import time
@@ -17,8 +18,9 @@ from lidarslam.core.errors import LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.interface import Odometry
-from lidarslam.pipeline.estimates import Estimated, ScanResult
+from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.stages import Stages
@@ -48,6 +50,7 @@ class Pipeline(Stateful):
         config: of the global map.
         graph: built along the way; complete when the last result has come.
         checkpointer: saves the state now and then, without that of odometry and graph.
+        store: of the global map, see `MapBuilder`.
     """
 
     _stages: Stages
@@ -60,8 +63,9 @@ class Pipeline(Stateful):
         config: GlobalMapConfig,
         graph: "SlamGraph | None" = None,
         checkpointer: Checkpointer | None = None,
+        store: TileStore | None = None,
     ) -> None:
-        self._stages = Stages(odometry, localiser, config, graph)
+        self._stages = Stages(odometry, localiser, config, graph, store)
         self._checkpointer = checkpointer
         self.held = None
         self._error: LidarSlamError | None = None  # that ended the scans
@@ -78,12 +82,22 @@ class Pipeline(Stateful):
         """
         jobs: deque[Future[ScanResult]] = deque()
         # Matrices are small: BLAS threads would mostly wait, and take the cores from the other threads.
-        with closing(self._stages), threadpool_limits(1, "blas"), ThreadPoolExecutor(1, "map") as map_worker:
+        with (
+            closing(self._stages),
+            threadpool_limits(1, "blas"),
+            ThreadPoolExecutor(1, "map") as mapping,
+            ThreadPoolExecutor(1, "registration") as registration,
+        ):
+
+            def submit(estimated: Estimated, following: Estimated | None) -> None:
+                localised = registration.submit(self._stages.localise, estimated, following)
+                jobs.append(mapping.submit(self._build, estimated, localised))
+
             for estimated in self._estimate(scans):
                 previous, self.held = self.held, estimated
                 if previous is None:
                     continue
-                jobs.append(map_worker.submit(self._process, previous, estimated))
+                submit(previous, estimated)
                 while jobs and (jobs[0].done() or len(jobs) > _SCANS_BEHIND):
                     yield jobs.popleft().result()
                 if self._checkpointer is not None and self._checkpointer.is_due():
@@ -92,7 +106,7 @@ class Pipeline(Stateful):
                     self._stages.wait_for_graph()
                     self._checkpointer.save(self)
             if self.held is not None:
-                jobs.append(map_worker.submit(self._process, self.held, None))
+                submit(self.held, None)
             while jobs:
                 yield jobs.popleft().result()
             self._stages.finish()
@@ -109,5 +123,5 @@ class Pipeline(Stateful):
         except LidarSlamError as error:
             self._error = error
 
-    def _process(self, estimated: Estimated, following: Estimated | None) -> ScanResult:
-        return self._stages.build(estimated, self._stages.localise(estimated, following))
+    def _build(self, estimated: Estimated, localised: Future[Localised]) -> ScanResult:
+        return self._stages.build(estimated, localised.result())

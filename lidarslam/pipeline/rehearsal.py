@@ -117,10 +117,12 @@ class Part:
 PARTS = {
     "surfels": Part(
         _surfels,
-        tuple(f"mapping.surfels.{kind}_kernels" for kind in ("cell", "correspondence", "side", "surfel")),
+        tuple(f"mapping.surfels.{kind}_kernels" for kind in ("cell", "correspondence", "linear", "side", "surfel")),
     ),
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
-    "alignment": Part(_alignment, ("odometry.alignment.residuals", "odometry.alignment.point_to_plane")),
+    "alignment": Part(
+        _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("residuals", "point_to_plane", "steps"))
+    ),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.kernels")),
     "checks": Part(_checks, ("mapping.global_map.visibility_kernels", "mapping.slides.kernels"), is_late=True),

@@ -11,6 +11,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
@@ -34,6 +35,7 @@ class Stages(Stateful):
         odometry, localiser: estimate the poses.
         config: of the global map.
         graph: built along the way; complete after `finish`.
+        store: of the global map, see `MapBuilder`.
     """
 
     map: MapBuilder
@@ -42,16 +44,21 @@ class Stages(Stateful):
     _measured_stamp: float | None  # of the last scan, unless its motion was only predicted
 
     def __init__(
-        self, odometry: Odometry, localiser: Localiser, config: GlobalMapConfig, graph: "SlamGraph | None" = None
+        self,
+        odometry: Odometry,
+        localiser: Localiser,
+        config: GlobalMapConfig,
+        graph: "SlamGraph | None" = None,
+        store: TileStore | None = None,
     ) -> None:
         self._odometry = odometry
         self._localiser = localiser
         self._graph = graph
         self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
         mapper = localiser.surfel_mapper
-        self._correction = None if graph is None or mapper is None else MapCorrection(mapper)
+        self._correction = None if graph is None or mapper is None or not mapper.kept_scans else MapCorrection(mapper)
         self._measured_stamp = None
-        self.map = MapBuilder(config)
+        self.map = MapBuilder(config, store)
 
     def estimate(self, scan: Scan, read_ms: float = 0.0) -> Estimated:
         """The odometry of the next scan, which took so long to read."""

@@ -95,7 +95,7 @@ def close_loops(
     if graph is None or global_map is None:
         return None
     logger.info("optimising the pose graph")
-    closed = _corrected(graph, graph.finish(), global_map.voxel_size_m, log)
+    closed = _corrected(graph, graph.finish(), global_map, log)
     if closed is not None:
         pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
@@ -106,14 +106,15 @@ def loops_so_far(graph: "SlamGraph | None", global_map: GlobalMap | None, log: S
     """Correct the log with the loops that are closed by now; more scans may follow."""
     if graph is None or global_map is None:
         return None
-    return _corrected(graph, graph.present(), global_map.voxel_size_m, log)
+    return _corrected(graph, graph.present(), global_map, log)
 
 
 def _corrected(
-    graph: "SlamGraph", result: "Corrected | None", voxel_size_m: float, log: ScanLog
+    graph: "SlamGraph", result: "Corrected | None", global_map: GlobalMap, log: ScanLog
 ) -> "GraphOutcome | None":
     """Correct the log of one recording."""
-    closed = None if result is None else FinishedGraph(graph, result, (len(log),), voxel_size_m).outcome([0])
+    like = global_map.voxel_size_m, global_map.most_points
+    closed = None if result is None else FinishedGraph(graph, result, (len(log),), *like).outcome([0])
     if closed is not None:
         log.correct(closed.T_world_lidar)
     return closed
@@ -126,13 +127,17 @@ class FinishedGraph:
     _graph: "SlamGraph"
     _result: "Corrected"
     _scans: tuple[int, ...]
+    # of the maps, see `GlobalMap`
     _voxel_size_m: float
+    _most_points: int | None = None
 
     @classmethod
-    def of_recordings(cls, graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float) -> "FinishedGraph | None":
+    def of_recordings(
+        cls, graph: "SlamGraph", scans: Sequence[int], voxel_size_m: float, most_points: int | None = None
+    ) -> "FinishedGraph | None":
         """Optimise recordings of so many scans each; None where no scan was registered."""
         result = graph.finish()
-        return None if result is None else cls(graph, result, tuple(scans), voxel_size_m)
+        return None if result is None else cls(graph, result, tuple(scans), voxel_size_m, most_points)
 
     @property
     def joined(self) -> list[int]:
@@ -165,7 +170,7 @@ class FinishedGraph:
         row = {int(key): new for new, key in enumerate(chosen)}
         return GraphOutcome(
             T_world_lidar=np.concatenate([self._scan_poses(recording) for recording in recordings]),
-            global_map=self._graph.draw_map(result, self._voxel_size_m, recordings),
+            global_map=self._graph.draw_map(result, self._voxel_size_m, recordings, self._most_points),
             keyframe_poses=result.keyframe_poses[chosen],
             edges=tuple(
                 replace(edge, first=row[edge.first], second=row[edge.second])

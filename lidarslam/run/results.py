@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from lidarslam.config.settings import Config, dump_yaml
@@ -12,9 +12,10 @@ from lidarslam.core.text.trajectory_io import format_kitti, format_tum
 from lidarslam.evaluation.map.entropy import sampled_map_entropy
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MapFormat
-from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
+from lidarslam.mapping.global_map.drawing import DrawnMap, drawn_map
+from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.map_io import write_cloud
-from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
+from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
@@ -22,6 +23,7 @@ from lidarslam.run.summary.summary import RunSummary, WrittenMap, summarise
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.map_tiles import TileWriter
 
 logger = logging.getLogger(__name__)
 
@@ -36,30 +38,25 @@ class RunOutcome:
     is_resumable: bool = False  # whether it can be continued from a checkpoint
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnMap:
-    """The final map."""
-
-    # cloud, voxel_size_m: its points, one in each voxel; None when no scan was added
-    cloud: PointCloud | None
-    voxel_size_m: float | None
-    moved: int = 0  # number of points that were removed as moving objects
-
-
-def final_map(tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig) -> DrawnMap:
-    """The map of a run whose poses are final; a pose graph has drawn it anew."""
+def final_map(
+    tracked: Tracked, closed: GraphOutcome | None, config: GlobalMapConfig, directory: RunDirectory | None = None
+) -> DrawnMap:
+    """The map of a run whose poses are final; a pose graph has drawn it anew. Tiles go to the directory."""
     views = tracked.views.placed(tracked.log.trajectory.T_world_lidar)
-    return drawn_map(tracked.global_map if closed is None else closed.global_map, views, config)
+    return draw(tracked.global_map if closed is None else closed.global_map, views, config, directory)
 
 
-def drawn_map(global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig) -> DrawnMap:
-    """A map without the points that the views see through."""
-    if global_map is None:
-        return DrawnMap(None, None)
-    moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
-    cloud = global_map.cloud(config.min_hits, moved)
-    cloud = replace(cloud, attributes=cloud.attributes.only(config.fields))
-    return DrawnMap(cloud, global_map.voxel_size_m, int(moved.sum()))
+def draw(
+    global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig, directory: RunDirectory | None
+) -> DrawnMap:
+    """The final map; its tiles, if it has any, are written to the directory."""
+    if directory is None:
+        return drawn_map(global_map, views, config)
+    writer = TileWriter(directory)
+    drawn = drawn_map(global_map, views, config, writer.write)
+    if drawn.tiled is not None and drawn.tiled.points:
+        writer.finish(drawn.tiled)
+    return drawn
 
 
 def write_results(
@@ -103,9 +100,11 @@ def write_map(directory: RunDirectory, drawn: DrawnMap, formats: Sequence[MapFor
     for name in (files.MAP_PLY, *(files.MAPS[one] for one in formats)):
         with directory.replacing(name) as path:
             write_cloud(path, cloud)
-    entropy = sampled_map_entropy(cloud.points)
+    # Of an overview it would tell of the thinning.
+    entropy = sampled_map_entropy(cloud.points) if drawn.tiled is None else None
     fields = tuple(name for name, _ in cloud.attributes.present())
-    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, None if entropy is None else entropy.mean, fields)
+    mean = None if entropy is None else entropy.mean
+    return WrittenMap(len(cloud), drawn.voxel_size_m, drawn.moved, mean, fields, drawn.tiled)
 
 
 def _write_trajectories(directory: RunDirectory, tracked: Tracked) -> TrajectoryMetrics | None:

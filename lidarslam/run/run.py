@@ -74,6 +74,8 @@ def execute(
                 description = describe_computed(request, recording)
                 unfinished = stack.enter_context(Unfinished.claim(directory, description, request.resume))
             log, graph = ScanLog(), _open_graph(config, directory, unfinished)
+            if config.mapping.budget_ms is not None:
+                log.warn("with mapping.budget_ms the results depend on the clock; another run may differ")
             if graph is not None:
                 stack.callback(graph.close)
             with viewing(request.rerun, config.viewer, recording.name, directory, log, page) as viewer:
@@ -84,7 +86,7 @@ def execute(
                 compiling.wait_for_all(phase)
                 phase("writing the results")
                 closed = close_loops(graph, tracked.global_map, log, viewer)
-                drawn = final_map(tracked, closed, config.global_map)
+                drawn = final_map(tracked, closed, config.global_map, directory)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
             formats = request.map_formats

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from lidarslam.core.text.plain_text import as_typed, count, scan_span, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
+from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary.summary import GraphSummary, RunSummary, WrittenMap
-from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
+from lidarslam.storage.directory import MAP_PLY, MAP_TILES, REPORT, SCANS_CSV, SUMMARY
 
 # A speed that differs less is that of the recording.
 _ALIKE = 1.05
@@ -33,7 +34,9 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
     summary = outcome.summary
     yield f"{count(summary.scans, 'scan')}, {summary.length_m:.1f} m in {summary.duration_s:.1f} s"
     total = summary.ms_per_scan["total"]
-    each = f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms)"
+    slowest = summary.slowest
+    worst = "" if slowest is None else f", slowest: scan {slowest.scan:,}, {slowest.ms:.0f} ms of {slowest.stage}"
+    each = f"{total.median:.0f} ms a scan (99 % under {total.p99:.0f} ms{worst})"
     in_all = f"{summary.elapsed_s:.1f} s for all{_speed(summary.realtime_factor)}"
     yield f"{each}, {in_all}; {summary.peak_rss_mb:,.0f} MB of memory"
     yield format_map(summary.map)
@@ -68,7 +71,14 @@ def format_map(written: WrittenMap) -> str:
     fields = f", with {' and '.join(written.fields)}" if written.fields else ""
     moved = f"; {count(written.moved, 'point')} of moving objects removed" if written.moved else ""
     entropy = f"; mean map entropy {written.entropy:.2f} (lower is crisper)" if written.entropy is not None else ""
+    if written.tiled is not None:
+        return f"{_tiles(written.tiled)}{fields}{moved}; {MAP_PLY}: {count(written.points, 'point')}, one per {voxel}"
     return f"map of {count(written.points, 'point')}, voxels of {voxel}{fields}{moved}{entropy}"
+
+
+def _tiles(tiled: TiledMap) -> str:
+    voxel, tiles = small_length(tiled.tiling.voxel_size_m), count(len(tiled.points), "tile")
+    return f"map of {count(tiled.total, 'point')} in {tiles}, {MAP_TILES}/, voxels of {voxel}"
 
 
 def _loops(graph: GraphSummary) -> str:

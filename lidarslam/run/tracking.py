@@ -18,6 +18,7 @@ from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
@@ -101,7 +102,8 @@ def track(
         scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
     localiser = localiser or make_localiser(config, inertial)
-    pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints)
+    store = TileStore(request.out, None if unfinished is None else unfinished.tiles)
+    pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
         scans = checkpoints.begin(pipeline, scans, is_recorded=request.rerun != "off")
     truth = unless_damaged(lambda: recording.ground_truth, log, "no metrics")

@@ -3,12 +3,15 @@
 import contextlib
 import errno
 import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.files import cannot_write, make_directory, only_writer, replacing
+from lidarslam.core.files import cannot_write, make_directory, only_writer, remove_partial_files, replacing
+
+_TILE = re.compile(r"-?\d+_-?\d+\.laz")
 
 # What a full or failing disk says.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
@@ -23,6 +26,9 @@ ODOMETRY_TUM = "odometry.tum"
 MAP_PLY = "map.ply"
 # Further formats of the map, by their names in `--map-format`.
 MAPS = {"pcd": "map.pcd", "laz": "map.laz", "e57": "map.e57"}
+# The folder of a large map's tiles, and the list of these.
+MAP_TILES = "map"
+MAP_INDEX = f"{MAP_TILES}/index.json"
 POSE_GRAPH = "pose_graph.g2o"
 SCANS_CSV = "scans.csv"
 SUMMARY = "summary.json"
@@ -88,8 +94,7 @@ class RunDirectory:
                 except BaseException:
                     directory._discard_unless_run()
                     raise
-                for name in directory._stale:
-                    (path / name).unlink(missing_ok=True)
+                directory._remove_stale()
         except OSError as error:
             if error.errno not in _NO_ROOM:
                 raise
@@ -133,25 +138,56 @@ class RunDirectory:
         """
         self.write_text(name, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
+    def _remove_stale(self) -> None:
+        """Remove what is left of the earlier run."""
+        for name in self._stale:
+            (self.path / name).unlink(missing_ok=True)
+        _remove_empty(self.path)
+
     def _discard_unless_run(self) -> None:
         """Remove files that no config.yaml describes: they would be in the way of the next attempt."""
         if not _is_run(self.path):
             for name in self._written:
                 (self.path / name).unlink(missing_ok=True)
+            _remove_empty(self.path)
+
+
+def remove_files(path: Path) -> None:
+    """Remove all files of a run."""
+    for name in (*tile_names(path), *FILES):
+        (path / name).unlink(missing_ok=True)
+    _remove_empty(path)
+
+
+def tile_names(path: Path) -> list[str]:
+    """The index of a map's tiles, and then the tiles, as far as they lie in the directory of a run itself."""
+    folder = path / MAP_TILES
+    if folder.is_symlink() or not folder.is_dir():
+        return []
+    tiles = sorted(f"{MAP_TILES}/{file.name}" for file in folder.iterdir() if _TILE.fullmatch(file.name))
+    return [*([MAP_INDEX] if (path / MAP_INDEX).exists() else []), *tiles]
+
+
+def _remove_empty(path: Path) -> None:
+    """Remove the folder of a map's tiles, when nothing lies there but what a killed process left."""
+    folder = path / MAP_TILES
+    if folder.is_dir() and not folder.is_symlink():
+        remove_partial_files(folder)
+        with contextlib.suppress(OSError):  # something else lies there
+            folder.rmdir()
 
 
 def remove_run(path: Path) -> None:
     """Remove a run's files, and its directory when nothing else lies there; leave anything else alone."""
     if _is_run(path):
-        for name in FILES:
-            (path / name).unlink(missing_ok=True)
+        remove_files(path)
         if not any(path.iterdir()):
             path.rmdir()
 
 
 def _earlier_run(path: Path, overwrite: bool, resume: bool) -> list[str]:
     """The files of a run that lies in the directory already, if it may be replaced."""
-    present = [name for name in FILES if (path / name).exists()]
+    present = [*(name for name in FILES if (path / name).exists()), *tile_names(path)]
     if (path / ABOUT).exists():  # the other files are of that run or merge, even without a config.yaml
         if not overwrite and not resume:
             raise OutputError(

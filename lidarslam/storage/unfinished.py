@@ -10,10 +10,10 @@ from typing import Any, Literal
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
 from lidarslam.core.state.stateful import Saved
-from lidarslam.storage.directory import ABOUT, FILES, STATE, UNFINISHED, RunDirectory
+from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
 
-_SUBMAPS = "submaps.bin"
+_SUBMAPS, _TILES = "submaps.bin", "tiles.bin"
 # Differences to another run that an error lists.
 _LISTED = 3
 
@@ -92,8 +92,7 @@ def remove_unfinished(run: Path) -> None:
     """
     with only_writer(run):
         remove_partial_files(run)
-        for name in FILES:
-            (run / name).unlink(missing_ok=True)
+        remove_files(run)
         Unfinished(run, About({})).end(stopped=False)
     if not any(run.iterdir()):
         run.rmdir()
@@ -106,13 +105,13 @@ class Unfinished:
         run: its directory.
         about: which run it is.
         saved: the state to go on from, None to begin.
-        state, submaps: the files of the state and of the pose graph's submaps.
+        state, submaps, tiles: the files of the state, of the pose graph's submaps, and of the global map's tiles.
     """
 
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
         self._folder = run / UNFINISHED
-        self.state, self.submaps = run / STATE, self._folder / _SUBMAPS
+        self.state, self.submaps, self.tiles = run / STATE, self._folder / _SUBMAPS, self._folder / _TILES
         self.saved: Saved | None = None
 
     @classmethod
@@ -174,7 +173,7 @@ class Unfinished:
     def _remove_files(self) -> None:
         if self._folder.is_dir():
             remove_partial_files(self._folder)
-        for path in (self.state, self.submaps):
+        for path in (self.state, self.submaps, self.tiles):
             path.unlink(missing_ok=True)
 
 

@@ -41,7 +41,7 @@ def run_train(sources: tuple[Path, ...], say: Callable[[str], None], **options: 
         out=out,
         config=load_train_config(options["config_file"] or earlier, settings),
         start_from=start_from,
-        **{name: options[name] for name in ("device", "prepared", "resume", "overwrite")},
+        **{name: options[name] for name in ("device", "prepared", "resume", "overwrite", "where")},
     )
     return execute(request, say)
 

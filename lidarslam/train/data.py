@@ -5,6 +5,7 @@ import json
 import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ class Stretch:
     name: str  # of the recording
     # differs from that of any other recording, and of itself before it was changed; values that JSON can hold
     identity: dict[str, Any]
-    open: Callable[[], ScanSequence]  # gives its scans
+    open: Callable[[], ScanSequence]  # gives its scans; can be pickled
     # first, stop: which of them, as in `range`
     first: int
     stop: int
@@ -77,7 +78,7 @@ def recorded(source: Path, reader: ReaderConfig) -> Stretch:
         "files": [len(stats), sum(stat.st_size for stat in stats), newest_ns],
         "reader": reader.model_dump(mode="json"),
     }
-    return Stretch(recording.name, identity, lambda: recording, 0, len(recording))
+    return Stretch(recording.name, identity, partial(open_recording, source, reader), 0, len(recording))
 
 
 def simulated(config: SimulatedConfig) -> list[Stretch]:
@@ -105,11 +106,11 @@ def simulated(config: SimulatedConfig) -> list[Stretch]:
 
 def _simulation(number: int, scans: int) -> Stretch:
     identity = {"simulated": number, "seed": _SIMULATION_SEED, "scans": scans}
+    return Stretch(f"simulation {number}", identity, partial(_build, number, scans), 0, scans)
 
-    def build() -> ScanSequence:
-        return next(mixture(1, scans, _SIMULATION_SEED, number))
 
-    return Stretch(f"simulation {number}", identity, build, 0, scans)
+def _build(number: int, scans: int) -> ScanSequence:
+    return next(mixture(1, scans, _SIMULATION_SEED, number))
 
 
 def hold_out(stretches: Sequence[Stretch], share: float, seed: int) -> tuple[list[Stretch], list[Stretch]]:
@@ -159,14 +160,12 @@ def prepared(
         InputError: a recording turns out unreadable.
         OutputError: the cache cannot be written.
     """
-    return [_prepared(piece, config, cache, count) for stretch in stretches for piece in stretch.pieces()]
+    return [prepared_piece(piece, config, cache, count) for stretch in stretches for piece in stretch.pieces()]
 
 
-def _prepared(piece: Stretch, config: TrainingConfig, cache: Path, count: Counter) -> PreparedRecording:
-    key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": config.images.model_dump(mode="json")}
-    if not piece.is_simulated:
-        key["teacher"] = config.teacher
-    path = cache / f"{_digest(key)}.safetensors"
+def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: Counter) -> PreparedRecording:
+    """One of the pieces of a stretch, as `prepared`."""
+    key, path = _key(piece, config), file_of(piece, config, cache)
     try:
         kept = PreparedRecording(**read_tensor_file(path, _KIND)[0])
     except (InputError, TypeError):  # not there yet, or damaged: made anew
@@ -175,6 +174,18 @@ def _prepared(piece: Stretch, config: TrainingConfig, cache: Path, count: Counte
         return made
     count(len(piece))
     return kept
+
+
+def _key(piece: Stretch, config: TrainingConfig) -> dict[str, Any]:
+    """What a prepared stretch depends on."""
+    images = config.images.model_dump(mode="json")
+    key = {**piece.identity, "first": piece.first, "stop": piece.stop, "images": images}
+    return key if piece.is_simulated else {**key, "teacher": config.teacher}
+
+
+def file_of(piece: Stretch, config: TrainingConfig, cache: Path) -> Path:
+    """Where a piece is kept once it is prepared."""
+    return cache / f"{_digest(_key(piece, config))}.safetensors"
 
 
 def _prepare(piece: Stretch, config: TrainingConfig, count: Counter) -> PreparedRecording:

@@ -14,6 +14,7 @@ from torch import nn
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.files import make_directory, only_writer
+from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.training.config import TrainingConfig
@@ -25,6 +26,7 @@ from lidarslam.train.data import Stretch, digest, draw_weights, hold_out, prepar
 from lidarslam.train.devices import DeviceName, Devices
 from lidarslam.train.loop import Recordings, TrainingLoop
 from lidarslam.train.settings import TrainConfig, dump_train_yaml
+from lidarslam.train.side_by_side import prepare_side_by_side
 from lidarslam.train.state import Progress, load_state
 from lidarslam.train.text import format_outcome
 
@@ -41,6 +43,7 @@ class TrainRequest:
     prepared: Path | None = None  # where prepared recordings are kept; None: in `out`
     resume: bool = False  # go on with the training in `out`
     overwrite: bool = False  # replace it
+    where: Where = SERIAL  # whether recordings are prepared one after another or side by side
 
 
 def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
@@ -103,6 +106,8 @@ def _recordings(
     done, total = 0, sum(len(stretch) for stretch in stretches)
     if not devices.is_first:
         devices.wait()
+    if devices.is_first and not request.where.is_serial:
+        prepare_side_by_side([*learned, *held_out], config, cache, request.where)
     with show_count("preparing recordings") as show:
 
         def count(more: int) -> None:

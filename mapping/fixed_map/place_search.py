@@ -18,6 +18,7 @@ from lidarslam.mapping.surfels.registration import Registration, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.attempts import measure_fit
 from lidarslam.mapping.tracking.birds_eye_map import levelling
+from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.start_poses import best_starts, positions_around, start_score
 
@@ -128,7 +129,7 @@ class PlaceSearch:
         starts: list[FloatArray] = []
         for view in self._map.views(cell_m):
             T = make_transform(view.R_level_world.T @ R_level_lidar, np.zeros(3))
-            starts.extend(view.find(points, T, reach_m, _PLACES, _PEAKS))
+            starts.extend(complete(view.find(points, T, reach_m, _PLACES, _PEAKS)))
         return self.among(scans, starts)
 
     def among(self, scans: KeptScans, starts: Sequence[FloatArray]) -> Search:
@@ -190,7 +191,7 @@ class PlaceSearch:
             T = T_map_lidar.copy()
             T[:3, :3] = exp(np.array([*(np.deg2rad(yaw_deg) * up), 0.0, 0.0, 0.0]))[:3, :3] @ T[:3, :3]
             starts.append(positions_around(T, up, _NEAR_CELLS * cell_m, 0.5 * _NEAR_CELLS * cell_m))
-        return self.among(scans, list(best_starts(latest.keypoints, np.concatenate(starts), region)))
+        return self.among(scans, list(complete(best_starts(latest.keypoints, np.concatenate(starts), region))))
 
     def _with_others(self, place: Place, kept: Sequence[KeptScan], regions: Regions) -> Place:
         """A place with the fits of the other scans; none where one is off from where the motion puts it."""

@@ -1,7 +1,6 @@
 """The merged map: one averaged point a voxel, so that memory follows the mapped area, not the number of scans."""
 
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +10,9 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import State, Stateful
 from lidarslam.mapping.global_map import kernels
+from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
+from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
@@ -47,66 +48,51 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-
-@dataclass(frozen=True, eq=False)
-class _Voxels:
-    """Sums over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
-
-    keys: NDArray[np.int64]
-    sums: NDArray[np.float32]
-    layout: Layout
-
-    def __post_init__(self) -> None:
-        if self.sums.shape != (len(self.keys), self.layout.width):
-            raise ValueError(f"expected sums ({len(self.keys)}, {self.layout.width}), got {self.sums.shape}")
-
-    @classmethod
-    def join(cls, parts: "Sequence[_Voxels]") -> "_Voxels":
-        """All of them after one another, equal keys not added up."""
-        layout = Layout.union([part.layout for part in parts])
-        wide = (part.layout.widened(part.sums, layout) for part in parts)
-        return cls(
-            np.concatenate([np.empty(0, dtype=np.int64), *(part.keys for part in parts)]),
-            np.concatenate([np.empty((0, layout.width), dtype=np.float32), *wide]),
-            layout,
-        )
-
-    def reduced(self) -> "_Voxels":
-        """Rows of equal keys added up, in the order of keys."""
-        unique, totals = np.empty_like(self.keys), np.empty_like(self.sums)
-        order = np.argsort(self.keys)
-        count = kernels.add_up(order, self.keys, self.sums, self.layout.summed, unique, totals)
-        return _Voxels(unique[:count].copy(), totals[:count].copy(), self.layout)
-
-    def chosen(self, rows: NDArray[np.bool_]) -> "_Voxels":
-        """Some of them."""
-        return _Voxels(self.keys[rows], self.sums[rows], self.layout)
+    def select(self, chosen: NDArray[np.bool_]) -> "PointCloud":
+        """Some of the points, by a mask (N,)."""
+        return PointCloud(self.points[chosen], self.normals[chosen], self.attributes.select(chosen))
 
 
 class GlobalMap(Stateful):
     """Accumulates scans into voxels.
 
     New points wait in a list and are merged into the sorted main table when there are as many as half of it, so that
-    sorting costs little a scan, and memory stays within a small factor of the number of voxels.
+    sorting costs little a scan, and memory stays within a small factor of the number of voxels. When the table has more
+    voxels than it may, those of tiles that were not visited since it was merged before go to disk.
+
+    Args:
+        voxel_size_m: edge of a voxel.
+        most_points: number of voxels in memory; None: any.
+        store: where others lie; None: in a temporary file.
     """
 
     voxel_size_m: float
-    _merged: _Voxels
-    _pending: list[_Voxels]
+    most_points: int | None
+    _merged: Voxels
+    _pending: list[Voxels]
+    _store: TileStore | None  # None where the number of voxels is not bounded
 
-    def __init__(self, voxel_size_m: float) -> None:
-        self.voxel_size_m = voxel_size_m
-        self._merged, self._pending = _Voxels.join([]), []
+    def __init__(self, voxel_size_m: float, most_points: int | None = None, store: TileStore | None = None) -> None:
+        self.voxel_size_m, self.most_points = voxel_size_m, most_points
+        self._store = None if most_points is None else TileStore() if store is None else store
+        self._merged, self._pending = Voxels.join([]), []
         self._after_restore()
 
     def _after_restore(self) -> None:
         self._pending_size = sum(len(part.keys) for part in self._pending)
         self._lock = threading.Lock()  # a viewer may look while a scan is added
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of it is in memory; of any other map, only `tiles` and `tile` tell more than a part."""
+        with self._lock:
+            self._merge()
+            return self._store is None or not len(self._store)
+
     def state(self) -> State:
         """The table and the points that wait: to merge them now would round other sums."""
         with self._lock:
-            self._pending = [_Voxels.join(self._pending)]
+            self._pending = [Voxels.join(self._pending)]
             return super().state()
 
     def add(self, points: FloatArray, T_world_lidar: FloatArray, attributes: PointAttributes | None = None) -> None:
@@ -117,7 +103,7 @@ class GlobalMap(Stateful):
         T = np.ascontiguousarray(T_world_lidar)
         kernels.write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
         layout.write(attributes, sums)
-        self._wait(_Voxels(keys, sums, layout))
+        self._wait(Voxels(keys, sums, layout))
 
     def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
         """Add the voxels of another map, as if its points were added here."""
@@ -129,11 +115,11 @@ class GlobalMap(Stateful):
         )  # within the voxel, where float32 is exact enough
         sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
         sums[:, :COUNT] *= means.rows[:, COUNT, None]
-        self._wait(_Voxels(keys, sums, means.layout))
+        self._wait(Voxels(keys, sums, means.layout))
 
-    def means(self) -> VoxelMeans:
-        """The voxels so far."""
-        voxels = self._voxels(1)
+    def means(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> VoxelMeans:
+        """The voxels so far, arguments as in `cloud`."""
+        voxels = self._voxels(min_hits, left_out)
         rows = voxels.sums.copy()
         rows[:, POSITION] = self._mean_points(voxels)
         rows[:, VIEW] = voxels.sums[:, VIEW] / voxels.sums[:, COUNT, None]
@@ -150,34 +136,73 @@ class GlobalMap(Stateful):
             min_hits: as in `points`.
             left_out: (M,) which of `points` are left out.
         """
-        voxels = self._voxels(min_hits)
-        if left_out is not None:
-            voxels = voxels.chosen(~left_out)
+        voxels = self._voxels(min_hits, left_out)
         points = self._mean_points(voxels)
         normals = estimate_normals(points)
         normals[np.einsum("ij,ij->i", normals, voxels.sums[:, VIEW]) < 0.0] *= -1.0
         return PointCloud(points, normals, voxels.layout.attributes(voxels.sums))
 
-    def _wait(self, voxels: _Voxels) -> None:
+    @property
+    def tiling(self) -> Tiling:
+        """The tiles of the map."""
+        return Tiling.of(self.voxel_size_m)
+
+    def tiles(self) -> list[Tile]:
+        """All tiles that have voxels, in memory or not."""
+        in_memory, store = self._voxels(), self._store
+        return sorted({*self.tiling.tiles(in_memory.keys), *(store.tiles if store is not None else ())})
+
+    def tile(self, tile: Tile, margin_m: float = 0.0) -> "GlobalMap":
+        """A map of a tile alone, with a margin of its neighbours and the attributes of the whole map."""
+        low, high = self.tiling.bounds(tile, margin_m)
+        in_memory, parts = self._voxels(), [Voxels.join([])]
+        if self._store is not None:
+            parts[0] = Voxels(parts[0].keys, np.empty((0, self._store.layout.width), np.float32), self._store.layout)
+            for near in self.tiling.around(low, high):
+                parts += [voxels.within(low, high) for voxels in self._store.voxels(near)]
+        parts.append(in_memory.within(low, high))
+        cut = GlobalMap(self.voxel_size_m)
+        cut._merged = Voxels.join(parts).reduced()
+        return cut
+
+    def lies_in(self, tile: Tile, min_hits: int = 1) -> NDArray[np.bool_]:
+        """(M,) which of `points` lie in a tile."""
+        keys = self._voxels(min_hits).keys
+        low, high = self.tiling.bounds(tile)
+        x, y = column_cells(keys), row_cells(keys)
+        return (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+
+    def brightest(self) -> float:
+        """The largest intensity of a voxel; 0 where none is known."""
+        in_memory = self._voxels()
+        stored = 0.0 if self._store is None else self._store.brightest
+        return max(stored, in_memory.layout.largest_intensity(in_memory.sums))
+
+    def _wait(self, voxels: Voxels) -> None:
         with self._lock:
             self._pending.append(voxels)
             self._pending_size += len(voxels.keys)
-            if self._pending_size > max(_MIN_PENDING, len(self._merged.keys) // 2):
+            most_waiting = max(_MIN_PENDING, len(self._merged) // 2)
+            if self._pending_size > (most_waiting if self.most_points is None else min(most_waiting, self.most_points)):
                 self._merge()
 
     def _merge(self) -> None:
         if self._pending_size:
-            waiting = _Voxels.join(self._pending).reduced()
-            self._merged = _Voxels.join([self._merged, waiting]).reduced()
+            waiting = Voxels.join(self._pending).reduced()
+            self._merged = self._merged.united(waiting)
+            if self._store is not None and self.most_points is not None and len(self._merged) > self.most_points:
+                self._merged = self._store.take(self._merged, self.tiling, waiting.keys, self.most_points)
         self._pending, self._pending_size = [], 0
 
-    def _voxels(self, min_hits: int) -> _Voxels:
+    def _voxels(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> Voxels:
         with self._lock:
             self._merge()
-            merged = self._merged
-        return merged if min_hits <= 1 else merged.chosen(merged.sums[:, COUNT] >= min_hits)
+            voxels = self._merged
+        if min_hits > 1:
+            voxels = voxels.chosen(voxels.sums[:, COUNT] >= min_hits)
+        return voxels if left_out is None else voxels.chosen(~left_out)
 
-    def _mean_points(self, voxels: _Voxels) -> FloatArray:
+    def _mean_points(self, voxels: Voxels) -> FloatArray:
         within = voxels.sums[:, POSITION] / voxels.sums[:, COUNT, None]
         return key_cells(voxels.keys) * self.voxel_size_m + within
 

@@ -63,6 +63,28 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, summed: int, unique:
     return count
 
 
+@compiled
+def unite(
+    first_keys: Keys, first_sums: Sums, second_keys: Keys, second_sums: Sums, summed: int, unique: Keys, totals: Sums
+) -> int:  # fmt: skip
+    """As `add_up` for two tables, each with its keys (N,) sorted and unique."""
+    count, a, b, columns = 0, 0, 0, first_sums.shape[1]
+    while a < len(first_keys) or b < len(second_keys):
+        from_first = b >= len(second_keys) or (a < len(first_keys) and first_keys[a] <= second_keys[b])
+        from_second = a >= len(first_keys) or (b < len(second_keys) and second_keys[b] <= first_keys[a])
+        unique[count] = first_keys[a] if from_first else second_keys[b]
+        for column in range(columns):
+            totals[count, column] = first_sums[a, column] if from_first else second_sums[b, column]
+        if from_first and from_second:
+            for column in range(summed):
+                totals[count, column] += second_sums[b, column]
+            if summed < columns and _is_earlier(second_sums[b], totals[count], summed):
+                for column in range(summed, columns):
+                    totals[count, column] = second_sums[b, column]
+        a, b, count = a + from_first, b + from_second, count + 1
+    return count
+
+
 @compiled_part
 def _is_earlier(row: Sums, other: Sums, column: int) -> bool:
     """Whether the time of one row (C,) is before another's: a column and the rest of it in the next one."""

@@ -30,8 +30,13 @@ def require_format(name: MapFormat) -> None:
         raise OutputError("E57 maps need pye57; type: pip install 'lidarslam[e57]'")
 
 
-def write_cloud(path: Path, cloud: PointCloud) -> None:
+def write_cloud(path: Path, cloud: PointCloud, brightest: float | None = None) -> None:
     """Write a binary .ply, .pcd, .laz or .e57 file with points, normals and attributes; E57 holds no normals.
+
+    Args:
+        path: of the file.
+        cloud: with at least one point.
+        brightest: the largest intensity of the map that the cloud is a part of, for .laz; None: it is the whole map.
 
     Raises:
         OutputError: the file could not be written, or the cloud is empty.
@@ -40,7 +45,10 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
         raise OutputError(f"{path.parent}: a map without points cannot be written")
     write, failure = _WRITERS[path.suffix]
     try:
-        write(path, cloud)
+        if brightest is None:
+            write(path, cloud)
+        else:
+            write_laz(path, cloud, brightest=brightest)
     except failure as error:
         reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), type(error).__name__)
         raise OutputError(f"{path.parent}: the {path.suffix} map cannot be written there ({reason})") from error

@@ -127,6 +127,10 @@ def seen_through(points: FloatArray, views: PlacedViews, voxel_size_m: float) ->
     moved = np.zeros(len(points), dtype=np.bool_)
     reach_m = max(_LEAST_REACH_M, _PIXEL_OF_VOXEL * voxel_size_m * _COLUMNS / TWO_PI)
     order = np.random.default_rng(0).permutation(len(views))
+    if len(points):  # views out of reach of all points have no vote
+        sensors = views.T_world_lidar[order, :3, 3]
+        off = sensors - np.clip(sensors, points.min(axis=0), points.max(axis=0))
+        order = order[np.einsum("ij,ij->i", off, off) <= (reach_m + voxel_size_m) ** 2]
     T_lidar_world = np.ascontiguousarray(inverse(views.T_world_lidar[order]))
     images, grids = views.images[order], views.grids[order]
     judge(np.ascontiguousarray(points), T_lidar_world, images, grids, reach_m, voxel_size_m, moved)

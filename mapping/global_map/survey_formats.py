@@ -14,10 +14,11 @@ _LAZ_NORMALS = ("NormalX", "NormalY", "NormalZ")
 _POINTS_AT_A_TIME = 1_000_000
 
 
-def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None) -> None:
+def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None, brightest: float | None = None) -> None:
     """Write a compressed LAS 1.4 file; normals and rings are extra dimensions, `wkt` is its coordinate system.
 
-    Intensities and colours have 16 bits there: intensities up to 1 are scaled to 65535, others rounded.
+    Intensities and colours have 16 bits there: intensities up to 1 are scaled to 65535, others rounded. The cloud may
+    be a part of a map, whose largest intensity is `brightest`.
     """
     import laspy
 
@@ -35,7 +36,7 @@ def write_laz(path: Path, cloud: PointCloud, wkt: str | None = None) -> None:
     columns |= dict.fromkeys(("return_number", "number_of_returns"), np.ones(len(cloud), dtype=np.uint8))
     if known.intensity is not None:
         intensity = np.nan_to_num(known.intensity)
-        scale = _LAZ_FULL if intensity.max() <= 1.0 else 1.0
+        scale = _LAZ_FULL if (intensity.max() if brightest is None else brightest) <= 1.0 else 1.0
         columns["intensity"] = np.clip(np.round(scale * intensity), 0.0, _LAZ_FULL).astype(np.uint16)
     if known.rgb is not None:
         columns |= zip(("red", "green", "blue"), known.rgb.T.astype(np.uint16) * 257, strict=True)

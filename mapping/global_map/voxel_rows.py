@@ -80,6 +80,11 @@ class Layout:
                 new[:] = old
         return wide
 
+    def largest_intensity(self, rows: Rows) -> float:
+        """The largest mean intensity; 0 where none is known."""
+        intensity = self.parts(rows)[0]
+        return float(np.nanmax(_means(intensity, unknown=np.nan), initial=0.0)) if self.intensity else 0.0
+
     def attributes(self, rows: Rows) -> PointAttributes:
         """Means of intensity and colour, ring and time of the earliest point; rings as far as one is known."""
         intensity, rgb, first = self.parts(rows)

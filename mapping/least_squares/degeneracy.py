@@ -29,7 +29,12 @@ def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray,
     total = float(weights.sum())
     if total <= 0.0:
         return Degeneracy(np.eye(6), lever_m)
-    scaled = jacobian / lever_scale(lever_m)
-    shares, axes = np.linalg.eigh((scaled * weights[:, None]).T @ scaled / total)
-    noise = float(weights @ tilt**2) / total
-    return Degeneracy(axes[:, shares < max(_LEAST_SHARE, _NOISE_FACTOR * noise)].T, lever_m)
+    constraint = (jacobian * weights[:, None]).T @ jacobian / total
+    return degenerate_directions(constraint, float(weights @ tilt**2) / total, lever_m)
+
+
+def degenerate_directions(constraint: FloatArray, squared_tilt: float, lever_m: float) -> Degeneracy:
+    """As `find_degeneracy`, from the weighted means (6, 6) of `J^T J` and of the squared tilt."""
+    scale = lever_scale(lever_m)
+    shares, axes = np.linalg.eigh(constraint / np.outer(scale, scale))
+    return Degeneracy(axes[:, shares < max(_LEAST_SHARE, _NOISE_FACTOR * squared_tilt)].T, lever_m)

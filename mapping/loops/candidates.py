@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.loops.drift import Track
 from lidarslam.mapping.loops.registration import SubmapCloud
 from lidarslam.mapping.loops.sparse_submap import SparseSubmap
+from lidarslam.mapping.loops.submap_file import SubmapFile
 
 # Shorter ways back are no loops, in median ranges and in metres.
 _MIN_WAY_RANGES, _MIN_WAY_M = 3.0, 10.0
@@ -63,16 +65,16 @@ class KeyframeDatabase(Stateful):
 
     Attributes:
         track: the present estimates.
-        submaps: one a keyframe.
+        submaps: one a keyframe, in a file.
     """
 
     track: Track
 
-    def __init__(self, config: LoopConfig) -> None:
+    def __init__(self, config: LoopConfig, directory: Path | None = None) -> None:
         self._config = config
         self.track = Track(np.empty((0, 4, 4)), np.empty(0), np.empty(0, dtype=np.int64), config.drift_rates)
-        self.submaps: list[SparseSubmap] = []
-        self._descriptors: list[NDArray[np.complex64]] = []
+        self.submaps = SubmapFile(directory)
+        self._descriptors = np.empty((0, 1, 1), dtype=np.complex64)  # (N, ...), with room for more keyframes
 
     def __len__(self) -> int:
         return len(self.submaps)
@@ -102,7 +104,12 @@ class KeyframeDatabase(Stateful):
 
     def _keep(self, points: FloatArray) -> None:
         self.submaps.append(SparseSubmap.of(points, self._config.max_range_m))
-        self._descriptors.append(BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m))
+        descriptor = BirdEyeView.of(self.submaps[-1]).descriptor(self.radius_m)
+        if len(self) > len(self._descriptors):
+            room = np.zeros((max(64, 2 * len(self)), *descriptor.shape), dtype=np.complex64)
+            room[: len(self) - 1] = self._descriptors[: len(self) - 1].reshape(-1, *descriptor.shape)
+            self._descriptors = room
+        self._descriptors[len(self) - 1] = descriptor
 
     def cloud(self, index: int) -> SubmapCloud:
         """A keyframe with those before and after it in its segment."""
@@ -130,7 +137,9 @@ class KeyframeDatabase(Stateful):
             yield from self._alike(index, others)
 
     def _compare(self, view: BirdEyeView, others: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        return compare(view.descriptor(self.radius_m), np.stack([self._descriptors[i] for i in others]))
+        is_run = others[-1] - others[0] == len(others) - 1  # as within one segment: a view of them is no copy
+        chosen = self._descriptors[slice(others[0], others[-1] + 1) if is_run else others]
+        return compare(view.descriptor(self.radius_m), chosen)
 
     def _nearby(self, index: int, others: NDArray[np.intp]) -> Iterator[Candidate]:
         """Earlier keyframes of the segment within reach of the estimate."""

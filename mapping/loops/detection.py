@@ -7,6 +7,7 @@ that drift cannot explain is rejected within a segment; where tracking was lost,
 import logging
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -44,9 +45,9 @@ class LoopDetector(Stateful):
     _accepted: list[LoopClosure]
     _pending: list[LoopClosure]
 
-    def __init__(self, config: LoopConfig) -> None:
+    def __init__(self, config: LoopConfig, directory: Path | None = None) -> None:
         self._config = config
-        self._database = KeyframeDatabase(config)
+        self._database = KeyframeDatabase(config, directory)
         self._accepted, self._pending = [], []
 
     def rebuild(self, submaps: Iterable[FloatArray]) -> None:

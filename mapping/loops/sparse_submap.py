@@ -22,7 +22,7 @@ _THIN = 0.08
 _NARROW = 0.06
 _POLE = 0.7
 # Pixels of the range image: 3 degrees of azimuth and elevation.
-_PIXELS = (120, 60)
+PIXELS = (120, 60)
 # From the sensor's axis, "up" may be so far.
 _LARGEST_TILT = np.cos(np.deg2rad(45.0))
 
@@ -58,12 +58,12 @@ class SparseSubmap:
         if len(chosen) > _MAX_POINTS:
             chosen = chosen[np.linspace(0, len(chosen) - 1, _MAX_POINTS).astype(np.intp)]
         kinds, axes, tilt = _shapes(fine, fine[chosen])
-        image = np.full(_PIXELS[0] * _PIXELS[1], np.inf)
+        image = np.full(PIXELS[0] * PIXELS[1], np.inf)
         np.minimum.at(image, _pixels(points, ranges), ranges)
         image[np.isinf(image)] = 0.0
         return cls(
             fine[chosen].astype(np.float32), axes.astype(np.float16), tilt.astype(np.float16), kinds,
-            image.astype(np.float16).reshape(_PIXELS), range_m, cell_m, _level_rotation(axes[kinds == PLANE]),
+            image.astype(np.float16).reshape(PIXELS), range_m, cell_m, _level_rotation(axes[kinds == PLANE]),
         )  # fmt: skip
 
     def nearest_ranges(self, points: FloatArray) -> FloatArray:
@@ -74,11 +74,11 @@ class SparseSubmap:
 
 def _pixels(points: FloatArray, ranges: FloatArray) -> NDArray[np.intp]:
     """(N,) flat indices into a range image."""
-    azimuth = (np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5) * _PIXELS[0]
+    azimuth = (np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5) * PIXELS[0]
     sine = np.clip(points[:, 2] / np.maximum(ranges, 1e-9), -1.0, 1.0)
-    elevation = (np.arcsin(sine) / np.pi + 0.5) * _PIXELS[1]
-    rows = np.minimum(azimuth.astype(np.intp), _PIXELS[0] - 1)
-    return rows * _PIXELS[1] + np.minimum(elevation.astype(np.intp), _PIXELS[1] - 1)
+    elevation = (np.arcsin(sine) / np.pi + 0.5) * PIXELS[1]
+    rows = np.minimum(azimuth.astype(np.intp), PIXELS[0] - 1)
+    return rows * PIXELS[1] + np.minimum(elevation.astype(np.intp), PIXELS[1] - 1)
 
 
 def principal_components(

@@ -20,6 +20,7 @@ from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import refine
@@ -32,6 +33,7 @@ from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
 from lidarslam.mapping.pose_graph.laid_submaps import LaidSubmaps, connected_with_last
 from lidarslam.mapping.pose_graph.neighbourhoods import REACH, Neighbourhoods
 from lidarslam.mapping.pose_graph.optimizer import optimise, relax
+from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
 from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
@@ -58,6 +60,7 @@ class SlamGraph(Stateful):
     _edges: list[RelativePose]
     _attitudes: list[Attitude]  # of the first recording, whose world they are in
     _closures: list[LoopClosure]
+    _relaxing: RelaxSchedule
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
     _laid: LaidSubmaps  # in the running local map
     _looked_at: int  # closures that the local map has been compared with
@@ -75,12 +78,12 @@ class SlamGraph(Stateful):
         self._config = config
         self._local_radius_m = local_radius_m
         self._selector = KeyframeSelector(config.keyframes)
-        self._detector = LoopDetector(config.loops)
+        self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
         self._store = SubmapStore(directory, file)
         self._submap = None
         self.scan_poses, self.keyframe_ms, self._first_scans = [], [], [0]
         self._keyframes, self._poses, self._edges, self._closures = [], [], [], []
-        self._unrefined, self._attitudes = [], []
+        self._unrefined, self._attitudes, self._relaxing = [], [], RelaxSchedule()
         self._laid, self._looked_at = LaidSubmaps(local_radius_m), 0
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
@@ -97,18 +100,14 @@ class SlamGraph(Stateful):
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, self._segment + 1
 
     def draw(
-        self,
-        points: FloatArray,
-        T_world_lidar: FloatArray,
-        voxel_size_m: float,
-        attributes: PointAttributes | None = None,
+        self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, known: PointAttributes | None = None
     ) -> None:
         """Add points (N, 3) of the latest scan, at its pose as registered, to the submap of the last keyframe."""
         if not self._is_submap_open:
             return
         if self._submap is None:
             self._submap = GlobalMap(voxel_size_m)
-        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar, attributes)
+        self._submap.add(points, inverse(self.scan_poses[self._keyframes[-1].scan]) @ T_world_lidar, known)
 
     def add(self, scan: GraphScan) -> None:
         """Take the next scan; the points of the one before have been drawn by now."""
@@ -172,9 +171,11 @@ class SlamGraph(Stateful):
         corrected, edges = corrected_recordings(registered, firsts, scans, poses), (*self._edges, *loops)
         return Corrected(corrected, scans, poses, tuple(closures), inliers, edges, firsts, frames)
 
-    def draw_map(self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None) -> GlobalMap:
-        """The submaps of some recordings, or of all, at their keyframes' corrected poses."""
-        drawn = GlobalMap(voxel_size_m)
+    def draw_map(
+        self, result: Corrected, voxel_size_m: float, recordings: Collection[int] | None = None, most: int | None = None
+    ) -> GlobalMap:
+        """The submaps of some recordings, or of all, at their corrected poses, with `most` voxels in memory."""
+        drawn = GlobalMap(voxel_size_m, most, TileStore(self._store.directory))
         for index, (pose, recording) in enumerate(zip(result.keyframe_poses, result.keyframe_recordings, strict=True)):
             if recordings is None or recording in recordings:
                 drawn.add_means(self._means(index), pose)
@@ -223,8 +224,7 @@ class SlamGraph(Stateful):
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
         self._refine_closures(until=index - REACH)
-        # A closure that is within its own deviation of the present poses does not move them.
-        if any(closure.accepted and squared_error(closure, self._poses) > 6.0 for closure in found):
+        if self._relaxing.is_due(found, self._poses):
             self._poses = list(relax(np.array(self._poses), self._edges, self._accepted(), self._attitudes))
 
     def _refine_closures(self, until: int) -> None:

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
+from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # Pixels of one degree.
 ROWS, COLUMNS = 180, 360
@@ -31,18 +32,22 @@ def draw_indices(points: FloatArray, min_range_m: float, image: NDArray[np.int64
 
 
 @compiled
-def write_moments(
-    points: FloatArray, image: NDArray[np.int64], pixels: NDArray[np.int64], means: FloatArray,
-    covariances: FloatArray, counts: NDArray[np.int64],
+def write_planes(
+    points: FloatArray, image: NDArray[np.int64], pixels: NDArray[np.int64], means: FloatArray, normals: FloatArray,
+    variances: FloatArray, counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Write the mean (M, 3), covariance (M, 3, 3) and number (M,) of the points around pixels (M, 2) of an image."""
-    offset = np.empty(3)
+    """Write the planes of the points around pixels (M, 2) of an image.
+
+    The mean (M, 3), the axis of least variance (M, 3), the variances (M, 3) along the principal axes, ascending, and
+    the number (M,) of the points.
+    """
+    offset, mean, products, covariance = np.empty(3), np.empty(3), np.empty(6), np.empty(6)
     for m in range(len(pixels)):
         centre = points[image[pixels[m, 0], pixels[m, 1]]]
         reach2 = _REACH * _REACH * (centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
         count = 0
-        means[m, :] = 0.0
-        covariances[m, :, :] = 0.0
+        mean[:] = 0.0
+        products[:] = 0.0
         for row in range(max(pixels[m, 0] - _NEAR_ROWS, 0), min(pixels[m, 0] + _NEAR_ROWS + 1, ROWS)):
             for step in range(-_NEAR_COLUMNS, _NEAR_COLUMNS + 1):
                 n = image[row, (pixels[m, 1] + step) % COLUMNS]
@@ -54,16 +59,28 @@ def write_moments(
                     continue
                 count += 1
                 for i in range(3):
-                    means[m, i] += offset[i]
-                    for j in range(i + 1):
-                        covariances[m, i, j] += offset[i] * offset[j]
+                    mean[i] += offset[i]
+                _add_products(offset, 1.0, products)
+        for i in range(3):
+            mean[i] /= count
+            means[m, i] = centre[i] + mean[i]
+        for entry in range(6):
+            covariance[entry] = products[entry] / count
+        _add_products(mean, -1.0, covariance)
+        write_eigenvalues(covariance, variances[m])
+        write_eigenvector(covariance, variances[m, 0], normals[m])
         counts[m] = count
-        for i in range(3):
-            for j in range(i + 1):
-                value = covariances[m, i, j] / count - means[m, i] * means[m, j] / (count * count)
-                covariances[m, i, j] = covariances[m, j, i] = value
-        for i in range(3):
-            means[m, i] = centre[i] + means[m, i] / count
+
+
+@compiled_part
+def _add_products(v: FloatArray, sign: float, total: FloatArray) -> None:
+    """Add the six distinct products of the components of a vector (3,): xx, xy, xz, yy, yz, zz."""
+    total[0] += sign * v[0] * v[0]
+    total[1] += sign * v[0] * v[1]
+    total[2] += sign * v[0] * v[2]
+    total[3] += sign * v[1] * v[1]
+    total[4] += sign * v[1] * v[2]
+    total[5] += sign * v[2] * v[2]
 
 
 @compiled

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state.stateful import Shape
-from lidarslam.mapping.slides.kernels import COLUMNS, ROWS, draw_indices, vote, write_moments
+from lidarslam.mapping.slides.kernels import COLUMNS, ROWS, draw_indices, vote, write_planes
 
 _MIN_RANGE_M = 1.0
 _FEWEST_NEIGHBOURS = 5
@@ -43,17 +43,13 @@ class Surfels:
         image = np.empty((ROWS, COLUMNS), dtype=np.int64)
         draw_indices(points, _MIN_RANGE_M, image)
         pixels = np.argwhere(image >= 0)
-        means, covariances = np.empty((len(pixels), 3)), np.empty((len(pixels), 3, 3))
+        means, normals, variances = np.empty((3, len(pixels), 3))
         counts = np.empty(len(pixels), dtype=np.int64)
-        write_moments(points, image, pixels, means, covariances, counts)
-        known = counts >= _FEWEST_NEIGHBOURS
-        means, covariances = means[known], covariances[known]
-        variances, axes = np.linalg.eigh(covariances)
-        normals = axes[:, :, 0]
+        write_planes(points, image, pixels, means, normals, variances, counts)
         normals[np.einsum("ij,ij->i", normals, means) > 0.0] *= -1.0
         noise_m = _NOISE_M + _NOISE_OF_RANGE * np.linalg.norm(means, axis=1)
         flat = (variances[:, 0] < _THINNEST_SHARE * variances[:, 1]) & (variances[:, 0] < noise_m**2)
-        flat &= variances[:, 1] > _LINE_SHARE * variances[:, 2]
+        flat &= (variances[:, 1] > _LINE_SHARE * variances[:, 2]) & (counts >= _FEWEST_NEIGHBOURS)
         return cls(means[flat], normals[flat], 2.0 * np.sqrt(variances[flat, 2]))
 
     def facing(self, direction: FloatArray) -> "Surfels":

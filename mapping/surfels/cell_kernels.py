@@ -3,7 +3,7 @@
 The hash has open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows`
 (2^bits,) int32. A cell's sums are (15,) float32: number of points, first and second moments about the cell's centre in
 units of the cell (x, y, z, xx, xy, xz, yy, yz, zz), first and second moment of the elevation, and the sum of the view
-directions (x, y, z).
+directions (x, y, z). They fill a cache line with a sixteenth number, see `other_side`.
 """
 
 import math
@@ -33,6 +33,9 @@ _MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
 _ABOVE_BITS = 3
 OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 
+# Column of the link to a cell's other side: its row plus one, exact to 16 million cells; zero where there is none.
+OTHER = 15
+
 # A cell with so many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
@@ -46,8 +49,7 @@ class Cells(NamedTuple):
     table_keys: Keys
     table_rows: Rows
     keys: Keys  # (M,) of the cells, by row
-    others: Rows  # (M,) row of each cell's other side, or `ABSENT`
-    sums: Floats  # (M, 15) moments
+    sums: Floats  # (M, 16) moments, and the link to the other side
 
 
 @compiled_part
@@ -122,15 +124,21 @@ def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
         keys[n] = key_of(cell_of(points[n, 0] * scale), cell_of(points[n, 1] * scale), cell_of(points[n, 2] * scale))
 
 
+@compiled_part
+def other_side(row: int, sums: Floats) -> int:
+    """Row of the other side of the cell in a row, `ABSENT` where there is none."""
+    return int(sums[row, OTHER]) - 1
+
+
 @compiled
-def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows, others: Rows) -> None:
-    """Write the links (M,) between both sides of cells, for the keys (N,) in rows (N,) that are other sides."""
+def link_sides(keys: Keys, rows: Rows, bits: int, table_keys: Keys, table_rows: Rows, sums: Floats) -> None:
+    """Write the links between both sides of cells into sums (M, 16), for the keys (N,) in rows (N,) of other sides."""
     for n in range(len(keys)):
-        if keys[n] < 0 and others[rows[n]] == ABSENT:
+        if keys[n] < 0 and other_side(rows[n], sums) == ABSENT:
             first = find_one(keys[n] & FIRST_SIDE, bits, table_keys, table_rows)
-            others[rows[n]] = first
+            sums[rows[n], OTHER] = first + 1
             if first != ABSENT:
-                others[first] = rows[n]
+                sums[first, OTHER] = rows[n] + 1
 
 
 @compiled

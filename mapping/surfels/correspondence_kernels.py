@@ -22,36 +22,38 @@ _FEWEST_POINTS = 6
 _MOST_ACROSS = 0.5
 
 
-class Rows(NamedTuple):
-    """Arrays of correspondences, one a row, and the index of each point; see `mapping.surfels.surfel_map`."""
+class Surfaces(NamedTuple):
+    """The surfaces that N points correspond to, a row for each point."""
 
-    number: NDArray[np.intp]
-    points: FloatArray
-    normals: FloatArray
-    thickness_m: FloatArray
-    tilt: FloatArray
+    counts: NDArray[np.int32]  # (N,) residuals of the point: 1 with a plane, up to 3 with a compact object, or none
+    points: FloatArray  # (N, 3) on the surface, in the world
+    normals: FloatArray  # (N, 3, 3) unit, in the world, one for each residual
+    thickness_m: FloatArray  # (N, 3) standard deviation of the surface along each
+    tilt: FloatArray  # (N, 3) standard deviation of each normal, radians
 
     @classmethod
-    def empty(cls, count: int) -> "Rows":
-        """Uninitialised rows."""
-        vectors, numbers = np.empty((2, count, 3)), np.empty((2, count))
-        return cls(np.empty(count, dtype=np.intp), *vectors, *numbers)
+    def none(cls, count: int) -> "Surfaces":
+        """No surface for any point."""
+        shape = (count, 3)
+        return cls(
+            np.zeros(count, dtype=np.int32), np.empty(shape), np.empty((*shape, 3)), np.empty(shape), np.empty(shape)
+        )
 
 
 @compiled
 def match_planes(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray, sensor: FloatArray,
-    found: Rows, begin: int,
-) -> tuple[int, int]:  # fmt: skip
-    """Write a correspondence, from row `begin` on, for every unmatched point (N, 3) whose cell has a plane.
+    found: Surfaces,
+) -> int:  # fmt: skip
+    """Write the surface of every unmatched point (N, 3) whose cell has a plane.
 
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
     without a plane are moved to the beginning of `unmatched`.
 
     Returns:
-        Numbers of correspondences and of unmatched points.
+        Number of points that are still unmatched.
     """
-    count, left = begin, 0
+    left = 0
     for w in range(len(unmatched)):
         n, row = unmatched[w], rows[w]
         if row >= 0:
@@ -62,28 +64,26 @@ def match_planes(
             faced, behind = is_steep(-along, distance), is_steep(along, distance)
             if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
-                _write(found, count, n, p[0:3], p[3], p[4], p[5], p[9], tilt)
-                count += 1
+                _write(found, n, p, p[3], p[4], p[5], p[9], tilt)
                 continue
         unmatched[left] = n
         left += 1
-    return count, left
+    return left
 
 
 @compiled
 def match_compact(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray,
-    T_world_lidar: FloatArray, largest_m: float, found: Rows, begin: int,
-) -> int:  # fmt: skip
-    """Write correspondences of unmatched points with the mean of a surfel that is no plane, along its short axes.
+    T_world_lidar: FloatArray, largest_m: float, found: Surfaces,
+) -> None:  # fmt: skip
+    """Write the surfaces of unmatched points whose surfel is no plane: across its short axes, through its mean.
 
     The mean of a surfel is a point on the object only where the object ends within it, not in grass. Across the rings a
     surfel is as short as its rings are close: these axes are left out, or the map would follow the sensor.
 
     `unmatched` (W,) has the indices of the points (N, 3), `rows` (N,) the cells of all points, or -1. Axes are short
-    below a standard deviation of `largest_m`. Returns the number of correspondences.
+    below a standard deviation of `largest_m`.
     """
-    count = begin
     sensor = T_world_lidar[:3, 3]
     ax, ay, az = T_world_lidar[0, 2], T_world_lidar[1, 2], T_world_lidar[2, 2]
     for n in unmatched:
@@ -104,9 +104,7 @@ def match_compact(
             u, v, w = _axis(p, axis)
             across_rings = abs(u * rx + v * ry + w * rz) / length
             if p[9 + axis] < largest_m and across_rings < _MOST_ACROSS:
-                _write(found, count, n, p[0:3], u, v, w, p[9 + axis], 0.0)
-                count += 1
-    return count
+                _write(found, n, p, u, v, w, p[9 + axis], 0.0)
 
 
 @compiled_part
@@ -121,11 +119,12 @@ def _axis(p: FloatArray, axis: int) -> tuple[float, float, float]:
 
 @compiled_part
 def _write(
-    found: Rows, row: int, n: int, point: FloatArray, u: float, v: float, w: float, thickness_m: float, tilt: float
+    found: Surfaces, n: int, surfel: FloatArray, u: float, v: float, w: float, thickness_m: float, tilt: float
 ) -> None:
-    found.number[row] = n
+    residual = found.counts[n]
     for axis in range(3):
-        found.points[row, axis] = point[axis]
-    found.normals[row, 0], found.normals[row, 1], found.normals[row, 2] = u, v, w
-    found.thickness_m[row] = thickness_m
-    found.tilt[row] = tilt
+        found.points[n, axis] = surfel[axis]
+    normal = found.normals[n, residual]
+    normal[0], normal[1], normal[2] = u, v, w
+    found.thickness_m[n, residual], found.tilt[n, residual] = thickness_m, tilt
+    found.counts[n] += 1

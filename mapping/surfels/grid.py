@@ -6,6 +6,7 @@ has grown; surfels overlap, so that no wall is cut at a cell's border. A plane s
 same place, its other side.
 """
 
+import math
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,15 +21,17 @@ from lidarslam.mapping.surfels.symmetric import SYMMETRIC
 from lidarslam.mapping.surfels.voxel_hash import ABSENT, Rows, VoxelHash, cell_keys, key_cells, point_keys
 
 # Columns of a cell's sums: number of points, first and second moments about the cell's centre in units of the cell,
-# first and second moment of the elevation, and the sum of the view directions.
+# first and second moment of the elevation, the sum of the view directions, and the link to the other side.
 _COUNT, _FIRST, _SECOND, _ELEVATION, _VIEW = 0, slice(1, 4), slice(4, 10), slice(10, 12), slice(12, 15)
-_COLUMNS = 15
+_SUMS, _SURFELS = 16, 15
 # Columns of surfels: mean in the world, unit axes of least (towards the sensor) and of largest extent, standard
 # deviations along the principal axes (ascending) and of the elevation (radians), weighted number of points, whether it
 # is a plane.
 MEAN, NORMAL, DIRECTION, SPREADS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 ELEVATION_SPREAD, COUNT, IS_PLANE = 12, 13, 14
 
+# Bytes that the processor fetches at a time.
+_CACHE_LINE = 64
 # Points that represent a cell in a grid of another size.
 _SAMPLES = 6
 # Stray cells have less than this share of the mean number of points in a cube of so many cells. They are looked for
@@ -43,8 +46,8 @@ class SurfelGrid(Stateful):
 
     cell_m: float
     _keys: NDArray[np.int64]
-    _sums: Annotated[NDArray[np.float32], Shape(None, _COLUMNS)]
-    _surfels: Annotated[FloatArray, Shape(None, _COLUMNS)]
+    _sums: Annotated[NDArray[np.float32], Shape(None, _SUMS)]
+    _surfels: Annotated[FloatArray, Shape(None, _SURFELS)]
     _surfel_counts: Annotated[NDArray[np.float32], Shape(None)]
     _tidied: int
 
@@ -52,9 +55,8 @@ class SurfelGrid(Stateful):
         self.cell_m = cell_m
         self._hash = VoxelHash()
         self._keys = np.zeros(0, dtype=np.int64)
-        self._others = np.zeros(0, dtype=np.int32)
-        self._sums = np.zeros((0, _COLUMNS), dtype=np.float32)
-        self._surfels = np.zeros((0, _COLUMNS))
+        self._sums = np.zeros((0, _SUMS), dtype=np.float32)
+        self._surfels = np.zeros((0, _SURFELS))
         self._surfel_counts = np.zeros(0, dtype=np.float32)  # points of the cell when its surfel was computed
         self._tidied = 0  # cells left at the last removal of strays
 
@@ -70,7 +72,8 @@ class SurfelGrid(Stateful):
         if not len(self._keys) == len(self._sums) == len(self._surfels) == len(self._surfel_counts):
             raise ValueError("the arrays of a surfel grid differ in length")
         self._hash = VoxelHash()
-        self._index()
+        self._resize(len(self._keys))
+        self._index(len(self._keys))
 
     def insert(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
         """Insert points (N, 3) of the world.
@@ -94,7 +97,7 @@ class SurfelGrid(Stateful):
             keys[turned] |= kernels.OTHER_SIDE
             rows[turned] = self._hash.insert(keys[turned])
             self._reserve(len(self))
-            kernels.link_sides(keys[turned], rows[turned], *self._hash.slots, self._others)
+            kernels.link_sides(keys[turned], rows[turned], *self._hash.slots, self._sums)
         seen = np.ascontiguousarray(elevations), views
         kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
 
@@ -185,37 +188,32 @@ class SurfelGrid(Stateful):
         """Keep the cells in these rows only."""
         if len(kept) == len(self):
             return
-        self._keys = self._keys[kept]
-        self._sums = self._sums[kept]
-        self._surfels = self._surfels[kept]
-        self._surfel_counts = self._surfel_counts[kept]
-        self._index()
+        for values in (self._keys, self._sums, self._surfels, self._surfel_counts):
+            values[: len(kept)] = values[kept]
+            values[len(kept) :] = 0  # new cells begin empty
+        self._index(len(kept))
 
-    def _index(self) -> None:
+    def _index(self, count: int) -> None:
         """Rebuild the hash and the links of sides; the other side of a cell without a first one becomes the first."""
-        self._hash.rebuild(self._keys)
-        others = np.flatnonzero(self._keys < 0)
-        first = self._keys[others] & kernels.FIRST_SIDE
+        keys = self._keys[:count]
+        self._hash.rebuild(keys)
+        others = np.flatnonzero(keys < 0)
+        first = keys[others] & kernels.FIRST_SIDE
         is_lone = self._hash.find(first) == ABSENT
         if is_lone.any():
-            self._keys[others[is_lone]] = first[is_lone]
-            self._hash.rebuild(self._keys)
-        self._others = np.full(len(self._keys), ABSENT, dtype=np.int32)
-        rows = np.arange(len(self._keys), dtype=np.int32)
-        kernels.link_sides(self._keys, rows, *self._hash.slots, self._others)
+            keys[others[is_lone]] = first[is_lone]
+            self._hash.rebuild(keys)
+        self._sums[:, kernels.OTHER] = 0.0
+        kernels.link_sides(keys, np.arange(count, dtype=np.int32), *self._hash.slots, self._sums)
 
     def _cells(self) -> kernels.Cells:
-        return kernels.Cells(self.cell_m, *self._hash.slots, self._keys, self._others, self._sums)
+        return kernels.Cells(self.cell_m, *self._hash.slots, self._keys, self._sums)
 
     def _reserve(self, count: int) -> None:
         if count > len(self._keys):
             self._resize(max(4096, 2 * count))
 
     def _resize(self, capacity: int) -> None:
-        others = np.full(capacity, ABSENT, dtype=np.int32)
-        count = min(capacity, len(self._others))
-        others[:count] = self._others[:count]
-        self._others = others
         self._keys = _resized(self._keys, capacity)
         self._sums = _resized(self._sums, capacity)
         self._surfels = _resized(self._surfels, capacity)
@@ -223,7 +221,11 @@ class SurfelGrid(Stateful):
 
 
 def _resized(values: NDArray[Any], capacity: int) -> NDArray[Any]:
-    """A copy with more rows, or fewer."""
-    out = np.zeros((capacity, *values.shape[1:]), dtype=values.dtype)
+    """A copy with more rows, or fewer; it begins with a cache line, so that few rows lie across two."""
+    shape = (capacity, *values.shape[1:])
+    size = math.prod(shape) * values.itemsize
+    room = np.zeros(size + _CACHE_LINE, dtype=np.uint8)
+    begin = -room.ctypes.data % _CACHE_LINE
+    out: NDArray[Any] = room[begin : begin + size].view(values.dtype).reshape(shape)
     out[: len(values)] = values[:capacity]
     return out

@@ -11,12 +11,14 @@ import numpy as np
 
 from lidarslam.core.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
-from lidarslam.mapping.least_squares.gauss_newton import geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, degenerate_directions
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
+from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
+from lidarslam.mapping.surfels.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
+from lidarslam.mapping.surfels.matching import Matcher
 from lidarslam.mapping.surfels.sampling import MIN_CORRESPONDENCES
-from lidarslam.mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
+from lidarslam.mapping.surfels.surfel_map import LEVELS, SurfelMap
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.
 _ITERATIONS, _PATIENT_ITERATIONS = (3, 20), (10, 40)
@@ -46,6 +48,7 @@ class Registration:
     covariance: FloatArray
     degeneracy: Degeneracy  # the directions along which the prediction was kept
     iterations: int  # of Gauss-Newton
+    matcher: Matcher  # with the correspondences of the keypoints in the finest cells
 
 
 def register(
@@ -63,18 +66,20 @@ def register(
         patient: whether to allow more iterations.
     """
     T_world_lidar, velocity, iterations = prediction.T_world_lidar, prediction.velocity, 0
+    times = sweep.times if with_velocity and sweep.times is not None else np.empty(0)
     coarse, most = _PATIENT_ITERATIONS if patient else _ITERATIONS
     try:
+        prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
-            cell_m = surfel_map.cell_m * LEVELS[level]
+            cell_m, matcher = surfel_map.cell_m * LEVELS[level], surfel_map.matcher(len(sweep), level)
             for _ in range(coarse if level else most - iterations):
                 points = sweep.compensated(velocity)
-                matches = surfel_map.match(transform_points(T_world_lidar, points), T_world_lidar, level)
-                if len(matches) < MIN_CORRESPONDENCES:
+                matcher.match(transform_points(T_world_lidar, points), T_world_lidar)
+                system = _System.of(points, times, T_world_lidar, matcher.surfaces, cell_m)
+                if system is None:
                     return None
-                system = _Linearised.at(T_world_lidar, points, matches, cell_m)
-                times = sweep.times.take(matches.index) if with_velocity and sweep.times is not None else None
-                solution = _solve(system, times, prediction, T_world_lidar, velocity)
+                away = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
+                solution = _solve(system, prior, np.concatenate([away, velocity - prediction.velocity]))
                 T_world_lidar = T_world_lidar @ exp(solution.step[:6])
                 velocity = velocity + solution.step[6:]
                 iterations += 1
@@ -83,7 +88,7 @@ def register(
         covariance = solution.covariance()
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
-    return Registration(orthonormalize(T_world_lidar), velocity, covariance, solution.degeneracy, iterations)
+    return Registration(orthonormalize(T_world_lidar), velocity, covariance, solution.degeneracy, iterations, matcher)
 
 
 def with_mean_velocity(
@@ -121,28 +126,39 @@ def _has_converged(step: FloatArray, level: int, cell_m: float, lever_m: float) 
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearised:
-    """Residuals (M,), their Jacobian (M, 6), information (M,) and tilt (M,) of the normals, at a pose."""
+class _System:
+    """Normal equations (12, 12) and (12,) of pose and velocity, and the directions that they leave open."""
 
-    residuals: FloatArray
-    jacobian: FloatArray
-    weights: FloatArray
-    tilt: FloatArray
-    lever_m: float
+    hessian: FloatArray
+    gradient: FloatArray
+    degeneracy: Degeneracy
+    squared_time: float  # mean square of the residuals' times
+
+    @property
+    def lever_m(self) -> float:
+        return self.degeneracy.lever_m
 
     @classmethod
-    def at(
-        cls, T_world_lidar: FloatArray, points: FloatArray, matches: Correspondences, cell_m: float
-    ) -> "_Linearised":
-        p = points.take(matches.index, axis=0)
-        residuals = matches.residuals(transform_points(T_world_lidar, p))
-        jacobian = point_to_plane_jacobian(p, matches.normals @ T_world_lidar[:3, :3])
-        size, thickness2 = np.abs(residuals), matches.thickness_m**2
-        scale = max(_SCALE_PER_MEDIAN * float(np.median(size)), _LEAST_SCALE * cell_m)
-        weights = geman_mcclure(size, scale**2 + thickness2, thickness2 + _RANGE_NOISE_M**2)
-        weights[size > _GATE * cell_m] = 0.0
-        lever_m = float(np.sqrt(np.einsum("ij,ij->", p, p) / max(len(p), 1)))
-        return cls(residuals, jacobian, weights, matches.tilt, lever_m)
+    def of(
+        cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, cell_m: float
+    ) -> "_System | None":
+        """Of points (N, 3) with times (N,), or none to keep the velocity; None where too few have a surface.
+
+        The Jacobian with the velocity is `t` times that with the pose, to first order.
+        """
+        rows = np.empty((3 * len(points), COLUMNS))
+        count, squared = linearise(points, times, np.ascontiguousarray(T_world_lidar), surfaces, rows)
+        if count < MIN_CORRESPONDENCES:
+            return None
+        rows, total = rows[:count], np.zeros((13, 13))
+        scale = max(_SCALE_PER_MEDIAN * float(np.median(np.abs(rows[:, RESIDUAL]))), _LEAST_SCALE * cell_m)
+        weights, squared_tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, total)
+        lever_m = float(np.sqrt(squared / count))
+        if weights > 0.0:
+            degeneracy = degenerate_directions(total[:6, :6] / weights, squared_tilt, lever_m)
+        else:
+            degeneracy = Degeneracy(np.eye(6), lever_m)
+        return cls(total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION, degeneracy, squared_time)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,28 +178,10 @@ class _Solution:
         return np.asarray(np.linalg.inv(observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
 
 
-def _solve(
-    system: _Linearised, times: FloatArray | None, prediction: Prediction, T_world_lidar: FloatArray,
-    velocity: FloatArray,
-) -> _Solution:  # fmt: skip
-    """One Gauss-Newton step of pose and, where `times` (M,) are given, velocity.
-
-    The Jacobian with the velocity is `t` times that with the pose, to first order.
-    """
-    J, r = system.jacobian, system.residuals
-    degeneracy = find_degeneracy(J, system.weights, system.tilt, system.lever_m)
-    held = DEGENERATE_INFORMATION * degeneracy.projector()
-    prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
-    error = np.concatenate([log(inverse(prediction.T_world_lidar) @ T_world_lidar), velocity - prediction.velocity])
-    JW = J * (system.weights / _CORRELATION)[:, None]
-    hessian, holding, b = np.zeros((12, 12)), np.zeros((12, 12)), -prior @ error
-    hessian[:6, :6], holding[:6, :6] = JW.T @ J, held
-    b[:6] -= JW.T @ r + held @ error[:6]
-    if times is not None:
-        Jt, JWt = J * times[:, None], JW * times[:, None]
-        hessian[:6, 6:] = JW.T @ Jt
-        hessian[6:, :6] = hessian[:6, 6:].T
-        hessian[6:, 6:], holding[6:, 6:] = JWt.T @ Jt, held * float(np.mean(times**2))
-        b[6:] -= JWt.T @ r + holding[6:, 6:] @ error[6:]
-    step: FloatArray = np.asarray(np.linalg.solve(hessian + prior + holding, b), dtype=np.float64)
-    return _Solution(step, hessian, prior, degeneracy)
+def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
+    """One Gauss-Newton step with a prior's information (12, 12), at an error (12,) of the present state from it."""
+    held, holding = DEGENERATE_INFORMATION * system.degeneracy.projector(), np.zeros((12, 12))
+    holding[:6, :6], holding[6:, 6:] = held, held * system.squared_time
+    b = -(prior + holding) @ error - system.gradient
+    step: FloatArray = np.asarray(np.linalg.solve(system.hessian + prior + holding, b), dtype=np.float64)
+    return _Solution(step, system.hessian, prior, system.degeneracy)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import Cells
+from lidarslam.mapping.surfels.cell_kernels import ABSENT, Cells, other_side
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one
 
 # Least squared cosine between the view of a point and those of its cell for one side.
@@ -31,7 +31,7 @@ def belong_to_others(
     for n in range(len(rows)):
         row, chosen[n] = rows[n], False
         x, y, z = float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
-        other = cells.others[row]
+        other = other_side(row, cells.sums)
         if other >= 0:
             if outdated(row, cells.sums, counts):
                 refresh_one(row, cells, surfels, counts, scratch)
@@ -61,9 +61,9 @@ def turn_to_sensor(
     scratch = np.empty(15), np.empty(6), np.empty(3)
     for n in range(len(rows)):
         row = rows[n]
-        if row < 0 or cells.others[row] < 0:
+        other = other_side(row, cells.sums) if row >= 0 else ABSENT
+        if other == ABSENT:
             continue
-        other = cells.others[row]
         if outdated(row, cells.sums, counts):
             refresh_one(row, cells, surfels, counts, scratch)
         if outdated(other, cells.sums, counts):

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import Cells, find_one, middle_of, neighbour_key
+from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, find_one, middle_of, neighbour_key, other_side
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # A surfel is computed again when its cell has grown by this factor.
-_GROWTH = np.float32(1.3)
-# Weight of a neighbouring cell's points, by the number of coordinates in which it differs.
-_NEIGHBOUR_WEIGHTS = (1.0, 0.8, 0.6, 0.4)
+_GROWTH = np.float32(1.6)
+# By how much less a neighbouring cell's points weigh, for each coordinate in which it differs.
+_LESS_PER_AXIS = 0.2
 # Fewer points make no plane.
 _FEWEST_POINTS = 6
 # Sine of the least angle to a plane at which one of its sides is seen.
@@ -89,26 +89,48 @@ def _gather(row: int, cells: Cells, total: FloatArray) -> None:
 
     Neighbours seen from the other side are another surface: a thin wall has two.
     """
-    total[:] = 0.0
-    own = cells.sums[row]
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                key = neighbour_key(cells.keys[row], i, j, k)
-                other = find_one(key, cells.bits, cells.table_keys, cells.table_rows)
+    own, key = cells.sums[row], cells.keys[row]
+    # Sums in variables of their own stay in registers.
+    n = x = y = z = xx = xy = xz = yy = yz = zz = elevation = squared = u = v = w = 0.0
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            for c in range(-1, 2):
+                other = find_one(neighbour_key(key, a, b, c), cells.bits, cells.table_keys, cells.table_rows)
                 if other < 0:
                     continue
-                if cells.others[other] >= 0:
-                    other = row if i == j == k == 0 else _same_side(own, other, cells)
-                sums = cells.sums[other]
-                if own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14] >= 0.0:
-                    _add_shifted(sums, i, j, k, total)
+                if cells.sums[other, OTHER] > 0.0:
+                    other = row if a == b == c == 0 else _same_side(own, other, cells)
+                s = cells.sums[other]
+                if own[12] * s[12] + own[13] * s[13] + own[14] * s[14] < 0.0:
+                    continue
+                weight = 1.0 - _LESS_PER_AXIS * (abs(a) + abs(b) + abs(c))
+                i, j, k = float(a), float(b), float(c)
+                # Moments about the centre of the neighbour, then about the own centre.
+                m, p, q, r = weight * s[0], weight * s[1], weight * s[2], weight * s[3]
+                n += m
+                x += p + i * m
+                y += q + j * m
+                z += r + k * m
+                xx += weight * s[4] + i * (2.0 * p + i * m)
+                xy += weight * s[5] + i * q + j * (p + i * m)
+                xz += weight * s[6] + i * r + k * (p + i * m)
+                yy += weight * s[7] + j * (2.0 * q + j * m)
+                yz += weight * s[8] + j * r + k * (q + j * m)
+                zz += weight * s[9] + k * (2.0 * r + k * m)
+                elevation += weight * s[10]
+                squared += weight * s[11]
+                u += weight * s[12]
+                v += weight * s[13]
+                w += weight * s[14]
+    total[0], total[1], total[2], total[3] = n, x, y, z
+    total[4], total[5], total[6], total[7], total[8], total[9] = xx, xy, xz, yy, yz, zz
+    total[10], total[11], total[12], total[13], total[14] = elevation, squared, u, v, w
 
 
 @compiled_part
 def _same_side(own: NDArray[np.float32], row: int, cells: Cells) -> int:
     """The row of that side of a cell whose view direction is nearer to that of the sums (15,)."""
-    other = cells.others[row]
+    other = other_side(row, cells.sums)
     if _view_cosine(own, cells.sums[other]) > _view_cosine(own, cells.sums[row]):
         return int(other)
     return row
@@ -119,23 +141,3 @@ def _view_cosine(own: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
     """Cosine between the view directions of two cells, times the length of the first."""
     length = math.sqrt(sums[12] * sums[12] + sums[13] * sums[13] + sums[14] * sums[14])
     return float((own[12] * sums[12] + own[13] * sums[13] + own[14] * sums[14]) / max(length, 1e-9))
-
-
-@compiled_part
-def _add_shifted(sums: NDArray[np.float32], i: int, j: int, k: int, total: FloatArray) -> None:
-    """Add moments about the centre of a cell at an offset of (i, j, k) cells to moments about the own centre."""
-    weight = _NEIGHBOUR_WEIGHTS[abs(i) + abs(j) + abs(k)]
-    n, x, y, z = np.float64(sums[0]), np.float64(sums[1]), np.float64(sums[2]), np.float64(sums[3])
-    total[0] += weight * n
-    total[1] += weight * (x + i * n)
-    total[2] += weight * (y + j * n)
-    total[3] += weight * (z + k * n)
-    total[4] += weight * (sums[4] + 2 * i * x + i * i * n)
-    total[5] += weight * (sums[5] + i * y + j * x + i * j * n)
-    total[6] += weight * (sums[6] + i * z + k * x + i * k * n)
-    total[7] += weight * (sums[7] + 2 * j * y + j * j * n)
-    total[8] += weight * (sums[8] + j * z + k * y + j * k * n)
-    total[9] += weight * (sums[9] + 2 * k * z + k * k * n)
-    total[10] += weight * sums[10]
-    for column in range(11, 15):
-        total[column] += weight * sums[column]

@@ -1,6 +1,5 @@
 """Local map of surfels in three sizes of cells, and the point-to-plane correspondences of a scan with it."""
 
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -9,15 +8,13 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.surfels.cell_kernels import write_views
-from lidarslam.mapping.surfels.correspondence_kernels import Rows, match_compact, match_planes
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.matching import Correspondences, Matcher
 
 # Sizes of the grids, in cells. A point's correspondence is the plane of the finest grid that has one.
 LEVELS = (1, 2, 4)
-# Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
-_COMPACT = 0.5
 # Cells beyond the radius are dropped each time the sensor has moved by this share of it.
-_FORGET_AFTER = 0.1
+_FORGET_AFTER = 0.2
 # Scans between two removals of stray cells.
 _TIDIED_AFTER = 500
 # Surfaces within this cosine of the z axis are floors or ceilings.
@@ -26,31 +23,6 @@ _LEVEL_COSINE = 0.7
 _ANY_HEIGHT_RAD = 0.2
 # A direction that few walls are parallel to.
 _UNEVEN = np.array([0.46, 0.29, 0.84])
-
-
-@dataclass(frozen=True, eq=False)
-class Correspondences:
-    """M residuals of points with surfaces, each along one direction."""
-
-    index: NDArray[np.intp]  # (M,) of the point
-    points: FloatArray  # (M, 3) on the surface, in the world
-    normals: FloatArray  # (M, 3) unit, in the world
-    thickness_m: FloatArray  # (M,) standard deviation of the surface along the normal
-    tilt: FloatArray  # (M,) standard deviation of the normal, radians
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def residuals(self, world: FloatArray) -> FloatArray:
-        """Signed distances (M,) of the matched points, at (M, 3) of the world, from their surfaces."""
-        return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
-
-    def first_of_each_point(self) -> "Correspondences":
-        """One residual for each point, the one across its surface."""
-        index, first = np.unique(self.index, return_index=True)
-        return Correspondences(
-            index, self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first]
-        )
 
 
 class SurfelMap(Stateful):
@@ -127,22 +99,13 @@ class SurfelMap(Stateful):
             T_world_lidar: pose of the sensor.
             level: finest grid that is used, for points that may be off by more than a cell.
         """
-        points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
-        sensor, unmatched = np.array(T[:3, 3]), np.arange(len(points))
-        found, count, finest = Rows.empty(3 * len(points)), 0, None
-        for grid in self._grids[level:]:
-            rows = grid.find(points.take(unmatched, axis=0), sensor)
-            surfels = grid.refreshed(rows)
-            finest = finest or (rows, surfels)
-            count, left = match_planes(points, unmatched, rows, surfels, sensor, found, count)
-            unmatched = unmatched[:left]
-        assert finest is not None
-        largest_m = _COMPACT * self._grids[level].cell_m
-        count = match_compact(points, unmatched, *finest, T, largest_m, found, count)
-        return Correspondences(
-            found.number[:count], found.points[:count], found.normals[:count], found.thickness_m[:count],
-            found.tilt[:count],
-        )  # fmt: skip
+        matcher = self.matcher(len(points), level)
+        matcher.match(points, T_world_lidar)
+        return matcher.correspondences()
+
+    def matcher(self, count: int, level: int = 0) -> Matcher:
+        """Correspondences of so many points, as of `match`, at one pose after another; until the map changes."""
+        return Matcher(self._grids[level:], count)
 
     def vertical(self) -> FloatArray:
         """Unit normal (3,) of floors and ceilings near the sensor; the world's z axis when there are none."""

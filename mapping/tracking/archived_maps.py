@@ -1,11 +1,12 @@
 """Archived maps: maps that tracking was lost in, searched now and then for the sensor's return."""
 
 from lidarslam.core.state.stateful import Stateful
-from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempts import Attempt, ScanMatcher
+from lidarslam.mapping.tracking.attempt import Attempt
+from lidarslam.mapping.tracking.attempts import ScanMatcher
+from lidarslam.mapping.tracking.budget import Budget, Steps
+from lidarslam.mapping.tracking.spread_search import SpreadSearch
 
 # A map of fewer scans is not worth a search.
 _LEAST_SCANS = 5
@@ -24,6 +25,7 @@ class ArchivedMaps(Stateful):
         self._maps = []
         self._scans_until_search = 0
         self._wait = float(_FIRST_WAIT)
+        self._search = SpreadSearch()
 
     def __len__(self) -> int:
         return len(self._maps)
@@ -35,22 +37,28 @@ class ArchivedMaps(Stateful):
         self._maps = [*self._maps[:1], surfel_map]
         self._wait = float(_FIRST_WAIT)
         self._scans_until_search = _FIRST_WAIT
+        self._search.drop()
 
-    def relocalise(
-        self, scan: SampledScan, prediction: Prediction, last: MotionState, config: MappingConfig
-    ) -> Attempt | None:
-        """Relocalise a scan in the archived maps, the latest first; None when no search is due, or it fits none.
+    def relocalise(self, matcher: ScanMatcher, prediction: Prediction, budget: Budget) -> Attempt | None:
+        """Relocalise a scan in the archived maps, the latest first; None when no search is due, or it finds none.
 
         The map and all archived after it leave the archive.
         """
         self._scans_until_search -= 1
-        if not self._maps or self._scans_until_search > 0:
-            return None
-        self._wait = min(self._wait * _WAIT_GROWTH, _LONGEST_WAIT)
-        self._scans_until_search = round(self._wait)
+        if not self._search.is_under_way:
+            if not self._maps or self._scans_until_search > 0:
+                return None
+            self._wait = min(self._wait * _WAIT_GROWTH, _LONGEST_WAIT)
+            self._scans_until_search = round(self._wait)
+            self._search.begin(self._searching(matcher, prediction), prediction)
+        attempt = self._search.go_on(matcher, prediction, budget)
+        if attempt is not None:
+            self._maps = self._maps[: self._maps.index(attempt.surfel_map)]
+        return attempt
+
+    def _searching(self, matcher: ScanMatcher, prediction: Prediction) -> Steps[Attempt | None]:
         for surfel_map in reversed(self._maps):
-            attempt = ScanMatcher(scan, last, surfel_map, config).search_map(prediction)
+            attempt = yield from matcher.on(surfel_map).search_map(prediction)
             if attempt is not None:
-                self._maps = self._maps[: self._maps.index(surfel_map)]
                 return attempt
         return None

@@ -13,6 +13,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from lidarslam.core.geometry import FloatArray, make_transform, skew
 from lidarslam.core.thinning import one_per_cell
+from lidarslam.mapping.tracking.budget import Steps
 
 _YAWS = 72
 # Correlation peaks that are kept for each yaw as a rule, and their least distance, in cells and radians.
@@ -26,6 +27,8 @@ _HEIGHT_BINS = 2  # of a cell's edge
 _FREE_WEIGHT = 0.25
 _ALONG_RAYS = np.linspace(0.1, 0.85, 12)
 _LEVEL_SINE = 0.2
+# Spacing of the positions in free space that are drawn, in cells.
+_FREE_SPACING = 0.4
 # Largest extent of the map's image, in cells to either side of the middle.
 _MOST_CELLS = 512
 
@@ -53,7 +56,7 @@ class BirdsEyeMap:
 
     def find(
         self, points: FloatArray, T_world_lidar: FloatArray, reach_m: float, most: int, peaks_per_yaw: int = _PEAKS
-    ) -> FloatArray:
+    ) -> Steps[FloatArray]:
         """Poses (K, 4, 4) of a scan by descending correlation, with the roll and pitch of a given pose.
 
         Args:
@@ -66,22 +69,31 @@ class BirdsEyeMap:
         level = points @ (self.R_level_world @ T_world_lidar[:3, :3]).T
         level = level[np.einsum("ij,ij->i", level[:, :2], level[:, :2]) < reach_m**2]
         level = level[one_per_cell(level, self.cell_m / _HEIGHT_BINS)]
-        size = next_fast_len(max(self.columns.shape) + 2 * int(np.ceil(reach_m / self.cell_m)) + 2, real=True)
-        spectrum = rfft2(self.columns, s=(size, size))
+        free = _free_space(level, self.cell_m)
+        beyond = 2 * int(np.ceil(reach_m / self.cell_m)) + 2
+        size = tuple(next_fast_len(cells + beyond, real=True) for cells in self.columns.shape)
+        spectrum = rfft2(self.columns.astype(np.float32), s=size)
         peaks = []
         for yaw in np.arange(_YAWS) * (2.0 * np.pi / _YAWS):
+            yield
             c, s = np.cos(yaw), np.sin(yaw)
-            image = _image(level @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), reach_m, self.cell_m)
+            turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            image = _image(level @ turn, free @ turn[:2, :2], reach_m, self.cell_m)
             norm = float(np.linalg.norm(image))
             if norm == 0.0:
                 return np.empty((0, 4, 4))
-            correlation = irfft2(spectrum * np.conj(rfft2(image, s=(size, size))), s=(size, size)) / norm
+            product = spectrum * np.conj(rfft2(image, s=size))
+            correlation = np.asarray(irfft2(product, s=size) / norm, dtype=np.float32)
             peaks += [
                 (score, yaw, self._position(shift, size, reach_m))
                 for score, shift in _peaks(correlation, peaks_per_yaw)
             ]
         chosen = _apart(sorted(peaks, key=lambda peak: -peak[0]), _APART * self.cell_m, most)
-        return np.array([self.pose_at(yaw, xy, level, T_world_lidar, reach_m) for yaw, xy in chosen]).reshape(-1, 4, 4)
+        poses = []
+        for yaw, xy in chosen:
+            yield
+            poses.append(self.pose_at(yaw, xy, level, T_world_lidar, reach_m))
+        return np.array(poses).reshape(-1, 4, 4)
 
     def distance_m(self, x: float, y: float) -> float:
         """Distance of a position, levelled, from the nearest point."""
@@ -89,9 +101,9 @@ class BirdsEyeMap:
             return np.inf
         return float(np.linalg.norm(self.points[:, :2] - [x, y], axis=1).min())
 
-    def _position(self, shift: NDArray[np.intp], size: int, reach_m: float) -> FloatArray:
+    def _position(self, shift: NDArray[np.intp], size: tuple[int, ...], reach_m: float) -> FloatArray:
         """Position (2,) of the sensor for a shift (2,) of its image, in cells modulo the size."""
-        shift = np.where(shift < max(self.columns.shape), shift, shift - size)
+        shift = np.where(shift < self.columns.shape, shift, shift - size)
         return np.asarray(self.corner + self.cell_m * shift + reach_m, dtype=np.float64)
 
     def pose_at(
@@ -103,8 +115,9 @@ class BirdsEyeMap:
         """
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        around = self.points[np.einsum("ij,ij->i", self.points[:, :2] - xy, self.points[:, :2] - xy) < reach_m**2]
-        z = height_shift(around[:, 2], level[:, 2], self.cell_m / _HEIGHT_BINS)
+        away = self.points[:, :2] - xy
+        around = self.points[np.einsum("ij,ij->i", away, away) < reach_m**2, 2]
+        z = height_shift(around, level[:, 2], self.cell_m / _HEIGHT_BINS)
         R = self.R_level_world.T @ turn @ self.R_level_world @ T_world_lidar[:3, :3]
         return make_transform(R, self.R_level_world.T @ np.array([*xy, z]))
 
@@ -127,32 +140,39 @@ def _columns(level: FloatArray, corner: FloatArray, cell_m: float) -> FloatArray
     return np.asarray(np.sqrt(np.clip(counts - _FLAT, 0.0, _TALL)), dtype=np.float64)
 
 
-def _image(level: FloatArray, reach_m: float, cell_m: float) -> FloatArray:
-    """Image of a scan (N, 3) around the sensor: columns, negative where rays passed through."""
+def _free_space(level: FloatArray, cell_m: float) -> FloatArray:
+    """Positions (K, 2) that the nearly level rays of a scan (N, 3) passed through, some in each cell."""
+    ranges = np.linalg.norm(level, axis=1)
+    flat = level[np.abs(level[:, 2]) < _LEVEL_SINE * ranges]
+    through = (flat[:, None] * _ALONG_RAYS[:, None]).reshape(-1, 3)
+    through[:, 2] = 0.0
+    kept: FloatArray = through[one_per_cell(through, _FREE_SPACING * cell_m), :2]
+    return kept
+
+
+def _image(level: FloatArray, free: FloatArray, reach_m: float, cell_m: float) -> NDArray[np.float32]:
+    """Image of a scan (N, 3) around the sensor: columns, negative in free space (K, 2)."""
     corner = np.array([-reach_m, -reach_m])
     side = 2 * int(np.ceil(reach_m / cell_m)) + 1
     occupied = _columns(level, corner, cell_m)
-    image = np.zeros((side, side))
+    image = np.zeros((side, side), dtype=np.float32)
     image[: occupied.shape[0], : occupied.shape[1]] = occupied
-    ranges = np.linalg.norm(level, axis=1)
-    flat = level[np.abs(level[:, 2]) < _LEVEL_SINE * ranges, :2]
-    through = (flat[:, None] * _ALONG_RAYS[:, None]).reshape(-1, 2)
-    cells = np.floor((through - corner) / cell_m).astype(np.intp)
+    cells = np.floor((free - corner) / cell_m).astype(np.intp)
     seen = np.zeros_like(image, dtype=np.bool_)
     seen[cells[:, 0], cells[:, 1]] = True
     image[seen & (image == 0.0)] = -_FREE_WEIGHT * float(image.max(initial=0.0))
     return image
 
 
-def _peaks(correlation: FloatArray, count: int) -> list[tuple[float, NDArray[np.intp]]]:
+def _peaks(correlation: NDArray[np.float32], count: int) -> list[tuple[float, NDArray[np.intp]]]:
     """The highest few values that are apart, each with its cell (2,)."""
     found = []
-    size, reach = len(correlation), int(_APART)
+    (wide, deep), reach = correlation.shape, int(_APART)
     around = np.arange(-reach, reach + 1)
     for _ in range(count):
         i, j = np.unravel_index(int(correlation.argmax()), correlation.shape)
         found.append((float(correlation[i, j]), np.array([i, j], dtype=np.intp)))
-        correlation[np.ix_((i + around) % size, (j + around) % size)] = -np.inf
+        correlation[np.ix_((i + around) % wide, (j + around) % deep)] = -np.inf
     return found
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
-from lidarslam.mapping.tracking.attempts import Attempt
+from lidarslam.mapping.tracking.attempt import Attempt
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 # At the end of the messages of scans that are degraded for no other reason.

@@ -5,6 +5,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, transform_points
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.surfels.surfel_map import LEVELS, SurfelMap
+from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.fit import translation_information
 
 # Points that score a start, and starts that are registered.
@@ -28,10 +29,13 @@ def turned_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float)
     return turned
 
 
-def best_starts(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> FloatArray:
+def best_starts(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> Steps[FloatArray]:
     """The few of the poses (K, 4, 4) at which compensated points (N, 3) of the LiDAR frame are nearest to the map."""
     few = points[:: max(1, len(points) // _SCORED_POINTS)]
-    scores = [start_score(few, start, surfel_map) for start in starts]
+    scores = []
+    for start in starts:
+        scores.append(start_score(few, start, surfel_map))
+        yield
     return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
 
 
@@ -46,17 +50,23 @@ def positions_around(T_world_lidar: FloatArray, up: FloatArray, radius_m: float,
     return moved
 
 
-def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> FloatArray:
+def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> Steps[FloatArray]:
     """The few of neighbouring poses (K, 4, 4) with the best directional support of compensated points (N, 3).
 
     Directions of translation have equal weight, however few points constrain them: `tr(A^-1 B)` with A the mean over
     the poses of the sums of `n n^T` over the matched points, and B the sum with inlier weights.
     """
     few = points[:: max(1, len(points) // _SCORED_POINTS)]
-    information, supported = zip(*(_information(few, start, surfel_map) for start in starts), strict=True)
+    # Rotations that are equal, as without an odometry, make every pose come twice.
+    distinct, inverse = np.unique(starts.reshape(-1, 16), axis=0, return_inverse=True)
+    sums = []
+    for start in distinct.reshape(-1, 4, 4):
+        sums.append(_information(few, start, surfel_map))
+        yield
+    information, supported = (np.array(parts)[inverse.reshape(-1)] for parts in zip(*sums, strict=True))
     mean = np.mean(information, axis=0)
     scale = np.linalg.inv(mean + _RIDGE * max(float(np.trace(mean)), 1e-9) * np.eye(3))
-    scores = np.einsum("ij,kji->k", scale, np.array(supported))
+    scores = np.einsum("ij,kji->k", scale, supported)
     return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
 
 

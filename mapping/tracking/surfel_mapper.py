@@ -5,6 +5,8 @@ inserted into the map. `mapping.tracking` has the cases in which the registratio
 """
 
 import logging
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -19,6 +21,7 @@ from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.tracker import Tracker
@@ -28,6 +31,7 @@ logger = logging.getLogger(__name__)
 # Insertions of the first sweep anew, with the motion that the second one showed.
 _REDRAWS = 2
 _AMBIGUOUS = "ambiguous: it may fit elsewhere in the map as well"
+_SEARCHING = "the search for its place goes on with the next scan"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +48,8 @@ class SurfelMapper(Stateful):
     """Holds the local map and the state of the last scan.
 
     Args:
-        config: of the registration.
+        config: of the mapping.
+        clock: seconds, for the budget of a scan.
         kept_scans: how many of the latest scans are kept, for `redraw`.
     """
 
@@ -57,12 +62,15 @@ class SurfelMapper(Stateful):
     _map_since: int  # number of scans before the present map began, or came back from the archive
     _recent: list[Insertion]
 
-    def __init__(self, config: MappingConfig, kept_scans: int = 0) -> None:
+    def __init__(
+        self, config: MappingConfig, clock: Callable[[], float] = time.perf_counter, kept_scans: int = 0
+    ) -> None:
         self._config = config
-        self._kept_scans = kept_scans
+        self.kept_scans = kept_scans
         self._scans, self._map_since, self._recent = 0, 0, []
+        self._budget = Budget(config.budget_ms, clock)
         self._sampler = Sampler(config)
-        self._tracker = Tracker(config)
+        self._tracker = Tracker(config, self._budget)
         self._map = None
         self._last = None
         self._first = None  # while it alone is the map, drawn with a guessed motion
@@ -79,6 +87,7 @@ class SurfelMapper(Stateful):
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
+        self._budget.begin(np.inf if self._last is None else scan.stamp - self._last.stamp)
         return self.process_sampled(self._sampler.sample(scan), prior)
 
     def process_sampled(self, scan: SampledScan, prior: Prior) -> MappedScan:
@@ -107,6 +116,7 @@ class SurfelMapper(Stateful):
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
+            reason = _SEARCHING if self._tracker.is_searching else reason
             return self._lose(scan, attempt.prediction, surfel_map, attempt.fit, reason)
         # Judge the pose by its fit, and adapt the noise of process and odometry.
         mapped = self._tracker.accept(attempt, scan, prior, prediction, last)
@@ -122,9 +132,9 @@ class SurfelMapper(Stateful):
         """Replace the local map by one drawn anew without the latest scans, so many, which are inserted.
 
         Returns:
-            False where another map has begun since, and stays.
+            False where another map has begun since, or a search of the map is under way: the map stays.
         """
-        if self._map is None or self._map_since > self._scans - scans:
+        if self._map is None or self._tracker.is_searching or self._map_since > self._scans - scans:
             return False
         missing = [insertion for insertion in self._recent if insertion.number > self._scans - scans]
         drawn.scans = self._map.scans - len(missing)
@@ -191,8 +201,8 @@ class SurfelMapper(Stateful):
         """Insert a scan, compensated, at its pose."""
         points = transform_points(state.T_world_lidar, scan.sweep.compensated(state.velocity))
         surfel_map.insert(points, scan.elevations, state.T_world_lidar[:3, 3])
-        recent = [one for one in self._recent if one.number > self._scans - self._kept_scans]
-        if self._kept_scans:
+        recent = [one for one in self._recent if one.number > self._scans - self.kept_scans]
+        if self.kept_scans:
             recent.append(Insertion(self._scans, points, scan.elevations, state.T_world_lidar[:3, 3]))
         self._recent = recent
 

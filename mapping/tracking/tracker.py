@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, displacement_m, inverse
+from lidarslam.core.geometry import displacement_m, inverse
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import (
     LARGEST_PROCESS_NOISE,
     LOST_MOTION,
@@ -24,9 +23,12 @@ from lidarslam.mapping.motion.prediction import (
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.archived_maps import ArchivedMaps
-from lidarslam.mapping.tracking.attempts import Attempt, ScanMatcher, best_of
+from lidarslam.mapping.tracking.attempt import Attempt, best_of
+from lidarslam.mapping.tracking.attempts import ScanMatcher
+from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.pose_status import judge
+from lidarslam.mapping.tracking.spread_search import SpreadSearch
 from lidarslam.mapping.tracking.tracking_state import TrackingState
 
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
@@ -46,8 +48,12 @@ class Tracker(Stateful):
     _odometry_noise: OdometryNoise
     _prediction_error_m: float
 
-    def __init__(self, config: MappingConfig) -> None:
+    def __init__(self, config: MappingConfig, budget: Budget | None = None) -> None:
         self._config = config
+        self._budget = budget or Budget()
+        self._search = SpreadSearch()
+        self._map_is_due = False  # whether the next search is one of the whole map
+        self._in_vain = False  # whether the last scan ended a search that found nothing
         self._state = TrackingState()
         self._archive = ArchivedMaps()
         self._process_noise = ProcessNoise()
@@ -58,6 +64,11 @@ class Tracker(Stateful):
     def is_unconfirmed(self) -> bool:
         """Whether the sensor was relocalised, and the next scans have not confirmed it yet."""
         return self._state.is_unconfirmed
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether a search is under way that goes on with the next scan."""
+        return self._search.is_under_way
 
     def begin_at(self, stamp: float, quality: float) -> None:
         """Begin with a scan whose pose was found and whose velocity is known; the next scans must confirm it."""
@@ -76,21 +87,28 @@ class Tracker(Stateful):
         self, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState, surfel_map: SurfelMap
     ) -> Attempt:
         """Register a scan near its prediction, else relocalise it; the status is lost where neither is reliable."""
-        matcher = ScanMatcher(scan, last, surfel_map, self._config)
+        matcher = ScanMatcher(scan, last, surfel_map, self._config, self._budget)
+        if self._state.is_lost and self.is_searching:  # which has all the time of a lost scan
+            found = self._found(matcher, prediction)
+            self._in_vain = found is None and not self.is_searching
+            return found or matcher.none(prediction)
         uncertain = self._state.is_uncertain(scan.stamp - last.stamp)
         near = matcher.register(prediction, self._begins_coarse(scan))
-        if not uncertain:
+        if not (uncertain or self._budget.is_spent):
             near = self._improve(matcher, prior, prediction, near)
         unconfirmed = self._state.is_unconfirmed
         if near.status is Status.LOST or ((uncertain or unconfirmed) and not near.is_reliable):
             best = self._relocalise(matcher, near)
         elif near.status is Status.DEGRADED and self._state.searches_nearby:
-            best = best_of(filter(None, (near, matcher.search_yaw(near.prediction))))
+            best = best_of(filter(None, (near, self._found(matcher, near.prediction, nearby=True))))
         elif near.status is Status.OK and not unconfirmed:
-            best = self._archive.relocalise(scan, near.prediction, last, self._config) or near
+            best = self._archive.relocalise(matcher, near.prediction, self._budget) or near
         else:
             best = near
-        rejected = best is near and unconfirmed and self._contradicts_motion(near, prior, last)
+        # After a relocalisation an improbable motion contradicts that.
+        motion = inverse(last.T_world_lidar) @ near.T_world_lidar
+        improbable = near.has_jumped or self._odometry_noise.rejects(prior, motion, self._config)
+        rejected = best is near and unconfirmed and improbable
         return replace(near, status=Status.LOST) if best is None or rejected else best
 
     def accept(
@@ -100,6 +118,8 @@ class Tracker(Stateful):
         registration, interval_s, jumped = attempt.registration, scan.stamp - last.stamp, attempt.has_jumped
         assert registration is not None
         self._state.registered(attempt.status, attempt.relocalised, attempt.quality, scan.stamp)
+        if attempt.status is Status.OK or attempt.relocalised:
+            self._end_search()
         if not attempt.relocalised:
             self._update_noise(attempt, prior, last, interval_s)
         error_m = displacement_m(attempt.correction, scan.range_m)
@@ -110,7 +130,8 @@ class Tracker(Stateful):
             covariance = registration.covariance
             state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
         else:
-            state = MotionState(scan.stamp, T_world_lidar, self._uncertain_velocity(attempt, scan, last), LOST_MOTION)
+            velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
+            state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
@@ -131,6 +152,7 @@ class Tracker(Stateful):
         if not self.loses(has_points):
             return False
         self._archive.add(surfel_map)
+        self._end_search()
         self._state.map_restarted()
         return True
 
@@ -138,7 +160,7 @@ class Tracker(Stateful):
         """Update with a scan that was not registered; true after so many that the map is to be given up."""
         self._prediction_error_m = _UNKNOWN_ERROR_M
         self._state.lost(has_points)
-        return has_points and self._state.gives_up
+        return has_points and self._state.gives_up and not self.is_searching
 
     def snapshot(self) -> "Tracker":
         """A copy to `rewind` to."""
@@ -150,6 +172,7 @@ class Tracker(Stateful):
         """Take the last registration back, but for the observed error of the predictions."""
         self._state = copy(earlier._state)
         self._process_noise, self._odometry_noise = earlier._process_noise, earlier._odometry_noise
+        self._end_search()
 
     def _begins_coarse(self, scan: SampledScan) -> bool:
         return self._prediction_error_m > _FINE_ERROR_CELLS * scan.cell_m
@@ -157,15 +180,16 @@ class Tracker(Stateful):
     def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""
         best = self._or_turning(matcher, prior, prediction, near)
-        if prediction.contradicted and self._state.velocity_known:
+        if prediction.contradicted and self._state.velocity_known and not self._budget.is_spent:
             alone = self.predict(matcher.scan, Prior(), matcher.last)
             other = matcher.register(alone, self._begins_coarse(matcher.scan))
             other = self._or_turning(matcher, Prior(), alone, other)
             best = max(best, other, key=lambda attempt: attempt.quality)
         misled = prior.T_prev_curr is not None and best.status is not Status.OK
-        if misled or not self._state.velocity_known:
+        if (misled or not self._state.velocity_known) and not self._budget.is_spent:
             rotations = prediction.T_world_lidar, matcher.last.T_world_lidar
-            best = self._or_displaced(best, matcher.register_displaced(rotations))
+            displaced = self._budget.run(matcher.register_displaced(rotations))
+            best = best if displaced is None else self._or_displaced(best, displaced[0])
         return best
 
     def _or_turning(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
@@ -173,7 +197,7 @@ class Tracker(Stateful):
 
         An unexpected motion bends the sweep, which then fits halfway at a wrong pose and velocity.
         """
-        if not self._state.fits_poorly(near.status, near.quality):
+        if not self._state.fits_poorly(near.status, near.quality) or self._budget.is_spent:
             return near
         turning = matcher.register_turning(self.predict(matcher.scan, prior, matcher.last, LARGEST_PROCESS_NOISE))
         if turning.is_reliable and turning.quality > _BETTER * near.quality:
@@ -191,18 +215,29 @@ class Tracker(Stateful):
         return replace(best, ambiguous=best.has_rivals(others))
 
     def _relocalise(self, matcher: ScanMatcher, near: Attempt) -> Attempt | None:
-        """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none."""
-        sufficient = near.is_reliable if self._state.is_unconfirmed else near.is_plausible
-        attempts = [near] if near.status is not Status.LOST and sufficient else []
-        attempts += filter(None, [matcher.search_yaw(near.prediction)])
-        if not any(attempt.is_reliable for attempt in attempts) and self._state.searches_map:
-            attempts += filter(None, [matcher.search_map(near.prediction)])
-        return best_of(attempts)
+        """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none.
 
-    def _contradicts_motion(self, attempt: Attempt, prior: Prior, last: MotionState) -> bool:
-        """Whether the motion since the last scan is improbable, which contradicts the relocalisation before."""
-        motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
-        return attempt.has_jumped or self._odometry_noise.rejects(prior, motion, self._config)
+        The nearby attempt does not count before a search is done.
+        """
+        sufficient = near.is_reliable if self._state.is_unconfirmed else near.is_plausible
+        counts, in_vain = near.status is not Status.LOST and sufficient, self._in_vain
+        self._in_vain = False
+        if counts and in_vain:
+            return near
+        found = self._found(matcher, near.prediction)
+        return best_of(filter(None, (near if counts and not self.is_searching else None, found)))
+
+    def _found(self, matcher: ScanMatcher, prediction: Prediction, nearby: bool = False) -> Attempt | None:
+        """The scan, relocalised by the search that is under way or a new one; None where that is not done or fails."""
+        self._map_is_due |= self._state.searches_map and not nearby
+        if not self._search.is_under_way:
+            self._search.begin(matcher.search(prediction, self._map_is_due), prediction)
+            self._map_is_due = False
+        return self._search.go_on(matcher, prediction, self._budget)
+
+    def _end_search(self) -> None:
+        self._search.drop()
+        self._map_is_due = self._in_vain = False
 
     def _update_noise(self, attempt: Attempt, prior: Prior, last: MotionState, interval_s: float) -> None:
         assert attempt.registration is not None
@@ -212,18 +247,3 @@ class Tracker(Stateful):
             self._process_noise = self._process_noise.updated(change, interval_s, variance)
         motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
         self._odometry_noise = self._odometry_noise.updated(prior, motion, self._config)
-
-    def _uncertain_velocity(self, attempt: Attempt, scan: SampledScan, last: MotionState) -> FloatArray:
-        """Velocity (6,) after a jump or a relocalisation.
-
-        After a relocalisation only the estimate within the sweep is known. After a jump one of two sweeps was bent by a
-        wrong velocity: the mean velocity between the two poses.
-        """
-        interval_s = scan.stamp - last.stamp
-        if not attempt.relocalised:
-            if interval_s > 0.0:
-                return body_velocity(inverse(last.T_world_lidar) @ attempt.T_world_lidar, interval_s)
-            return np.zeros(6)
-        assert attempt.registration is not None
-        observed = self._config.continuous_time and scan.sweep.times is not None
-        return attempt.registration.velocity if observed else np.zeros(6)

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.odometry.alignment.correspondences import Motion
 from lidarslam.odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
-from lidarslam.odometry.alignment.residuals import Motion
+from lidarslam.odometry.alignment.steps import gauss_newton_step
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 
 # Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
@@ -37,8 +37,7 @@ _NEGLIGIBLE = 0.02
 _NEGLIGIBLE_PRIOR = 1e-9
 # Part of a scan that another must have in view for what is not in view to be left out.
 _MOSTLY_IN_VIEW = 0.5
-# Information that keeps the normal equations solvable.
-_DAMPING = 1e-3
+_NOTHING = np.zeros((6, 6))
 
 
 class Effort(NamedTuple):
@@ -99,13 +98,14 @@ def align_each(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Eff
 
 def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterations: int) -> Alignment:
     T_prev_curr, innovation, prior = start.T_prev_curr, np.zeros(6), start
+    T_curr_prev = inverse(start.T_prev_curr)
     for done in np.linspace(0.0, 1.0, iterations).tolist():
         scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
         H, g = cost.normal_equations(_motion(T_prev_curr, innovation, sweeps)[0], scale_m)
         if done >= _ANNEALED and prior is start and start.information is not None:
             seen = INFORMATION_PER_M2 * _marginal(H)
             prior = replace(start, information=_where_unseen(start.information, seen))
-        step, change = _solve(T_prev_curr, innovation, H, g, prior)
+        step, change = _solve(T_prev_curr, innovation, H, g, prior, T_curr_prev)
         T_prev_curr, innovation = exp(step) @ T_prev_curr, innovation + change
         if done >= _ANNEALED and float(np.abs(step).max()) < _CONVERGED:
             break
@@ -124,20 +124,21 @@ def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) 
 
 
 def _solve(
-    T_prev_curr: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, prior: InitialEstimate
-) -> tuple[FloatArray, FloatArray]:
-    """One Gauss-Newton step (6,) of the motion, from the left, and one (6,) of the innovation."""
-    H, g = INFORMATION_PER_M2 * H, INFORMATION_PER_M2 * g
-    expected = _innovation_information()
+    T_prev_curr: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, prior: InitialEstimate,
+    T_curr_prev: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """One Gauss-Newton step (6,) of the motion, from the left, and one (6,) of the innovation.
+
+    T_curr_prev (4, 4) is the inverse of the prior's motion.
+    """
+    expected, away, information = _innovation_information(), _NOTHING[0], _NOTHING
     if prior.change_information is not None:
         expected = expected + prior.change_information
-    H[6:, 6:] += expected
-    g[6:] += expected @ innovation
     if prior.information is not None:
-        H[:6, :6] += prior.information
-        g[:6] += prior.information @ log(T_prev_curr @ inverse(prior.T_prev_curr))
-    H.flat[::13] += _DAMPING
-    delta = np.asarray(-np.linalg.solve(H, g), dtype=np.float64)
+        away, information = log(T_prev_curr @ T_curr_prev), prior.information
+    # Arrays of another layout would be compiled for anew.
+    information, expected = np.ascontiguousarray(information), np.ascontiguousarray(expected)
+    delta = gauss_newton_step(H, g, INFORMATION_PER_M2, information, away, expected, innovation)
     step = delta[:6] * (_LARGEST_STEP / max(float(np.abs(delta[:6]).max()), _LARGEST_STEP))
     return step, delta[6:]
 
@@ -152,10 +153,21 @@ def _where_unseen(prior: FloatArray, seen: FloatArray) -> FloatArray:
     The network's errors are not independent from scan to scan: it takes small translations for smaller ones. Where the
     images decide, even a small share of it would add up to a drift.
     """
-    whole = prior + _NEGLIGIBLE_PRIOR * np.trace(prior) * np.eye(6)
-    ratios, axes = eigh(seen, whole)
-    kept = whole @ axes[:, ratios < 1.0]
+    root, ratios, axes = _compared(seen, prior + _NEGLIGIBLE_PRIOR * prior.trace() * np.eye(6))
+    kept = root @ axes[:, ratios < 1.0]
     return np.asarray(kept @ kept.T)
+
+
+def _compared(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The generalised eigenvalues of two symmetric matrices, ascending, by the Cholesky factor L of the other.
+
+    Returns:
+        L, the ratios x one x / x other x, and as columns the unit vectors L' x along which they are taken.
+    """
+    root = np.linalg.cholesky(other)
+    half = np.linalg.inv(root)
+    ratios, axes = np.linalg.eigh(half @ one @ half.T)
+    return np.asarray(root, dtype=np.float64), ratios, axes
 
 
 def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: FloatArray) -> Alignment:
@@ -187,5 +199,6 @@ def _explained(in_view: FloatArray, inlier: FloatArray) -> tuple[float, FloatArr
     directions that hardly any point constrains do not count as missed.
     """
     little = _NEGLIGIBLE * max(float(in_view.diagonal().max()), 1.0) * np.eye(3)
-    ratios, axes = eigh(inlier + little, in_view + little)
-    return float(ratios[0]), np.asarray(axes[:, 0] / np.linalg.norm(axes[:, 0]), dtype=np.float64)
+    root, ratios, axes = _compared(inlier + little, in_view + little)
+    weakest = np.linalg.solve(root.T, axes[:, 0])
+    return float(ratios[0]), np.asarray(weakest / np.linalg.norm(weakest), dtype=np.float64)

@@ -6,7 +6,8 @@ import numpy as np
 
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
-from lidarslam.odometry.alignment.residuals import Motion, Planes, accumulate
+from lidarslam.odometry.alignment.correspondences import Motion, Planes
+from lidarslam.odometry.alignment.residuals import accumulate
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.projection import Floats
 from lidarslam.odometry.images.sweep_images import SweepImages
@@ -44,7 +45,7 @@ class PointToPlane:
     """
 
     def __init__(self, sweeps: SweepPair, column_step: int) -> None:
-        self._points = _points(sweeps.current, column_step)
+        self._points, self._count = _points(sweeps.current, column_step)
         self._planes = _planes(sweeps.previous)
 
     def normal_equations(self, motion: Motion, scale_m: float) -> tuple[FloatArray, FloatArray]:
@@ -53,23 +54,23 @@ class PointToPlane:
         The unknowns are a change of T_prev_curr from the left, rotation first, and the change (6,) of velocity.
         """
         total, unused = np.zeros((13, 13)), np.zeros((3, 3))
-        accumulate(self._points, self._planes, motion, scale_m, True, total, unused, unused)
-        return total[:12, :12], total[:12, 12]
+        accumulate(self._points, self._count, self._planes, motion, scale_m, True, total, unused, unused)
+        return total[:12, :12].copy(), total[:12, 12].copy()
 
     def fit(self, motion: Motion) -> Fit:
         """The inliers of a motion."""
         total, in_view, inlier = np.zeros((13, 13)), np.zeros((3, 3)), np.zeros((3, 3))
-        seen, count = accumulate(self._points, self._planes, motion, FINE_M, False, total, in_view, inlier)
-        points = max(len(self._points), 1)
+        seen, count = accumulate(self._points, self._count, self._planes, motion, FINE_M, False, total, in_view, inlier)
+        points = max(self._count, 1)
         return Fit(total[:12, :12], in_view, inlier, seen / points, count / points, count, float(total[12, 12]))
 
 
-def _points(images: SweepImages, column_step: int) -> Floats:
-    """(N, 7) point, normal and seconds of pixels that have a normal; the more rows, the fewer of each."""
+def _points(images: SweepImages, column_step: int) -> tuple[Floats, int]:
+    """(7, N or more) point, normal and seconds of pixels that have a normal, and N; of more rows fewer each."""
     height, width = images.offsets.shape
     fewer = max(1, height // _FULL_ROWS)
-    room = np.empty((height * (width // (fewer * column_step) + 1), 7), dtype=np.float32)
-    return room[: _sample(images.points, images.normals, images.offsets, column_step, fewer, room)]
+    room = np.empty((7, height * (width // (fewer * column_step) + 1)), dtype=np.float32)
+    return room, _sample(images.points, images.normals, images.offsets, column_step, fewer, room)
 
 
 def _planes(images: SweepImages) -> Planes:
@@ -81,7 +82,7 @@ def _planes(images: SweepImages) -> Planes:
 
 @compiled
 def _sample(points: Floats, normals: Floats, offsets: Floats, step: int, fewer: int, chosen: Floats) -> int:
-    """Write (N, 7) point, normal and seconds of one of `step * fewer` pixels of each row, if it has a normal; N.
+    """Write (7, N) point, normal and seconds of one of `step * fewer` pixels of each row, if it has a normal; N.
 
     So many rows in turn begin a step later.
     """
@@ -91,9 +92,9 @@ def _sample(points: Floats, normals: Floats, offsets: Floats, step: int, fewer: 
         for j in range(i % fewer * step, width, step * fewer):
             u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
             if u * u + v * v + w * w > 0.5:
-                point = chosen[count]
-                point[0], point[1], point[2] = points[0, i, j], points[1, i, j], points[2, i, j]
-                point[3], point[4], point[5], point[6] = u, v, w, offsets[i, j]
+                for axis in range(3):
+                    chosen[axis, count], chosen[3 + axis, count] = points[axis, i, j], normals[axis, i, j]
+                chosen[6, count] = offsets[i, j]
                 count += 1
     return count
 
@@ -107,9 +108,11 @@ def _fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels
     height, width = offsets.shape
     there = np.empty(width, dtype=np.bool_)
     for i in range(height):
+        # Row by row: an index into all of an image is slower.
+        x, y, z, u, v, w = points[0, i], points[1, i], points[2, i], normals[0, i], normals[1, i], normals[2, i]
+        seconds = offsets[i]
         for j in range(width):
-            u, v, w = normals[0, i, j], normals[1, i, j], normals[2, i, j]
-            there[j] = u * u + v * v + w * w > 0.5
+            there[j] = u[j] * u[j] + v[j] * v[j] + w[j] * w[j] > 0.5
         for j in range(width):
             source = j
             if not there[j]:
@@ -119,6 +122,5 @@ def _fill(points: Floats, normals: Floats, offsets: Floats, columns: int, pixels
                         source = left if there[left] else right
                         break
             pixel = pixels[i * width + j]
-            for axis in range(3):
-                pixel[axis], pixel[3 + axis] = points[axis, i, source], normals[axis, i, source]
-            pixel[6] = offsets[i, source]
+            pixel[0], pixel[1], pixel[2], pixel[3] = x[source], y[source], z[source], u[source]
+            pixel[4], pixel[5], pixel[6] = v[source], w[source], seconds[source]

@@ -27,6 +27,8 @@ _BLOCK = 240
 # From one quantity of a block to the next. Were it a power of two, the processor would take a store for what the next
 # load needs, and wait.
 _STRIDE = _BLOCK + 32
+# Neighbours that are added together, in registers.
+_AT_ONCE = 3
 
 
 class Patch(NamedTuple):
@@ -59,35 +61,47 @@ def surface_normals(image: Floats, patches: Sequence[Patch] = PATCHES) -> Floats
             patches.
         patches: of the tries, in turn.
     """
-    normals = np.zeros((3, *image.shape[1:]), dtype=np.float32)
+    rows, columns = max((one.rows for one in patches), default=0), max((one.columns for one in patches), default=0)
+    height, width = image.shape[1:]
+    padded = np.empty((4, height + 2 * rows, width + 2 * columns + _AT_ONCE - 1), dtype=np.float32)
+    _pad(image, rows, columns, padded)
+    normals = np.zeros((3, height, width), dtype=np.float32)
     for patch in patches:
-        _fit_planes(_padded(image, patch), patch, normals)
+        _fit_planes(padded, rows, columns, patch, normals)
     return normals
 
 
-def _padded(image: Floats, patch: Patch) -> Floats:
-    """(4, H + 2 rows, W + 2 columns) columns that go round, empty rows above and below; empty is infinitely far."""
-    around = ((0, 0), (0, 0), (patch.columns, patch.columns))
-    padded = np.pad(np.pad(image, around, mode="wrap"), ((0, 0), (patch.rows, patch.rows), (0, 0)))
-    padded[3][padded[3] <= 0.0] = np.inf
-    return padded
+@compiled
+def _pad(image: Floats, rows: int, columns: int, padded: Floats) -> None:
+    """Write (4, H + 2 rows, W + 2 columns or more) columns that go round, empty rows above and below; empty is far."""
+    height, width = image.shape[1:]
+    padded[:3, :rows], padded[:3, rows + height :] = _ZERO, _ZERO
+    padded[3, :rows], padded[3, rows + height :] = _FAR, _FAR
+    for channel in range(4):
+        for i in range(height):
+            row = padded[channel, rows + i]
+            row[columns : columns + width] = image[channel, i]
+            if channel == 3:
+                for j in range(columns, columns + width):
+                    row[j] = row[j] if row[j] > _ZERO else _FAR
+            row[:columns], row[columns + width :] = row[width : width + columns], row[columns : len(row) - width]
 
 
 @compiled
-def _fit_planes(padded: Floats, patch: Patch, normals: Floats) -> None:
-    """Write the normals (3, H, W) of pixels that have none yet and lie on a plane, from an image as of `_padded`."""
+def _fit_planes(padded: Floats, rows: int, columns: int, patch: Patch, normals: Floats) -> None:
+    """Write the normals (3, H, W) of pixels that have none yet and lie on a plane, from an image as of `_pad`."""
     height, width = normals.shape[1:]
     work, found = np.empty(15 * _STRIDE, dtype=np.float32), np.empty(3 * _STRIDE, dtype=np.float32)
     for i in range(height):
-        ranges = padded[3, i + patch.rows]
+        ranges = padded[3, i + rows]
         for begin in range(0, width, _BLOCK):
             end, is_wanted = min(begin + _BLOCK, width), False
             for j in range(begin, end):
                 missing = normals[0, i, j] == _ZERO and normals[1, i, j] == _ZERO and normals[2, i, j] == _ZERO
-                is_wanted |= missing and ranges[patch.columns + j] < _FAR
+                is_wanted |= missing and ranges[columns + j] < _FAR
             if not is_wanted:
                 continue
-            _scatter(padded, i, begin, end - begin, patch, work)
+            _scatter(padded, i + rows, begin + columns, end - begin, patch, work)
             _fit(end - begin, work, patch, found)
             for j in range(begin, end):
                 if normals[0, i, j] == _ZERO and normals[1, i, j] == _ZERO and normals[2, i, j] == _ZERO:
@@ -103,49 +117,56 @@ def _scatter(padded: Floats, i: int, begin: int, size: int, patch: Patch, work: 
 
     Args:
         padded, patch: as for `_fit_planes`.
-        i, begin, size: row, first column and number of the pixels.
+        i, begin, size: row and first column in the padded image, and number of the pixels.
         work: (15 * STRIDE,), written: x, y, z and range of the pixels; of their neighbours the number, the squared
             distance of the nearest, and sums of x, y, z, xx, yy, zz, xy, yz, xz.
     """
     work[:] = _ZERO
     work[5 * _STRIDE : 6 * _STRIDE] = _FAR
-    middle, gate_m = begin + patch.columns, np.float32(patch.gate_m)
+    gate_m = np.float32(patch.gate_m)
     for channel in range(4):
-        row = padded[channel, i + patch.rows]
+        row = padded[channel, i]
         for k in range(size):
-            work[channel * _STRIDE + k] = row[middle + k]
-    for down in range(2 * patch.rows + 1):
+            work[channel * _STRIDE + k] = row[begin + k]
+    for down in range(i - patch.rows, i + patch.rows + 1):
         # One by one: what is indexed by a slice in the middle is taken as not contiguous, and is not done at once.
-        x, y, z, ranges = padded[0, i + down], padded[1, i + down], padded[2, i + down], padded[3, i + down]
-        for first in range(begin, begin + 2 * patch.columns + 1):
-            itself = _FAR if down == patch.rows and first == middle else _ZERO
-            last = first + size
-            _add(size, gate_m, itself, x[first:last], y[first:last], z[first:last], ranges[first:last], work)
+        x, y, z, ranges = padded[0, down], padded[1, down], padded[2, down], padded[3, down]
+        end = begin + patch.columns + 1
+        for first in range(begin - patch.columns, end, _AT_ONCE):
+            last = first + size + _AT_ONCE - 1
+            itself, count = begin - first if down == i else -1, end - first
+            _add(size, gate_m, itself, count, x[first:last], y[first:last], z[first:last], ranges[first:last], work)
 
 
 @compiled_part
 def _add(
-    size: int, gate_m: np.float32, itself: np.float32, x: Floats, y: Floats, z: Floats, ranges: Floats, work: Floats
-) -> None:
-    """Add a neighbour of each pixel to the moments; `itself` is added to its distance."""
+    size: int, gate_m: np.float32, itself: int, count: int,
+    x: Floats, y: Floats, z: Floats, ranges: Floats, work: Floats,
+) -> None:  # fmt: skip
+    """Add neighbours of each pixel that are next to each other in a row to the moments, `count` of three at most.
+
+    One of them may be the pixel itself. The more at once, the less often moments are read and written.
+    """
     for k in range(size):
-        near = abs(ranges[k] - work[3 * _STRIDE + k]) <= gate_m
-        mask = _ONE if near else _ZERO
-        dx, dy, dz = (x[k] - work[k]) * mask, (y[k] - work[_STRIDE + k]) * mask, (z[k] - work[2 * _STRIDE + k]) * mask
-        xx, yy, zz = dx * dx, dy * dy, dz * dz
-        apart = xx + yy + zz + itself
-        apart = apart if near else _FAR
-        work[4 * _STRIDE + k] += mask
-        work[5 * _STRIDE + k] = apart if apart < work[5 * _STRIDE + k] else work[5 * _STRIDE + k]
-        work[6 * _STRIDE + k] += dx
-        work[7 * _STRIDE + k] += dy
-        work[8 * _STRIDE + k] += dz
-        work[9 * _STRIDE + k] += xx
-        work[10 * _STRIDE + k] += yy
-        work[11 * _STRIDE + k] += zz
-        work[12 * _STRIDE + k] += dx * dy
-        work[13 * _STRIDE + k] += dy * dz
-        work[14 * _STRIDE + k] += dx * dz
+        px, py, pz, distance = work[k], work[_STRIDE + k], work[2 * _STRIDE + k], work[3 * _STRIDE + k]
+        number, nearest = work[4 * _STRIDE + k], work[5 * _STRIDE + k]
+        sx, sy, sz = work[6 * _STRIDE + k], work[7 * _STRIDE + k], work[8 * _STRIDE + k]
+        sxx, syy, szz = work[9 * _STRIDE + k], work[10 * _STRIDE + k], work[11 * _STRIDE + k]
+        sxy, syz, sxz = work[12 * _STRIDE + k], work[13 * _STRIDE + k], work[14 * _STRIDE + k]
+        for c in range(_AT_ONCE):
+            near = abs(ranges[k + c] - distance) <= gate_m and c < count
+            mask = _ONE if near else _ZERO
+            dx, dy, dz = (x[k + c] - px) * mask, (y[k + c] - py) * mask, (z[k + c] - pz) * mask
+            xx, yy, zz = dx * dx, dy * dy, dz * dz
+            apart = xx + yy + zz if near and c != itself else _FAR
+            nearest = apart if apart < nearest else nearest
+            number += mask
+            sx, sy, sz, sxx, syy, szz = sx + dx, sy + dy, sz + dz, sxx + xx, syy + yy, szz + zz
+            sxy, syz, sxz = sxy + dx * dy, syz + dy * dz, sxz + dx * dz
+        work[4 * _STRIDE + k], work[5 * _STRIDE + k] = number, nearest
+        work[6 * _STRIDE + k], work[7 * _STRIDE + k], work[8 * _STRIDE + k] = sx, sy, sz
+        work[9 * _STRIDE + k], work[10 * _STRIDE + k], work[11 * _STRIDE + k] = sxx, syy, szz
+        work[12 * _STRIDE + k], work[13 * _STRIDE + k], work[14 * _STRIDE + k] = sxy, syz, sxz
 
 
 @compiled_part

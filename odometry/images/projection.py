@@ -19,9 +19,18 @@ _STRAY_SHARE = 0.002
 _LEAST_HEIGHT = math.radians(1.0)
 _HEIGHT_WITHOUT_POINTS = math.radians(15.0)
 # Nearer to the middle of a pixel than this, in pixels, no rounding of single precision leads out of it.
-_SURE = 0.499
+_SURE = np.float32(0.498)
 _TURN = 2.0 * math.pi
-_ZERO, _ONE, _HALF_PI, _PI, _QUARTER = (np.float32(x) for x in (0.0, 1.0, 0.5 * math.pi, math.pi, 0.25 * math.pi))
+_ZERO, _HALF, _ONE, _HALF_PI, _PI, _QUARTER = (
+    np.float32(x) for x in (0.0, 0.5, 1.0, 0.5 * math.pi, math.pi, 0.25 * math.pi)
+)  # fmt: skip
+_WHOLE, _FAR = np.float32(_TURN), np.float32(np.inf)
+# What stands for the pixel of a point in none, and of one too near to a border; and the same as numbers of pixels,
+# which are floats until they are stored.
+_OUTSIDE, _UNSURE = -1, -2
+_ABOVE_OR_BELOW, _NOT_SURE = np.float32(_OUTSIDE), np.float32(_UNSURE)
+# Points that are worked on together.
+_BLOCK = 1024
 _STEEP, _LEAST = np.float32(math.sqrt(2.0) - 1.0), np.float32(1e-30)
 _P0, _P1, _P2, _P3 = (
     np.float32(x) for x in (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1)
@@ -84,10 +93,8 @@ def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
 
     Points that are not finite, at the origin, or above or below a grid are left out.
     """
-    x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        ranges = np.sqrt(x * x + y * y + z * z)
-    elevations, azimuths = np.empty_like(x), np.empty_like(x)
+    x, y, z, ranges, elevations, azimuths = np.empty((6, len(points)), dtype=np.float32)
+    _write_coordinates(np.ascontiguousarray(points, dtype=np.float64), x, y, z, ranges)
     write_angles(x, y, z, elevations, azimuths)
     projections = []
     for grid in grids:
@@ -95,11 +102,20 @@ def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
         nearest = np.full(len(index), np.inf, dtype=np.float32)
         low, per_radian = grid.elevation_low, grid.rows_per_radian
         _keep_nearest(x, y, z, ranges, elevations, azimuths, grid.rows, grid.columns, low, per_radian, index, nearest)
-        image = np.zeros((4, len(index)), dtype=np.float32)
+        image = np.empty((4, len(index)), dtype=np.float32)
         _write_pixels(x, y, z, ranges, index, image)
         shape = (grid.rows, grid.columns)
         projections.append(Projection(image.reshape(4, *shape), index.reshape(shape)))
     return projections
+
+
+@compiled
+def _write_coordinates(points: FloatArray, x: Floats, y: Floats, z: Floats, ranges: Floats) -> None:
+    """Write the coordinates of points (N, 3) to single precision, and their ranges."""
+    for i in range(len(points)):
+        x[i], y[i], z[i] = points[i, 0], points[i, 1], points[i, 2]
+    for i in range(len(points)):
+        ranges[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
 
 
 @compiled
@@ -111,31 +127,51 @@ def _keep_nearest(
 
     Angles of single precision decide the pixel of all points but those next to its border, whose angles are taken anew.
     """
-    for i in range(len(ranges)):
-        if not (ranges[i] > 0.0 and ranges[i] < np.inf):
-            continue
-        azimuth = np.float64(azimuths[i])
-        across = (azimuth + _TURN if azimuth < 0.0 else azimuth) * (width / _TURN)
-        up = (elevations[i] - low) * per_radian + 0.5
-        row, column = int(up), int(across)  # below 0 it is cut to more, and so is not sure
-        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-        if abs(up - row - 0.5) > _SURE:
-            row = int(row_of(math.atan2(pz, math.sqrt(px * px + py * py)), low, per_radian))
-        if abs(across - column - 0.5) > _SURE:
-            column = int(column_of(math.atan2(py, px), width))
-        if row >= 0 and row < height:
-            pixel = row * width + column
-            if ranges[i] < nearest[pixel]:
+    pixels = np.empty(_BLOCK, dtype=np.int32)
+    for begin in range(0, len(ranges), _BLOCK):
+        end = min(begin + _BLOCK, len(ranges))
+        _find_pixels(
+            ranges[begin:end], elevations[begin:end], azimuths[begin:end], height, width, low, per_radian, pixels
+        )
+        for i in range(begin, end):
+            pixel = pixels[i - begin]
+            if pixel == _UNSURE:
+                px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+                row = row_of(math.atan2(pz, math.sqrt(px * px + py * py)), low, per_radian)
+                inside = row >= 0.0 and row < height
+                pixel = int(row) * width + int(column_of(math.atan2(py, px), width)) if inside else _OUTSIDE
+            if pixel != _OUTSIDE and ranges[i] < nearest[pixel]:
                 index[pixel], nearest[pixel] = i, ranges[i]
+
+
+@compiled_part
+def _find_pixels(
+    ranges: Floats, elevations: Floats, azimuths: Floats, height: int, width: int, low: float, per_radian: float,
+    pixels: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Write the pixels of a block of points in a loop that takes several at once, OUTSIDE or UNSURE."""
+    rows, columns, lowest = np.float32(height), np.float32(width), np.float32(low)
+    rows_per_radian, columns_per_radian = np.float32(per_radian), np.float32(width / _TURN)
+    for k in range(len(ranges)):
+        up = (elevations[k] - lowest) * rows_per_radian + _HALF
+        across = (azimuths[k] + (_WHOLE if azimuths[k] < _ZERO else _ZERO)) * columns_per_radian
+        row, column = np.floor(up), np.floor(across)
+        sure = abs(up - row - _HALF) <= _SURE and abs(across - column - _HALF) <= _SURE
+        pixel = row * columns + column if row >= _ZERO and row < rows else _ABOVE_OR_BELOW
+        pixel = pixel if sure else _NOT_SURE
+        there = ranges[k] > _ZERO and ranges[k] < _FAR
+        pixels[k] = np.int32(pixel if there else _ABOVE_OR_BELOW)
 
 
 @compiled
 def _write_pixels(x: Floats, y: Floats, z: Floats, ranges: Floats, index: NDArray[np.int64], image: Floats) -> None:
-    """Write the points of an image (4, H * W), zero before."""
+    """Write the points of an image (4, H * W)."""
     for pixel in range(len(index)):
         n = index[pixel]
         if n >= 0:
             image[0, pixel], image[1, pixel], image[2, pixel], image[3, pixel] = x[n], y[n], z[n], ranges[n]
+        else:
+            image[0, pixel], image[1, pixel], image[2, pixel], image[3, pixel] = _ZERO, _ZERO, _ZERO, _ZERO
 
 
 @compiled_part
@@ -156,13 +192,13 @@ def column_of(azimuth: float, width: int) -> float:
 def write_angles(x: Floats, y: Floats, z: Floats, elevations: Floats, azimuths: Floats) -> None:
     """Write the angles of points to single precision, in loops each of which takes several at once."""
     for i in range(len(x)):
-        elevations[i] = _arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
+        elevations[i] = arc_tangent(z[i], np.sqrt(x[i] * x[i] + y[i] * y[i]))
     for i in range(len(x)):
-        azimuths[i] = _arc_tangent(y[i], x[i])
+        azimuths[i] = arc_tangent(y[i], x[i])
 
 
 @compiled_part
-def _arc_tangent(y: np.float32, x: np.float32) -> np.float32:
+def arc_tangent(y: np.float32, x: np.float32) -> np.float32:
     """atan2 in single precision without branches, so that the processor takes several at once; NaN for NaN.
 
     Cephes Mathematical Library, atanf.c (Moshier, 1989).

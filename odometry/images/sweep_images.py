@@ -22,6 +22,8 @@ _ROWS = (64, 48, 32)
 _FILLED, _FILLED_BY_RINGS = 0.8, 0.5
 # Columns that a rotating sensor fills at least. The points of others do not lie in rows.
 _SEEN_COLUMNS = 0.5
+# Columns from one to the next that a median is taken of.
+_MEDIAN_STEP = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +46,25 @@ class SweepImages:
             )
 
     def median_range_m(self) -> float:
-        """Of all points, the lower of the two in the middle; 0 when there are none."""
-        x, y, z = self.points
+        """Of the points of every fourth column, the lower of the two in the middle; 0 when there are none."""
+        x, y, z = self.points[:, :, ::_MEDIAN_STEP]
         squares = x * x + y * y + z * z
         seen = squares[squares > 0.0]
         return float(np.sqrt(np.partition(seen, (len(seen) - 1) // 2)[(len(seen) - 1) // 2])) if len(seen) else 0.0
 
+    def with_normal(self) -> int:
+        """How many pixels have a normal."""
+        return _filled(self.normals)
+
     def share_with_normal(self) -> float:
         """Of the pixels that have a point; 0 when there are none."""
-        points, normals = (int(np.count_nonzero((part != 0.0).any(axis=0))) for part in (self.points, self.normals))
-        return normals / max(points, 1)
+        return self.with_normal() / max(_filled(self.points), 1)
+
+
+def _filled(image: Floats) -> int:
+    """How many pixels of an image (3, H, W) are not zero."""
+    x, y, z = image != 0.0
+    return int(np.count_nonzero(x | y | z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +120,9 @@ class Imager(Stateful):
 
 def _images(projection: Projection, grid: ImageGrid, scan: Scan, is_fine: bool = False) -> SweepImages:
     offsets = np.zeros(projection.index.shape, dtype=np.float32)
-    if scan.time_offsets is not None:
-        seen = projection.index >= 0
-        offsets[seen] = scan.time_offsets[projection.index[seen]] - scan.middle_offset_s
+    if scan.time_offsets is not None and len(scan):
+        seconds = scan.time_offsets.take(projection.index) - scan.middle_offset_s
+        np.copyto(offsets, seconds, where=projection.index >= 0, casting="same_kind")
     normals = surface_normals(projection.image, FINE_PATCHES if is_fine else PATCHES)
     return SweepImages(projection.image[:3], normals, offsets, grid.elevation_low, grid.elevation_high)
 

@@ -6,12 +6,12 @@ candidate counts there only as long as no motion before is known. A pair of scan
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, orthonormalize
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
@@ -90,7 +90,7 @@ class LearnedOdometry(Stateful):
             self._described = self._search.describe(shown.points, shown.normals)
             self._last = _Sweep(images, self._described.heading, scan.stamp, middle)
             if last is None:
-                return Motion(np.eye(4), int((images.alignment.normals != 0.0).any(axis=0).sum()))
+                return Motion(np.eye(4), images.alignment.with_normal())
             return Motion(np.eye(4), 0, "the scan is not later than the one before")
         candidates, self._described = self._search.compare(self._described, shown.points, shown.normals)
         self._last = sweep = _Sweep(images, self._described.heading, scan.stamp, middle)
@@ -99,7 +99,8 @@ class LearnedOdometry(Stateful):
             return Motion(np.eye(4), 0, "the network's answer is not a motion; try other weights")
         if self._is_aligned:
             return self._refined(candidates, last, sweep)
-        return self._motion(candidates[0].T_prev_curr, candidates[0].covariance, np.zeros(6), last, sweep)
+        motion = self._motion(candidates[0].T_prev_curr, candidates[0].covariance, np.zeros(6), last, sweep)
+        return replace(motion, points_used=images.network.with_normal())
 
     def close(self) -> None:
         """Nothing is held."""
@@ -129,20 +130,21 @@ class LearnedOdometry(Stateful):
             misfit = f"{best.inliers} inliers, {100.0 * best.explained:.0f} % of the information about one direction"
             return Motion(np.eye(4), 0, f"the scan does not fit the last one: {misfit}")
         covariance = np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)), dtype=np.float64)
-        T_prev_curr = orthonormalize(best.T_prev_curr)
-        motion = self._motion(T_prev_curr, covariance, best.velocity_change, last, sweep)
-        return Motion(motion.T_prev_curr, best.inliers, covariance=motion.covariance, degenerate=degeneracy.names)
+        motion = self._motion(best.T_prev_curr, covariance, best.velocity_change, last, sweep)
+        return replace(motion, points_used=best.inliers, degenerate=degeneracy.names)
 
     def _motion(
         self, T_prev_curr: FloatArray, covariance: FloatArray, change: FloatArray, last: _Sweep, sweep: _Sweep
     ) -> Motion:
-        """The motion between the stamps from that between the middles; its covariance is of a change from the left."""
+        """The motion between the stamps from that between the middles, whose covariance is of a change from the left.
+
+        The points that it rests on are left to the caller.
+        """
         self._last_covariance = covariance
         interval_s = sweep.middle - last.middle
         stamps, middles = (last.stamp, sweep.stamp), (last.middle, sweep.middle)
         between = self._interpolator.between_stamps(T_prev_curr, change, middles, stamps)
-        seen = int((sweep.images.network.normals != 0.0).any(axis=0).sum())
-        return Motion(between, seen, covariance=_right_covariance(T_prev_curr, covariance, change * interval_s))
+        return Motion(between, 0, covariance=_right_covariance(T_prev_curr, covariance, change * interval_s))
 
     def _forget(self) -> None:
         """The next motion does not follow on the last."""

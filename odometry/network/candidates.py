@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.odometry.images.bird_eye import MOST_CELLS, SHIFTS, bird_eye
+from lidarslam.odometry.images.bird_eye import MOST_CELLS, bird_eye
 from lidarslam.odometry.images.projection import Floats
 
 # Turns and shifts that are followed, and the least probability beside the best one's.
@@ -23,6 +23,8 @@ _LEAST_PROBABILITY = 0.02
 # Scores this near a peak belong to it: feature columns, cells.
 _NEAR_COLUMNS, _NEAR_CELLS = 6, 4
 _NEVER = np.float32(-1e4)
+# Rows and columns of a correlation of grids, which goes round, that belong to the shifts from -MOST_CELLS on.
+_WITHIN_REACH = np.ix_(*2 * (np.arange(-MOST_CELLS, MOST_CELLS + 1),))
 
 Graph = Callable[..., list[Floats]]
 """A part of a network on one scan or one pair: float32 arrays in, float32 arrays out."""
@@ -155,9 +157,8 @@ class WholePairs:
 
 def _shift_scores(previous: NDArray[np.complex64], current: NDArray[np.complex64]) -> Floats:
     """(1, SHIFTS, SHIFTS) correlation of features with these spectra, with the current scan shifted along y and x."""
-    product = np.einsum("fij,fij->ij", previous, current.conj())
-    scores = np.roll(fft.irfft2(product), (MOST_CELLS, MOST_CELLS), (0, 1))[:SHIFTS, :SHIFTS]
-    return np.ascontiguousarray(scores[None], dtype=np.float32)
+    scores = fft.irfft2((previous * current.conj()).sum(axis=0))
+    return np.ascontiguousarray(scores[_WITHIN_REACH][None], dtype=np.float32)
 
 
 def _peaks(scores: Floats, most: int, near: int) -> list[Floats]:

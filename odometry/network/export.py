@@ -21,6 +21,7 @@ from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.network.checkpoint import Checkpoint, network_of
 from lidarslam.odometry.network.correlation import CorrelationNetwork
 from lidarslam.odometry.network.exported import BIRD, COLUMNS, DESCRIPTION, PAIR, PEAKS, TURNS, describe
+from lidarslam.odometry.network.inference_form import InferenceColumns
 from lidarslam.odometry.network.pair_network import PairImages
 
 # Not a size of anything else, so that no dimension is taken for another.
@@ -90,7 +91,9 @@ def _graphs(network: nn.Module, rows: int, columns: int) -> list[_Graph]:
     grids = torch.rand(_EXAMPLE_BATCH, bird_eye.CHANNELS, bird_eye.CELLS, bird_eye.CELLS)
     scores = torch.rand(_EXAMPLE_BATCH, features.shape[-1]), torch.rand(_EXAMPLE_BATCH, SHIFTS, SHIFTS)
     return [
-        _Graph(COLUMNS, network.columns, (points, normals), ["points", "normals"], ["features"]),
+        _Graph(
+            COLUMNS, InferenceColumns(network.columns).eval(), (points, normals), ["points", "normals"], ["features"]
+        ),
         _Graph(TURNS, network.turn_scores, (features, features.flip(0)), ["previous", "current"], ["scores"]),
         _Graph(BIRD, network.bird, (grids,), ["grids"], ["features"]),
         _Graph(PEAKS, network.peaks, scores, ["turn_scores", "shift_scores"], ["angle", "shift", "log_sigma"]),

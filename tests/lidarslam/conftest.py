@@ -1,8 +1,6 @@
 """Shared fixtures of the application's tests."""
 
 import shutil
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +11,6 @@ from lidarslam.cli import main
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Ctrl-C works in this process and its children, even where the tests were started with it ignored (nohup)."""
-    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, earlier)
 
 
 @pytest.fixture

@@ -57,7 +57,7 @@ def files_no_longer_than(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("size", [0, 300, 1_200, 4_000, 100_000])
-@pytest.mark.parametrize("more", [(), ("--pcd",), ("--pose-graph",)])
+@pytest.mark.parametrize("more", [(), ("--pcd",), ("--pose-graph",), ("--set", "global_map.most_points=2000")])
 def test_a_run_on_a_full_disk(tmp_path: Path, small_recording: Path, size: int, more: Sequence[str]) -> None:
     """The map is 300 kB, the log of the scans 600 bytes, the configuration 3.6 kB."""
     out = tmp_path / "run"

@@ -22,7 +22,7 @@ def completed(line: str, shell: type[ShellComplete] = BashComplete) -> list[str]
         ("run --odometry k", ["plain kiss-icp"]),
         ("run --mapping ", ["plain surfels", "plain loam", "plain off"]),
         ("run x --reader kitti", ["plain kitti-odometry", "plain kitti-360", "plain kitti-raw"]),
-        ("simulate --world t", ["plain tunnel", "plain terrace"]),
+        ("simulate --world t", ["plain tunnel", "plain terrace", "plain town"]),
         ("simulate --sensor hdl-3", ["plain hdl-32e"]),
         ("simulate --motion l", ["plain legged"]),
         ("simulate --format r", ["plain rosbag1", "plain rosbag2"]),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, log, make_transform
 from lidarslam.core.text.trajectory_io import read_tum
@@ -22,10 +23,12 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
+from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import Localised, SweepMotion
 from lidarslam.run.modes.live.clouds import CloudDecoder
 from lidarslam.run.modes.live.discovery import find_topic
 from lidarslam.run.modes.live.incoming import IncomingQueue, Received
+from lidarslam.run.modes.live.live import bounded
 from lidarslam.run.modes.live.messages import serialize_transform
 from lidarslam.run.modes.live.publishing import PosePublisher
 from lidarslam.run.modes.live.statistics import LiveStatistics, count_missing
@@ -89,7 +92,7 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     """With constant velocity a run knows no more of a scan than a live one: the poses are the same, bit for bit."""
     from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
 
-    method = ["--odometry", "constant-velocity", "--no-report"]
+    method = ["--odometry", "constant-velocity", "--no-report", "--set", "mapping.budget_ms=1e9"]
     live, ran = tmp_path / "live", tmp_path / "ran"
     node = DdsNode(domain)
     odometry = node.subscribe(PublishedTopic("/lidarslam/odometry", "nav_msgs/msg/Odometry", True))
@@ -119,6 +122,12 @@ def test_a_robot_gets_its_poses_and_the_run_is_that_of_its_bag(
     sent = [STORE.deserialize_cdr(raw, TRANSFORMS_TYPE).transforms[0] for raw in found[1]]
     assert [one.child_frame_id for one in sent] == ["velodyne"] * SCANS
     np.testing.assert_allclose([one.transform.translation.x for one in sent], trajectory.positions[:, 0], atol=1e-8)
+
+
+def test_a_scan_has_a_budget_unless_one_is_given() -> None:
+    assert bounded(Config()).mapping.budget_ms == "auto"
+    given = Config(mapping=MappingConfig(budget_ms=80.0))
+    assert bounded(given) == given
 
 
 @pytest.mark.usefixtures("interruptible")

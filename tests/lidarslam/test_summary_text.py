@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from lidarslam.mapping.loops.closure import LoopClosure
+from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.loop_closing import LoopReport
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary.summary import GraphSummary, LostStretch, Milliseconds, RunSummary, WrittenMap
+from lidarslam.run.summary.summary import GraphSummary, LostStretch, RunSummary, WrittenMap
+from lidarslam.run.summary.timing import Milliseconds, SlowestScan
 from lidarslam.run.summary_text import format_map, format_outcome
 
 
@@ -19,7 +21,7 @@ def summary_of(graph: GraphSummary | None = None, moved: int = 0) -> RunSummary:
         length_m=0.0,
         duration_s=0.0,
         elapsed_s=0.1,
-        ms_per_scan={"total": Milliseconds(1.0, 1.0)},
+        ms_per_scan={"total": Milliseconds(1.0, 1.0, 1.0)},
         realtime_factor=None,
         peak_rss_mb=1.0,
         lost=tuple(LostStretch(0, 0, 0.0, 0.0, "too few points") for _ in range(4)),
@@ -34,6 +36,23 @@ def test_one_of_a_thing_is_singular() -> None:
     text = format_outcome(Path("out"), RunOutcome(summary_of(), None))
     for words in ("1 scan, 0.0 m", "map of 1 point, voxels", "LOST on 1 more stretch\n", "lost on 4 of 1 scan;"):
         assert words in text
+
+
+def test_the_slowest_stage_of_a_scan_is_named_but_not_of_the_first_that_loads_loops() -> None:
+    stage_ms = np.full((4, 6), 2.0)
+    stage_ms[0], stage_ms[2, STAGES.index("refine")] = 900.0, 77.0
+    slowest = SlowestScan.of(stage_ms)
+    assert slowest == SlowestScan(2, "refine", 77.0)
+    assert SlowestScan.of(stage_ms[:1]) is None
+    summary = replace(summary_of(), slowest=slowest)
+    assert "1 ms a scan (99 % under 1 ms, slowest: scan 2, 77 ms of refine)," in format_outcome(
+        Path("out"), RunOutcome(summary, None)
+    )
+    assert summary.to_json()["slowest_scan"] == {"scan": 2, "stage": "refine", "ms": 77.0}
+
+
+def test_percentiles_are_of_all_scans() -> None:
+    assert Milliseconds.of(np.arange(101.0)) == Milliseconds(50.0, 95.0, 99.0)
 
 
 def test_what_moved_is_counted() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, rotation_angle, transform_points
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
+from lidarslam.mapping.tracking.budget import complete
 
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
 
@@ -31,7 +32,7 @@ def test_place_turn_and_height_are_found(
     true = exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
     true[:3, 3] = place
     scan = transform_points(inverse(true), l_shaped_room(rng, 4_000))
-    best = BirdsEyeMap.of(points, UP, 0.4).find(scan, np.eye(4), 12.0, 5)[0]
+    best = complete(BirdsEyeMap.of(points, UP, 0.4).find(scan, np.eye(4), 12.0, 5))[0]
     assert np.linalg.norm(best[:2, 3] - true[:2, 3]) < 0.6
     assert abs(best[2, 3] - true[2, 3]) < 0.3
     assert np.rad2deg(rotation_angle(inverse(true) @ best)) < 6.0
@@ -44,18 +45,18 @@ def test_in_a_tilted_world_the_lean_is_kept(
     true = tilt @ exp([0.0, 0.0, 1.0, 1.0, -1.0, 0.0])
     scan = transform_points(inverse(true), transform_points(tilt, l_shaped_room(rng, 4_000)))
     plan = BirdsEyeMap.of(transform_points(tilt, points), tilt[:3, 2], 0.4)
-    best = plan.find(scan, tilt @ exp([0.0, 0.0, -2.0, 0.0, 0.0, 0.0]), 12.0, 5)[0]
+    best = complete(plan.find(scan, tilt @ exp([0.0, 0.0, -2.0, 0.0, 0.0, 0.0]), 12.0, 5))[0]
     assert np.linalg.norm(best[:3, 3] - true[:3, 3]) < 0.7
     assert np.rad2deg(rotation_angle(inverse(true) @ best)) < 6.0
 
 
 def test_what_shows_nothing_upright_lies_nowhere(points: FloatArray) -> None:
     floor = np.column_stack([np.random.default_rng(0).uniform(-3.0, 3.0, (500, 2)), np.full(500, -1.0)])
-    assert BirdsEyeMap.of(points, UP, 0.4).find(floor, np.eye(4), 12.0, 5).shape == (0, 4, 4)
+    assert complete(BirdsEyeMap.of(points, UP, 0.4).find(floor, np.eye(4), 12.0, 5)).shape == (0, 4, 4)
 
 
 def test_no_two_places_are_the_same(rng: np.random.Generator, l_shaped_room: RoomPoints, points: FloatArray) -> None:
-    poses = BirdsEyeMap.of(points, UP, 0.4).find(l_shaped_room(rng, 4_000), np.eye(4), 12.0, 20)
+    poses = complete(BirdsEyeMap.of(points, UP, 0.4).find(l_shaped_room(rng, 4_000), np.eye(4), 12.0, 20))
     assert len(poses) == 20
     for one, other in pairwise(poses):
         apart = np.linalg.norm(one[:3, 3] - other[:3, 3])

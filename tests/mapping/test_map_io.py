@@ -86,6 +86,13 @@ def test_intensities_up_to_one_fill_the_bits_of_laz(tmp_path: Path) -> None:
     assert laspy.read(tmp_path / "map.laz").intensity.tolist() == [0, 32768, 65535]
 
 
+def test_intensities_of_a_tile_are_on_the_scale_of_its_map(tmp_path: Path) -> None:
+    dark = PointCloud(np.eye(3), np.eye(3), PointAttributes(intensity=np.array([0.0, 0.6, 1.0], dtype=np.float32)))
+    for brightest, expected in ((255.0, [0, 1, 1]), (1.0, [0, 39321, 65535])):
+        write_cloud(tmp_path / "0_0.laz", dark, brightest)
+        assert laspy.read(tmp_path / "0_0.laz").intensity.tolist() == expected
+
+
 def test_pye57_reads_e57(tmp_path: Path, cloud: PointCloud) -> None:
     pye57 = pytest.importorskip("pye57")
     write_cloud(tmp_path / "map.e57", cloud)

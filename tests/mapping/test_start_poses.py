@@ -9,6 +9,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, is_rigid, rotation_angle, transform_points
 from lidarslam.mapping.motion.deskew import Sweep, move
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.budget import complete
 from lidarslam.mapping.tracking.start_poses import best_starts, best_velocity, turned_poses
 
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
@@ -66,7 +67,7 @@ def test_the_right_yaw_is_found_in_an_l_shaped_room(
     before = exp([0.0, 0.0, 0.2, 0.5, -0.5, 0.1])
     after = before @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
     points = transform_points(inverse(after), l_shaped_room(rng, 3_000))
-    best = best_starts(points, turned_poses(before, UP, 15.0), l_map)
+    best = complete(best_starts(points, turned_poses(before, UP, 15.0), l_map))
     assert (
         np.rad2deg(rotation_angle(inverse(best[0]) @ after)) < 9.0
     )  # of steps of 15; -97 lies 7 from one and 8 from the next
@@ -75,7 +76,7 @@ def test_the_right_yaw_is_found_in_an_l_shaped_room(
 
 def test_no_points_choose_no_start_in_particular(l_map: SurfelMap) -> None:
     starts = turned_poses(T_GIVEN, UP, 90.0)
-    assert best_starts(np.empty((0, 3)), starts, l_map).shape[1:] == (4, 4)
+    assert complete(best_starts(np.empty((0, 3)), starts, l_map)).shape[1:] == (4, 4)
 
 
 @pytest.mark.parametrize("true_deg", [-250.0, -50.0, 0.0, 200.0, 400.0])

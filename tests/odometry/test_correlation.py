@@ -5,12 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 
 from lidarslam.odometry.config import NetworkConfig
 from lidarslam.odometry.images import bird_eye
 from lidarslam.odometry.images.bird_eye import SHIFTS
 from lidarslam.odometry.network.correlation import INPUT_CHANNELS, CorrelationNetwork, column_channels
+from lidarslam.odometry.network.inference_form import InferenceColumns
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.odometry.network.pair_network import PairImages
 from lidarslam.odometry.network.torch_geometry import inverse, log
@@ -232,3 +234,21 @@ def test_grids_are_needed_where_the_network_looks_from_above(network, scans):
     images = torch.cat(scans, dim=1)
     with pytest.raises(ValueError, match="from above"):
         network(PairImages(images, images))
+
+
+def test_the_inference_form_of_the_column_encoder_is_the_encoder() -> None:
+    """Also next to the seam, on empty pixels, and with normalisation far from the first."""
+    torch.manual_seed(3)
+    encoder = CorrelationNetwork().columns
+    for part in encoder.modules():
+        if isinstance(part, nn.BatchNorm2d):
+            part.running_mean.normal_(0.0, 0.3)
+            part.running_var.uniform_(0.3, 2.0)
+            part.weight.data.uniform_(0.5, 1.5)
+            part.bias.data.normal_(0.0, 0.3)
+    points = 8.0 * torch.randn(2, 3, 16, 96) * (torch.rand(2, 1, 16, 96) > 0.3)
+    normals = functional.normalize(torch.randn(2, 3, 16, 96), dim=1) * (points[:, :1] != 0.0)
+    with torch.no_grad():
+        expected = encoder.eval()(points, normals)
+        found = InferenceColumns(encoder).eval()(points, normals)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.odometry.alignment.correspondences import Motion
 from lidarslam.odometry.alignment.point_to_plane import FINE_M, PointToPlane
-from lidarslam.odometry.alignment.residuals import Motion
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.projection import ImageGrid
 

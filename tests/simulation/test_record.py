@@ -13,7 +13,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_table import coordinates
 from lidarslam.datasets.registry import open_recording
-from lidarslam.simulation.recording import record as record_module
+from lidarslam.simulation.recording import sweeps
 from lidarslam.simulation.recording.motion import read_trajectory
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
@@ -42,7 +42,7 @@ def worlds(monkeypatch):
         boxes = Boxes(table[:, :3], table[:, 3:], np.tile(np.eye(3), (len(table), 1, 1)))
         return World(name, seed, Route(corners, 1.0, 1.0, 4.0, 3.0), boxes, height_fields=(floor,))
 
-    monkeypatch.setattr(record_module, "build_world", build)
+    monkeypatch.setattr(sweeps, "build_world", build)
 
 
 def request(out, **changes):

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from lidarslam.commands.shared.jobs import jobs_options, take_where
 from lidarslam.commands.shared.options import (
     PATH,
     CommandWithExample,
@@ -47,13 +48,15 @@ from lidarslam.commands.shared.terminal import EXIT_MENDABLE, say
 @click.option(
     "--prepared", type=PATH, metavar="DIR", help="Cache of preprocessed recordings.  [default: prepared in --out]"
 )
+@jobs_options
 @reader_options
 @config_options
 @click.pass_context
 def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Train the network of the learned odometry, self-supervised: recordings need no labels.
 
-    Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun.
+    Ctrl-C ends the training with the weights so far, and --resume continues it. Several GPUs: start it with torchrun;
+    --jobs and --ray are for the preparation of recordings.
     """
     from lidarslam.odometry.train_extra import require_train_extra
     from lidarslam.storage.default_places import source_name
@@ -65,7 +68,8 @@ def train(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
             raise click.UsageError("the processes of torchrun share a directory; name it with --out")
         out = default_out("trained", source_name(sources[0], options["sequence"]) if sources else "simulated")
     require_train_extra("training")
+    where = take_where(options)
     from lidarslam.train.command import run_train
 
-    if not run_train(sources, say, out=out, **options):
+    if not run_train(sources, say, out=out, where=where, **options):
         ctx.exit(EXIT_MENDABLE)

@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from lidarslam.commands.shared.jobs import jobs_options, take_where
 from lidarslam.commands.shared.names import Registered
 from lidarslam.commands.shared.options import FILE, CommandWithExample, default_out, out_option
 from lidarslam.commands.shared.terminal import say
@@ -50,6 +51,7 @@ _FORMAT = Registered("lidarslam.simulation.writers.registry", "FORMATS")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the random numbers.")
 @click.option("--format", type=_FORMAT, default="mcap", show_default=True, help="Format of the files.")
 @click.option("--imu/--no-imu", default=False, show_default=True, help="Record an IMU of 200 Hz on the LiDAR too.")
+@jobs_options
 @click.option("--overwrite", is_flag=True, help="Replace an earlier simulated recording in the folder.")
 def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **options: Any) -> None:
     """Simulate a recording, with the exact trajectory and the exact map."""
@@ -60,7 +62,8 @@ def simulate(out: Path | None, motion: str | None, trajectory: Path | None, **op
 
     motion = motion or ("handheld" if trajectory is None else "car")
     out = out or default_out("recordings", options["world"])
-    request = RecordRequest(out, motion=motion, trajectory=trajectory, **options)
+    where = take_where(options)
+    request = RecordRequest(out, where=where, motion=motion, trajectory=trajectory, **options)
     with show_count(out.name) as progress:
         summary = record(request, progress)
     say(format_summary(request, summary))

@@ -31,13 +31,21 @@ class CommandWithExample(click.Command):
 
 
 class _Path(click.Path):
-    """A path that is not empty, which would mean the current folder; for evalio:DATASET/SEQUENCE, its folder."""
+    """A path that is not empty, which would mean the current folder.
+
+    For evalio:DATASET/SEQUENCE, its folder; for the URL of a source, where that is fetched to.
+    """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         from lidarslam.datasets.published.evalio_names import located
+        from lidarslam.datasets.published.fetched import fetched, is_url
 
         if value == "":
             self.fail("the path is empty; name a file or a folder", param, ctx)
+        if is_url(value):
+            if not isinstance(param, click.Argument):
+                self.fail("is a URL; only sources are fetched, name a path", param, ctx)
+            return fetched(value)
         path = super().convert(value, param, ctx)
         return located(path) if isinstance(path, Path) else path
 

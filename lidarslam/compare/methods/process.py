@@ -5,7 +5,10 @@ goes to standard output: its number from 1, and how many there are. Libraries' o
 status is that of `lidarslam run`.
 """
 
+import contextlib
+import ctypes
 import os
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,6 +24,7 @@ from lidarslam.run.results import RunOutcome
 from lidarslam.run.run import execute
 
 STOPPED, LOST = 1, 3
+_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 _REQUEST = TypeAdapter(RunRequest)
 
 
@@ -47,6 +51,7 @@ def main() -> int:
     """Run; the exit status."""
     folder, peer, request = sys.argv[1:]
     os.chdir(folder)
+    _obey_parent()
     with os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8") as progress:
         os.dup2(2, 1)
         try:
@@ -58,6 +63,13 @@ def main() -> int:
         print(f"lidarslam: stopped after {outcome.summary.scans} scans: {outcome.stopped}", file=sys.stderr)
         return STOPPED
     return LOST if outcome.summary.went_astray else 0
+
+
+def _obey_parent() -> None:
+    """End with the supervisor, however that ends (Linux), and take its Ctrl-C, which processes of Ray block."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
 def _run(request: RunRequest, peer: str, progress: Callable[[int, int], None]) -> RunOutcome:

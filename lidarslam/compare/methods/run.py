@@ -54,10 +54,7 @@ def run_method(
         command: the process, with the encoded request as its last arguments.
     """
     folder = run.request.out
-    if (folder / LOG).is_file():  # of an earlier comparison
-        for name in (*files.FILES, PROCESS):
-            (folder / name).unlink(missing_ok=True)
-    folder.mkdir(parents=True, exist_ok=True)
+    clear(folder)
 
     def see(line: str) -> None:
         words = line.split()
@@ -70,6 +67,14 @@ def run_method(
     result = MethodResult(folder.name, status, message, wall_s=ending.wall_s, peak_rss_mb=ending.peak_rss_mb)
     RunDirectory(folder).write_json(PROCESS, {name: getattr(result, name) for name in _RECORDED})
     return _collect(run, result), ending.cause == "interrupt"
+
+
+def clear(folder: Path) -> None:
+    """Make a method's directory, or remove what a run of an earlier comparison left there."""
+    if (folder / LOG).is_file():
+        files.remove_files(folder)
+        (folder / PROCESS).unlink(missing_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 def finished_before(run: MethodRun) -> MethodResult | None:

@@ -13,6 +13,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import choose_scans, take_in
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
@@ -57,7 +58,7 @@ def execute_peer(request: RunRequest, peer: Peer, progress: Callable[[int, int],
         tracked = _track(request, recording, chosen, estimated)
         if errors:
             tracked = replace(tracked, error=errors[0])
-        drawn = final_map(tracked, None, request.config.global_map)
+        drawn = final_map(tracked, None, request.config.global_map, directory)
         return write_results(directory, request.config, describe_peer(request, peer), tracked, None, drawn)
 
 
@@ -82,7 +83,8 @@ def _track(request: RunRequest, recording: Recording, chosen: range, estimated: 
             else:
                 unplaced += 1
 
-    pipeline = Pipeline(ExternalOdometry(estimated.trajectory), make_localiser(config), config.global_map)
+    odometry, store = ExternalOdometry(estimated.trajectory), TileStore(request.out)
+    pipeline = Pipeline(odometry, make_localiser(config), config.global_map, store=store)
     with closing(pipeline.run(prefetch(placed()))) as results:
         for result in results:
             ms = estimated.register_ms.get(result.stamp, 0.0)

@@ -9,30 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary.timing import Milliseconds, SlowestScan
 from lidarslam.storage.directory import SCANS_CSV
 
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
-
-
-@dataclass(frozen=True)
-class Milliseconds:
-    """Median and 95th percentile of wall times."""
-
-    median: float
-    p95: float
-
-    @classmethod
-    def of(cls, values: Sequence[float] | FloatArray) -> "Milliseconds":
-        """Of at least one time."""
-        return cls(float(np.median(values)), float(np.percentile(values, 95.0)))
 
 
 @dataclass(frozen=True)
@@ -88,6 +76,7 @@ class WrittenMap:
     moved: int  # number of points that were removed as moving objects
     entropy: float | None = None  # mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed
     fields: tuple[str, ...] = ()  # the attributes of its points
+    tiled: TiledMap | None = None  # all of it, where `points` are those of an overview
 
 
 @dataclass(frozen=True)
@@ -110,6 +99,7 @@ class RunSummary:
     map: WrittenMap
     warnings: tuple[str, ...]
     contradictions: tuple[Contradiction, ...] = ()
+    slowest: SlowestScan | None = None
 
     @property
     def went_astray(self) -> bool:
@@ -129,6 +119,7 @@ class RunSummary:
             "duration_s": self.duration_s,
             "elapsed_s": self.elapsed_s,
             "ms_per_scan": {stage: vars(ms) for stage, ms in self.ms_per_scan.items()},
+            "slowest_scan": None if self.slowest is None else vars(self.slowest),
             "realtime_factor": self.realtime_factor,
             "peak_rss_mb": self.peak_rss_mb,
             "lost_scans": self.lost_scans,
@@ -149,8 +140,14 @@ def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings
         "map_points_moved": written.moved,
         "map_entropy": written.entropy,
         "map_fields": list(written.fields),
+        "map_tiles": None if written.tiled is None else _tiles_json(written.tiled),
         "warnings": list(warnings),
     }
+
+
+def _tiles_json(tiled: TiledMap) -> dict[str, Any]:
+    tiling = tiled.tiling
+    return {"tiles": len(tiled.points), "points": tiled.total, "voxel_size_m": tiling.voxel_size_m}
 
 
 def summarise(
@@ -186,6 +183,7 @@ def summarise(
         map=written,
         warnings=(*log.warnings, *_warnings(log, skipped, contradictions)),
         contradictions=contradictions,
+        slowest=SlowestScan.of(log.stage_ms),
     )
 
 

@@ -9,17 +9,12 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.simulation.casting.mesh import world_mesh
-from lidarslam.simulation.motion.carriers import find_carrier, mount_pose
-from lidarslam.simulation.recorder import SimulatedScan, Simulation
+from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, README, REFERENCE_MAP, new_folder
-from lidarslam.simulation.recording.motion import given_path, plan_motion
-from lidarslam.simulation.recording.path_clearance import check_clearance
 from lidarslam.simulation.recording.reference_map import ReferenceMap, SeenSurfaces, sample_seen
 from lidarslam.simulation.recording.request import RecordingSummary, RecordRequest
+from lidarslam.simulation.recording.sweeps import make_scans, make_simulation
 from lidarslam.simulation.recording.text import format_readme
-from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.worlds.registry import build_world
-from lidarslam.simulation.worlds.street.along import build_along
 from lidarslam.simulation.writers.interface import Rig, clock_s
 from lidarslam.simulation.writers.ply import as_records, write_ply
 from lidarslam.simulation.writers.registry import find_format
@@ -40,19 +35,16 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
     if request.imu and not chosen.imu:
         raise InputError(f"the format {request.format} has no place for an IMU; choose another, or leave out --imu")
     with new_folder(request.out, request.overwrite) as folder:
-        simulation = _simulation(request)
+        simulation = make_simulation(request)
         sensor, spacing_m = simulation.sensor, simulation.world.map_spacing_m
         seen = SeenSurfaces()
         counts: list[int] = []
 
         def scans() -> Iterator[SimulatedScan]:
-            for index in range(len(simulation)):
-                echoes = simulation.echoes(index)
-                seen.add_sweep(echoes, sensor.ranging.min_range_m)
-                simulated = simulation.scan(index, echoes)
+            for simulated in make_scans(request, simulation, seen):
                 counts.append(len(simulated.scan))
                 yield simulated
-                progress(index + 1, len(simulation))
+                progress(len(counts), len(simulation))
 
         imu = simulation.imu if request.imu else None
         chosen.writer()(folder, scans(), Rig(sensor.driver, sensor.period_s, simulation.T_world_lidar_at, imu))
@@ -74,21 +66,6 @@ def record(request: RecordRequest, progress: Progress) -> RecordingSummary:
         )
         (folder / README).write_text(format_readme(request, summary), encoding="utf-8")
     return summary
-
-
-def _simulation(request: RecordRequest) -> Simulation:
-    """The simulation that was asked for; a street is built along the trajectory, if there is one."""
-    sensor = find_sensor(request.sensor)
-    if request.world == "street" and request.trajectory is not None:
-        world = build_along(given_path(request.trajectory, request.motion), request.seed)
-    else:
-        world = build_world(request.world, request.seed)
-    motion, scans = plan_motion(request, world, sensor)
-    T_body_lidar = mount_pose(request.mount, motion.sensor_height_m)
-    simulation = Simulation(world, sensor, motion, T_body_lidar, scans, request.seed)
-    if request.trajectory is not None:
-        check_clearance(simulation, find_carrier(request.motion), str(request.trajectory))
-    return simulation
 
 
 def _write_map(path: Path, true_map: ReferenceMap) -> None:

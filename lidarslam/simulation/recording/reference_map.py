@@ -51,14 +51,22 @@ class SeenSurfaces:
 
     def add(self, points: FloatArray, normals: FloatArray, from_behind: NDArray[np.bool_]) -> None:
         """Add hits (N, 3) with their surfaces' outward normals (N, 3) and whether they were met from inside (N,)."""
-        self._pending.append(_unique(_voxels(points, self.voxel_m) | _sectors(normals) | from_behind))
+        self.add_keys(_unique(_voxels(points, self.voxel_m) | _sectors(normals) | from_behind))
+
+    def keys(self) -> KeyArray:
+        """Sorted keys of what was seen."""
+        self._merge()
+        return self._keys
+
+    def add_keys(self, keys: KeyArray) -> None:
+        """Add what was seen elsewhere, by its keys."""
+        self._pending.append(keys)
         if sum(map(len, self._pending)) > max(_BLOCK, len(self._keys)):
             self._merge()
 
     def around(self) -> KeyArray:
         """Sorted keys of the seen voxels and all that touch them."""
-        self._merge()
-        return _spread(self._keys)
+        return _spread(self.keys())
 
     def _merge(self) -> None:
         self._keys = _unique(np.concatenate([self._keys, *self._pending]))

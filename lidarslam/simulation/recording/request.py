@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lidarslam.core.tasks.tasks import SERIAL, Where
+
 
 @dataclass(frozen=True)
 class RecordRequest:
@@ -20,6 +22,7 @@ class RecordRequest:
     speed_mps: float | None = None  # where no bend slows it down, instead of the carrier's own and the route's limit
     imu: bool = False  # whether an IMU is recorded too
     overwrite: bool = False  # whether an earlier recording in `out` is replaced
+    where: Where = SERIAL  # whether scans are made one after another or side by side
 
     @property
     def moved(self) -> str:

@@ -16,6 +16,7 @@ WORLDS: dict[str, str] = {
     "park": "open_country.park",
     "fields": "open_country.fields",
     "terrace": "street.terrace",
+    "town": "street.town",
 }
 
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from lidarslam.config.settings import Config
 from lidarslam.core.text.plain_text import count, scan_span, small_length
-from lidarslam.storage.directory import RUN_SECTION, SCANS_CSV
+from lidarslam.storage.directory import MAP_TILES, RUN_SECTION, SCANS_CSV
 
 # Stretches of lost scans that are listed; scans.csv has them all.
 _LISTED = 3
@@ -35,7 +35,9 @@ def describe_results(summary: Mapping[str, Any]) -> dict[str, str]:
         moved = summary["map_points_moved"]
         removed = f"; {count(moved, 'point')} of moving objects removed" if moved else ""
         voxel = small_length(summary["map_voxel_size_m"])
-        shown["map"] = f"{count(summary['map_points'], 'point')}, voxels of {voxel}{removed}"
+        tiles = summary.get("map_tiles")
+        whole = f", of {tiles['points']:,} in {MAP_TILES}/" if tiles else ""
+        shown["map"] = f"{count(summary['map_points'], 'point')}{whole}, voxels of {voxel}{removed}"
     if summary["pose_graph"] is not None:
         graph = summary["pose_graph"]
         closed = count(summary["loop_closures"], "loop")

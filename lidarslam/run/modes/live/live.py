@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
 
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.faults import Faults
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
@@ -56,7 +58,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     node = _open_node(request.domain)
     if request.rerun == "spawn":
         require_window("serve a browser with --rerun web, or write a file with --rerun save")
-    config, log, faults = request.config, ScanLog(), Faults()
+    config, log, faults = bounded(request.config), ScanLog(), Faults()
     require_scans_only(config)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
@@ -76,7 +78,10 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
             topic = find_topic(node.published, request.topic, request.domain)
             show(f"{topic.name}: waiting for the first scan")
             with viewing(request.rerun, config.viewer, topic.name, directory, log, page) as viewer:
-                with threadpool_limits(1, "blas"), LiveSession(config, odometry, graph, log, faults, viewer) as session:
+                with (
+                    threadpool_limits(1, "blas"),
+                    LiveSession(config, odometry, graph, log, faults, viewer, TileStore(request.out)) as session,
+                ):
                     decoder = CloudDecoder(config.reader, topic.message_type, faults)
                     follower = _follower(request, node, session, decoder)
                     incoming = IncomingQueue(node.subscribe(topic).take, request.queue, follower.on_arrival)
@@ -88,7 +93,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
                 for warning in counts.warnings():
                     log.warn(warning)
                 closed = close_loops(graph, tracked.global_map, log, viewer)
-                drawn = final_map(tracked, closed, config.global_map)
+                drawn = final_map(tracked, closed, config.global_map, directory)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
             described = _describe(request, topic.name)
@@ -99,6 +104,13 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
             show("drawing the report")
             leave_report(request.out, Accuracy(outcome.metrics))
     return LiveOutcome(outcome, topic.name, counts, is_interrupted)
+
+
+def bounded(config: Config) -> Config:
+    """The configuration with a budget of a scan's mapping, which follows the rate of the sensor unless one is given."""
+    if config.mapping.budget_ms is not None:
+        return config
+    return config.model_copy(update={"mapping": config.mapping.model_copy(update={"budget_ms": "auto"})})
 
 
 def _follower(request: LiveRequest, node: "DdsNode", session: LiveSession, decoder: CloudDecoder) -> "Follower":

@@ -11,6 +11,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import look_at
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.background_worker import BackgroundWorker
 from lidarslam.pipeline.estimates import Estimated, Localised
@@ -36,6 +37,7 @@ class LiveSession:
         odometry, graph: new; closed by the caller.
         log, faults: of the scans.
         viewer: shown every scan, on the thread of the map.
+        store: of the global map, see `lidarslam.pipeline.map_building.MapBuilder`.
     """
 
     def __init__(
@@ -46,8 +48,9 @@ class LiveSession:
         log: ScanLog,
         faults: Faults,
         viewer: Viewer,
+        store: TileStore | None = None,
     ) -> None:
-        self._stages = Stages(odometry, make_localiser(config), config.global_map, graph)
+        self._stages = Stages(odometry, make_localiser(config), config.global_map, graph, store)
         self._builder = BackgroundWorker("map", _SCANS_BEHIND)
         self._log, self._faults, self._viewer = log, faults, viewer
 

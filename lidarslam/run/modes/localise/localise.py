@@ -13,6 +13,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.datasets.intake import choose_scans
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
+from lidarslam.mapping.global_map.drawing import DrawnMap
 from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.localisation import ScanToMap
@@ -20,7 +21,7 @@ from lidarslam.run.interruption import Interruptions
 from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
 from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
 from lidarslam.run.request import log_choices
-from lidarslam.run.results import DrawnMap, RunOutcome, write_results
+from lidarslam.run.results import RunOutcome, write_results
 from lidarslam.run.run import open_odometry, require_apart, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.summary import WrittenMap, summarise

@@ -31,7 +31,7 @@ def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     yield f"found at scan {found.found}, confirmed at scan {found.confirmed}, after {found.after_s:.1f} s"
     before = f", {found.placed_afterwards:,} before that placed afterwards" if found.placed_afterwards else ""
     yield f"{found.tracked:,} scans tracked in the map{before}, {summary.lost_scans:,} lost"
-    yield f"{total.median:.0f} ms a scan (95 % under {total.p95:.0f} ms), {summary.elapsed_s:.1f} s for all;" + (
+    yield f"{total.median:.0f} ms a scan (99 % under {total.p99:.0f} ms), {summary.elapsed_s:.1f} s for all;" + (
         f" {summary.peak_rss_mb:,.0f} MB of memory"
     )
     for warning in summary.warnings:

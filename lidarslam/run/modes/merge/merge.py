@@ -16,7 +16,7 @@ from lidarslam.run.loop_closing import FinishedGraph, begin_graph
 from lidarslam.run.modes.merge.parts import MergeRequest, closing_loops, earlier_parts, open_parts, remove_part
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.request import RunRequest, describe_run
-from lidarslam.run.results import RunOutcome, drawn_map, final_map, write_map, write_results
+from lidarslam.run.results import RunOutcome, draw, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.summary import GraphSummary, WrittenMap, peak_rss_mb
@@ -156,7 +156,11 @@ def _write(
     """Optimise the graph, and write the runs and the common map."""
     voxel_size_m = parts[0].request.config.global_map.voxel_size_m
     scans = [part.scans for part in parts]
-    finished = None if voxel_size_m is None else FinishedGraph.of_recordings(graph, scans, voxel_size_m)
+    finished = (
+        None
+        if voxel_size_m is None
+        else FinishedGraph.of_recordings(graph, scans, voxel_size_m, request.config.global_map.most_points)
+    )
     joined = [] if finished is None else finished.joined
     runs = tuple(_write_run(part, finished, index, index in joined) for index, part in enumerate(parts))
     common = None if finished is None else finished.common()
@@ -170,7 +174,7 @@ def _write(
             if part.tracked is not None:
                 views.append(part.tracked.views.placed(common.T_world_lidar[begin : begin + part.scans]))
             begin += part.scans
-        drawn = drawn_map(common.global_map, PlacedViews.join(views), request.config.global_map)
+        drawn = draw(common.global_map, PlacedViews.join(views), request.config.global_map, directory)
         written = write_map(directory, drawn, request.map_formats)
     recordings = tuple(_entry(part, runs[index], index in joined) for index, part in enumerate(parts))
     summary = MergeSummary(
@@ -199,7 +203,7 @@ def _write_run(part: _Part, finished: FinishedGraph | None, index: int, is_joine
         part.tracked.log.correct(closed.T_world_lidar)
     if not is_joined:
         part.tracked.log.warn(_OF_ITS_OWN)
-    drawn = final_map(part.tracked, closed, part.request.config.global_map)
+    drawn = final_map(part.tracked, closed, part.request.config.global_map, part.directory)
     request = part.request
     return write_results(
         part.directory, request.config, describe_run(request), part.tracked, closed, drawn, request.map_formats

@@ -9,6 +9,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import cKDTree
 
@@ -41,7 +42,7 @@ _LONGEST_SIDE_M = 5_000.0
 _FULL_M = 700.0
 
 
-def build_along(path: FloatArray, seed: int) -> World:
+def build_along(path: FloatArray, seed: int, fullness: float | None = None) -> World:
     """A street with the path in its middle; within `FREE_SIDE_M` of the path, at any height, there is only the road.
 
     The route goes along the path and back.
@@ -49,9 +50,10 @@ def build_along(path: FloatArray, seed: int) -> World:
     Args:
         path: (N, 2) polyline, or (N, 3) with the height of the ground; else the ground is gently hilly.
         seed: of everything that the path leaves open.
+        fullness: share of houses with ornaments, and of kerbs with cars and trees; None: less the longer the path.
 
     Raises:
-        InputError: the path is shorter than a metre, or extends over more than 5 km.
+        InputError: the path is shorter than 1 m, or extends over more than 5 km.
     """
     extent = np.ptp(path[:, :2], axis=0)
     length = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()
@@ -65,7 +67,9 @@ def build_along(path: FloatArray, seed: int) -> World:
     ground = _ground(rng, course)
     there = course.points[:: round(2.0 / _STEP_M), :2]
     route = Route(on_ground(np.concatenate([there, there[-2:0:-1]]), ground), 2.0, FREE_SIDE_M, 4.0, 11.0)
-    rows = _Rows(rng, course, ground)
+    fullness = min(1.0, _FULL_M / course.length_m) if fullness is None else fullness
+    taken = np.zeros(np.ceil(np.multiply(ground.heights.shape, ground.cell_m)).astype(int), dtype=bool)
+    rows = _Rows(rng, course, ground, fullness, taken)
     rows.build(replace(route, free_height_m=1e3))
     return World("street", seed, route, *rows.solid.solids, (ground,), tuple(rows.people()), map_spacing_m=0.1)
 
@@ -115,9 +119,7 @@ class Course:
     def distance(self, xy: FloatArray) -> FloatArray:
         """Distance (M,) of points (M, 2) from the nearest part of the course."""
         nearest = self.tree.query(xy)[0]
-        return np.asarray(
-            np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0))
-        )  # between two points it is nearer
+        return np.asarray(np.sqrt(np.maximum(nearest**2 - (0.5 * _STEP_M) ** 2, 0.0)))  # nearer between two points
 
 
 def _ground(rng: np.random.Generator, course: Course) -> HeightField:
@@ -139,13 +141,10 @@ class _Rows:
     rng: np.random.Generator
     course: Course
     ground: HeightField
+    fullness: float
+    taken: NDArray[np.bool_]  # (X, Y) cells of one metre of the ground
     solid: Builder = field(default_factory=Builder)
     _loose: Builder = field(default_factory=Builder)  # may reach into the free space, and is pruned
-    _taken: set[tuple[int, int]] = field(default_factory=set)  # cells of one metre
-
-    @property
-    def _fullness(self) -> float:
-        return min(1.0, _FULL_M / self.course.length_m)
 
     def build(self, free: Route) -> None:
         """Add everything; houses first, they need most room."""
@@ -159,11 +158,12 @@ class _Rows:
 
     def _claim(self, footprint: FloatArray, nearest_m: float) -> bool:
         """Take the cells of points (M, 2) if they are free and keep that distance from the course; whether they did."""
-        cells = {(int(x), int(y)) for x, y in np.floor(footprint)}
-        if self.course.distance(footprint).min() < nearest_m or not self._taken.isdisjoint(cells):
-            return False
-        self._taken |= cells
-        return True
+        x, y = np.floor(footprint - self.ground.origin_xy).astype(int).T
+        # Most are refused by their first point, which saves the search for all.
+        is_free = self.course.distance(footprint[:1])[0] >= nearest_m and not self.taken[x, y].any()
+        is_free = is_free and self.course.distance(footprint).min() >= nearest_m
+        self.taken[x, y] |= is_free
+        return bool(is_free)
 
     def _houses(self, side: Course) -> None:
         at = 0.0
@@ -190,12 +190,12 @@ class _Rows:
             where = origin + 0.5 * width * along + 4.0 * left_of(along)
             self._loose.place(tree, upright(self.ground, where, 0.0))
             return
-        is_plain = bool(self.rng.random() > self._fullness)
+        is_plain = bool(self.rng.random() > self.fullness)
         part = house(self.rng, width, depth, (not is_plain, not is_plain), is_plain=is_plain)
         self.solid.place(part, house_pose(self.ground, origin, along, width))
 
     def _cars(self, side: Course) -> None:
-        taken = self._fullness * self.rng.uniform(0.45, 0.8)
+        taken = self.fullness * self.rng.uniform(0.45, 0.8)
         for at in np.arange(4.0, side.length_m - 4.0, 6.0):
             if self.rng.random() > taken:
                 continue
@@ -214,7 +214,7 @@ class _Rows:
             if self._claim(where[None], HALF_WIDTH_M + 0.7):
                 pose = upright(self.ground, where, heading(where - side.beside(at, HALF_WIDTH_M + 1.9)))
                 lamp_height = self.rng.uniform(5.0, 7.5) if k % 4 == 0 else 0.0
-                has_tree = bool(self.rng.random() < 0.45 * self._fullness)
+                has_tree = bool(self.rng.random() < 0.45 * self.fullness)
                 furnish_pavement(self._loose, self._loose, self.rng, pose, lamp_height, has_tree)
 
     def _kerb_stones(self) -> Iterator[tuple[FloatArray, FloatArray]]:

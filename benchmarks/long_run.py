@@ -1,0 +1,268 @@
+"""Whether a run of 20,000 scans and 20 km with loops stays as it begins, and how far off it ends, beside its peers.
+
+    python benchmarks/long_run.py --out long_run
+    python benchmarks/long_run.py --out long_run --scans 3000 --odometry learned --peers
+
+A car drives through the simulated `town`, every street in both directions, then the same again. A process of its own
+simulates; the scans go from memory to memory into the pipeline of `lidarslam run` with its pose graph, which saves its
+state now and then, and to each peer in a process of its own. None is stored, all have the same scans.
+
+Prints a Markdown table, a row every `--every` scans: wall time of a scan, median and 99th percentile over those since
+the row before, of all stages but reading; the same of keyframes, on the graph's own thread; processor time of the whole
+process a scan; resident memory; size of the saved state and seconds to save it; size of the submaps on disk; cells of
+the local map, points of the global map, keyframes, loops accepted; the error of the position as it was registered. Then
+the time of the final optimisation and of drawing the map anew, and ATE and KITTI's drift of all methods. The folder
+has the rows in `rows.jsonl` and the peers' in `NAME.jsonl`, as they come, and the end in `end.json`;
+`benchmarks/long_run_plot.py` draws them. A file `stop` in the folder ends the drive there, and everything is measured
+on the scans so far.
+
+Linux only: memory is read from /proc.
+"""
+
+import argparse
+import json
+import logging
+import multiprocessing
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from long_run_peers import FedPeer, add_line, feed_peers
+from mapping_accuracy import make_simulation, print_row
+from mapping_memory import resident_mb
+
+from lidarslam.config.settings import Config
+from lidarslam.core.geometry import inverse
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
+from lidarslam.mapping.config import PoseGraphConfig
+from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.odometry.config import OdometryConfig
+from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.pipeline.pipeline import Pipeline
+from lidarslam.pipeline.scan_stream import prefetch
+from lidarslam.run.checkpoints import Checkpoints
+from lidarslam.run.loop_closing import begin_graph
+from lidarslam.run.scan_log import ScanLog
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensors.scan_patterns import Spinning
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.unfinished import Unfinished
+
+
+@dataclass(frozen=True)
+class Row:
+    """How things stand after so many scans; times are of the scans since the row before."""
+
+    scans: int
+    way_km: float
+    median_ms: float
+    p99_ms: float
+    keyframe_median_ms: float
+    keyframe_p99_ms: float
+    cpu_ms: float
+    rss_mb: float
+    state_mb: float
+    save_s: float
+    submaps_mb: float
+    cells: int
+    map_points: int
+    keyframes: int
+    loops: int
+    error_m: float
+
+    def cells_of_table(self) -> list[str]:
+        """As text."""
+        return [f"{value:,}" if isinstance(value, int) else f"{value:,.1f}" for value in asdict(self).values()]
+
+
+class TimedCheckpoints(Checkpoints):
+    """Knows how long the last one took."""
+
+    save_s = 0.0
+
+    def save(self, pipeline: Pipeline) -> None:
+        """Save, and take the time."""
+        started = time.perf_counter()
+        super().save(pipeline)
+        self.save_s = time.perf_counter() - started
+
+
+def simulate(options: argparse.Namespace, sink: Connection) -> None:
+    """The simulator's process: first the truth, then one scan after the other."""
+    simulation = make_simulation(options.world, options.motion, options.sensor, options.scans, options.seed)
+    sensor = simulation.sensor
+    if options.columns and isinstance(sensor.pattern, Spinning):
+        sensor = replace(sensor, pattern=replace(sensor.pattern, columns=options.columns))
+    simulation = Simulation(
+        simulation.world, sensor, simulation.motion, simulation.T_body_lidar, options.scans, options.seed
+    )
+    sink.send(simulation.ground_truth)
+    for scan in simulation.scans():
+        sink.send(scan)
+    sink.close()
+
+
+def received(source: Connection, count: int, stop: Path) -> Iterator[Scan]:
+    """So many scans from the simulator, or fewer once there is a file of that name."""
+    for number in range(count):
+        if number % 100 == 0 and stop.exists():
+            return
+        yield source.recv()
+
+
+def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -> dict[str, Any]:
+    """Our own pipeline over all scans, with a row now and then; what there is to report in the end."""
+    config = Config(odometry=OdometryConfig(method=options.odometry), pose_graph=PoseGraphConfig(enabled=True))
+    mapper = SurfelMapper(config.mapping)  # as `lidarslam run` makes it, but in reach
+    with ExitStack() as stack:
+        directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
+        unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
+        graph = begin_graph(config, file=unfinished.submaps)
+        assert graph is not None
+        stack.callback(graph.close)
+        log, odometry = ScanLog(), make_odometry(config.odometry)
+        stack.callback(odometry.close)
+        checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
+        pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, graph, checkpoints)
+        scans = checkpoints.begin(pipeline, scans, is_recorded=False)
+        for row in _rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished):
+            print_row(row.cells_of_table())
+            add_line(options.out / "rows.jsonl", asdict(row))
+        return _finish(graph, log, pipeline, truth)
+
+
+def _rows(
+    every: int,
+    scans: Iterator[Scan],
+    truth: Trajectory,
+    pipeline: Pipeline,
+    mapper: SurfelMapper,
+    log: ScanLog,
+    graph: SlamGraph,
+    checkpoints: TimedCheckpoints,
+    unfinished: Unfinished,
+) -> Iterator[Row]:
+    lengths_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
+    T_first_world = inverse(truth.T_world_lidar[0])
+    ms: list[float] = []
+    keyframes, cpu = 0, time.process_time()
+    for number, result in enumerate(pipeline.run(prefetch(scans)), 1):
+        log.add(result)
+        ms.append(sum(value for stage, value in result.stage_ms.items() if stage != "read"))
+        if number % every:
+            continue
+        keyframe_ms = graph.keyframe_ms[keyframes:] or [np.nan]
+        true_position = (T_first_world @ truth.T_world_lidar[number - 1])[:3, 3]
+        row = Row(
+            scans=number,
+            way_km=float(lengths_m[number - 1]) / 1e3,
+            median_ms=float(np.median(ms)),
+            p99_ms=float(np.percentile(ms, 99.0)),
+            keyframe_median_ms=float(np.median(keyframe_ms)),
+            keyframe_p99_ms=float(np.percentile(keyframe_ms, 99.0)),
+            cpu_ms=1e3 * (time.process_time() - cpu) / every,
+            rss_mb=resident_mb(),
+            state_mb=unfinished.state.stat().st_size / 2**20 if unfinished.state.exists() else 0.0,
+            save_s=checkpoints.save_s,
+            submaps_mb=unfinished.submaps.stat().st_size / 2**20,
+            cells=0 if mapper.local_map is None else len(mapper.local_map),
+            map_points=0 if pipeline.map.global_map is None else len(pipeline.map.global_map.points()),
+            keyframes=len(graph.keyframe_ms),
+            loops=sum(closure.accepted for closure in list(graph._closures)),
+            error_m=float(np.linalg.norm(true_position - result.T_world_lidar[:3, 3])),
+        )
+        yield row
+        ms, keyframes, cpu = [], len(graph.keyframe_ms), time.process_time()
+
+
+def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajectory) -> dict[str, Any]:
+    """Optimise, draw the map anew, and hold the trajectory against the truth, before and after."""
+    stamps, before = log.stamps, log.trajectory
+    started = time.perf_counter()
+    result = graph.finish()
+    optimise_s = time.perf_counter() - started
+    assert result is not None
+    assert pipeline.map.voxel_size_m is not None
+    drawn = graph.draw_map(result, pipeline.map.voxel_size_m)
+    return {
+        "optimise_s": optimise_s,
+        "draw_s": time.perf_counter() - started - optimise_s,
+        "map_points": len(drawn.points()),
+        "loops": sum(result.inliers),
+        "rss_mb": resident_mb(),
+        "methods": {
+            "before the graph": errors(before, truth),
+            "after the graph": errors(Trajectory(stamps, result.T_world_lidar), truth),
+        },
+    }
+
+
+def errors(estimate: Trajectory, truth: Trajectory) -> dict[str, float | None]:
+    """ATE and KITTI's drift."""
+    found: TrajectoryMetrics = evaluate_trajectory(estimate, truth)
+    drift = None if found.kitti is None else found.kitti.overall
+    return {
+        "ate_m": found.errors.ate_rmse_m,
+        "drift_percent": None if drift is None else drift.translation_percent,
+        "drift_deg_per_100m": None if drift is None else 100.0 * drift.rotation_deg_per_m,
+    }
+
+
+def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> dict[str, Any]:
+    """Print the end, with the peers beside ours."""
+    print(
+        f"\nfinal optimisation {found['optimise_s']:.1f} s ({found['loops']} loops kept), map drawn anew in"
+        f" {found['draw_s']:.1f} s ({found['map_points']:,} points), {found['rss_mb']:.0f} MB\n"
+    )
+    for peer in peers:
+        estimate = peer.result()
+        if estimate is not None:
+            found["methods"][peer.name] = errors(estimate, truth)
+    print_row(["method", "ATE, m", "drift, %", "drift, degrees in 100 m"])
+    print_row(["---"] * 4)
+    for name, measured in found["methods"].items():
+        print_row([name, *("" if value is None else f"{value:.3f}" for value in measured.values())])
+    return found
+
+
+def main() -> None:
+    """Parse the command line, run everything, print and draw it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of what was measured")
+    parser.add_argument("--world", default="town")
+    parser.add_argument("--motion", default="car-fast")
+    parser.add_argument("--sensor", default="vlp-16")
+    parser.add_argument("--columns", type=int, help="of a turn, to make less of a spinning sensor")
+    parser.add_argument("--scans", type=int, default=20_000)
+    parser.add_argument("--every", type=int, default=1_000)
+    parser.add_argument("--odometry", default="constant-velocity", help="in front of the map")
+    parser.add_argument("--peers", nargs="*", default=["kiss-icp", "kiss-slam"])
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    logging.disable(logging.INFO)
+    options.out.mkdir(parents=True)
+    context = multiprocessing.get_context("spawn")
+    source, sink = context.Pipe(duplex=False)
+    simulator = context.Process(target=simulate, args=(options, sink), daemon=True)
+    simulator.start()
+    truth = source.recv()
+    print_row(list(Row.__dataclass_fields__))
+    print_row(["---"] * len(Row.__dataclass_fields__))
+    peers = [FedPeer(context, name, options.every, options.out / f"{name}.jsonl") for name in options.peers]
+    found = run(options, feed_peers(received(source, options.scans, options.out / "stop"), peers), truth)
+    found = report(found, peers, truth)
+    (options.out / "end.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

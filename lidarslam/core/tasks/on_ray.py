@@ -1,0 +1,190 @@
+"""Tasks side by side as tasks of Ray: on this machine, or on a cluster; the only file that knows ray."""
+
+import contextlib
+import logging
+import os
+import signal
+import socket
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+import ray
+from ray import exceptions
+
+from lidarslam.core.errors import ConfigError, InputError, LidarSlamError, OutputError
+from lidarslam.core.tasks.tasks import OnDone, Tasks, Where
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+# Of a task whose process or machine died.
+_RETRIES = 3
+# Results are small; what does not fit is written to disk.
+_OBJECT_STORE_BYTES = 128 * 2**20
+_ANSWER_S = 5.0
+_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@contextlib.contextmanager
+def ray_tasks(where: Where) -> Iterator[Tasks]:
+    """A Ray of our own on this machine, which ends with the context, or the connection to a cluster.
+
+    Raises:
+        ConfigError: there is no such cluster, or Ray does not start.
+    """
+    logging.getLogger("ray").setLevel(logging.CRITICAL)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_environment(where))
+        place = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarslam-", ignore_cleanup_errors=True))
+        stack.callback(ray.shutdown)
+        try:
+            with _own_signals():
+                _connect(where, place)
+        except (OSError, RuntimeError, ValueError, TimeoutError) as error:
+            raise ConfigError(_no_ray(where, error)) from error
+        slots = int(ray.cluster_resources().get("CPU", 0))
+        if not slots:
+            raise ConfigError(f"--ray {where.cluster}: the cluster has no CPU; start nodes with ray start")
+        yield RayTasks(slots)
+
+
+def _connect(where: Where, place: str) -> None:
+    """To a cluster, or to a Ray of our own, which keeps its files in a folder."""
+    quiet: dict[str, Any] = {"logging_level": logging.CRITICAL, "log_to_driver": False}
+    if where.cluster is not None:
+        _require_answer(where.cluster)
+        ray.init(address=where.cluster, **quiet)
+        return
+    own: dict[str, Any] = {"object_store_memory": _OBJECT_STORE_BYTES, "include_dashboard": False, "_temp_dir": place}
+    ray.init(address="local", num_cpus=where.jobs, **own, **quiet)
+
+
+class RayTasks:
+    """The tasks of one connection."""
+
+    def __init__(self, slots: int) -> None:
+        self.slots = slots
+
+    def run(
+        self, function: Callable[[T], R], items: Sequence[T], on_done: OnDone | None = None, ahead: int | None = None
+    ) -> Iterator[R]:
+        """As `Tasks.run`."""
+        remote: Any = ray.remote(num_cpus=1, max_retries=_RETRIES)(_carry_out)
+        shared = ray.put((function, version("lidarslam")))
+        running: dict[Any, int] = {}
+        results: dict[int, Any] = {}
+        begun = taken = 0
+        try:
+            while taken < len(items):
+                while begun < len(items) and (ahead is None or begun < taken + ahead):
+                    running[remote.remote(shared, items[begun])] = begun
+                    begun += 1
+                if taken in results:
+                    yield results.pop(taken)
+                    taken += 1
+                    continue
+                _take(ray.wait([*running], num_returns=1)[0], running, results, on_done)
+        except BaseException:
+            _end(running, results, on_done)
+            raise
+
+
+def _take(done: list[Any], running: dict[Any, int], results: dict[int, Any], on_done: OnDone | None) -> None:
+    """Take the results of tasks that ended."""
+    for reference in done:
+        index = running.pop(reference)
+        try:
+            result = ray.get(reference)
+        except exceptions.RayTaskError as error:
+            raise _of_task(error) from None
+        except exceptions.RayError as error:
+            name = type(error).__name__
+            raise LidarSlamError(
+                f"a task came to no result in {_RETRIES + 1} attempts ({name}); see Ray's log"
+            ) from error
+        if isinstance(result, LidarSlamError):
+            raise result
+        results[index] = result
+        if on_done is not None:
+            on_done(index, result)
+
+
+def _end(running: dict[Any, int], results: dict[int, Any], on_done: OnDone | None) -> None:
+    """Interrupt all tasks as Ctrl-C would, and wait until they have ended; a second Ctrl-C ends that."""
+    for reference in running:
+        ray.cancel(reference, force=False)
+    while running:
+        done = ray.wait([*running], num_returns=1)[0]
+        with contextlib.suppress(Exception):  # cancelled, or as it was interrupted
+            _take(done, running, results, on_done)
+
+
+def _of_task(error: Any) -> Exception:
+    """What a task raised."""
+    if isinstance(error.cause, ImportError):
+        return ConfigError(f"a node of the cluster lacks a library or has another lidarslam: {error.cause}")
+    return error.cause if isinstance(error.cause, Exception) else RuntimeError(str(error))
+
+
+def _carry_out(shared: tuple[Callable[[T], R], str], item: T) -> R | LidarSlamError:
+    """One task, in a process of Ray; an error that the user can mend is its result.
+
+    Ray would try to pickle the error itself, with the arguments of its class.
+    """
+    function, expected = shared
+    if version("lidarslam") != expected:
+        return ConfigError(f"a node of the cluster has lidarslam {version('lidarslam')} and not {expected}; update it")
+    for name in _THREADS:
+        os.environ.setdefault(name, os.environ.get("OMP_NUM_THREADS", "1"))
+    try:
+        return function(item)
+    except LidarSlamError as error:
+        kinds = (InputError, ConfigError, OutputError, LidarSlamError)
+        return next(kind for kind in kinds if isinstance(error, kind))(str(error))
+
+
+@contextlib.contextmanager
+def _environment(where: Where) -> Iterator[None]:
+    """The environment that Ray's processes inherit: no report to its makers, our own limits of memory, and threads.
+
+    Each task on this machine has its share of the cores; on a cluster Ray gives it one.
+    """
+    wanted = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_memory_monitor_refresh_ms": "0"}
+    if where.cluster is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        wanted |= dict.fromkeys(_THREADS, str(max(1, cores // where.jobs)))
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+
+
+@contextlib.contextmanager
+def _own_signals() -> Iterator[None]:
+    """Ray's handler of SIGTERM, which would end the program, is taken out again."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
+
+
+def _require_answer(address: str) -> None:
+    """Raise OSError where nothing listens at HOST:PORT; Ray would try for minutes."""
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdecimal() and "/" not in host:
+        socket.create_connection((host.strip("[]"), int(port)), _ANSWER_S).close()
+
+
+def _no_ray(where: Where, error: Exception) -> str:
+    reason = " ".join(str(error).split())
+    if where.cluster is None:
+        return f"--jobs {where.jobs}: Ray does not start: {reason}"
+    return f"--ray {where.cluster}: no cluster answers there; this machine has to be one of its nodes ({reason})"

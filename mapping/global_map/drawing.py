@@ -1,0 +1,114 @@
+"""The final map: without dynamic points, in one piece, or in tiles with a thinned overview."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarslam.mapping.config import GlobalMapConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud, VoxelMeans
+from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
+from lidarslam.mapping.global_map.tile_store import Tile, Tiling
+
+logger = logging.getLogger(__name__)
+
+# Width of the neighbours' points that take part in the normals of a tile's.
+_MARGIN_M = 10.0
+# Voxels of an overview grow by this factor at a time, which leaves two thirds of the points.
+_COARSER = 2.0**0.25
+
+
+@dataclass(frozen=True)
+class TiledMap:
+    """A map in tiles, each of them with at least one point."""
+
+    tiling: Tiling
+    points: dict[Tile, int]  # how many there are in each tile
+    brightest: float  # the largest intensity in all of them
+
+    @property
+    def total(self) -> int:
+        """How many points there are."""
+        return sum(self.points.values())
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMap:
+    """The final map."""
+
+    # cloud, voxel_size_m: its points, one in each voxel; None when no scan was added
+    cloud: PointCloud | None
+    voxel_size_m: float | None
+    moved: int = 0  # number of points that were removed as moving objects
+    tiled: TiledMap | None = None  # all of the map, where `cloud` is an overview
+
+
+WriteTile = Callable[[Tile, PointCloud, float], None]
+"""Called with each tile that has points, these points, and the largest intensity of the map."""
+
+
+def drawn_map(
+    global_map: GlobalMap | None, views: PlacedViews, config: GlobalMapConfig, write_tile: WriteTile | None = None
+) -> DrawnMap:
+    """A map without the points that the views see through.
+
+    A map that is not in memory as a whole is drawn tile by tile, and thinned to the number of points that it may have.
+    """
+    if global_map is None:
+        return DrawnMap(None, None)
+    if not global_map.is_whole:
+        return _drawn_in_tiles(global_map, views, config, write_tile)
+    moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
+    cloud = global_map.cloud(config.min_hits, moved)
+    return DrawnMap(_with_fields(cloud, config), global_map.voxel_size_m, int(moved.sum()))
+
+
+def _drawn_in_tiles(
+    global_map: GlobalMap, views: PlacedViews, config: GlobalMapConfig, write_tile: WriteTile | None
+) -> DrawnMap:
+    tiles, brightest = global_map.tiles(), global_map.brightest()
+    logger.info("drawing the map in %d tiles", len(tiles))
+    overview = _Overview(global_map.voxel_size_m, global_map.most_points)
+    points, moved_in_all = {}, 0
+    for tile in tiles:
+        part = global_map.tile(tile, _MARGIN_M)
+        inside = part.lies_in(tile, config.min_hits)
+        moved = seen_through(part.points(config.min_hits), views, part.voxel_size_m)
+        moved_in_all += int((moved & inside).sum())
+        if not (inside & ~moved).any():
+            continue
+        points[tile] = int((inside & ~moved).sum())
+        overview.add(part.means(config.min_hits, moved | ~inside))
+        if write_tile is not None:
+            cloud = part.cloud(config.min_hits, moved).select(inside[~moved])
+            write_tile(tile, _with_fields(cloud, config), brightest)
+    cloud = _with_fields(overview.merged().cloud(), config)
+    return DrawnMap(cloud, overview.voxel_size_m, moved_in_all, TiledMap(global_map.tiling, points, brightest))
+
+
+class _Overview:
+    """Parts of a map on common voxels, as small as a number of points allows."""
+
+    def __init__(self, voxel_size_m: float, most_points: int | None) -> None:
+        self.voxel_size_m, self._most_points = voxel_size_m, most_points
+        self._parts: list[VoxelMeans] = []
+
+    def add(self, part: VoxelMeans) -> None:
+        self._parts.append(self._merged([part]).means())
+        while self._most_points is not None and sum(map(len, self._parts)) > self._most_points:
+            self.voxel_size_m = round(_COARSER * self.voxel_size_m, 3)
+            self._parts = [self._merged(self._parts).means()]
+
+    def merged(self) -> GlobalMap:
+        return self._merged(self._parts)
+
+    def _merged(self, parts: list[VoxelMeans]) -> GlobalMap:
+        merged = GlobalMap(self.voxel_size_m)
+        for part in parts:
+            merged.add_means(part, np.eye(4))
+        return merged
+
+
+def _with_fields(cloud: PointCloud, config: GlobalMapConfig) -> PointCloud:
+    return replace(cloud, attributes=cloud.attributes.only(config.fields))

@@ -1,0 +1,151 @@
+"""Square tiles of the global map, and those of their voxels that do not fit into memory."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.state.block_file import BlockFile
+from lidarslam.mapping.global_map.voxel_rows import Layout
+from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
+
+# Edge of a tile, as near as a whole number of voxels comes.
+_EDGE_M = 100.0
+_CODE_BITS = 32
+
+Tile = tuple[int, int]
+"""Number of a tile along x and y: tile (0, 0) begins at the origin of the world."""
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """Tiles of a whole number of voxels, so that each voxel lies in one."""
+
+    voxel_size_m: float
+    cells: int  # voxels along an edge
+
+    @classmethod
+    def of(cls, voxel_size_m: float) -> "Tiling":
+        """Of a map with such voxels."""
+        return cls(voxel_size_m, max(1, round(_EDGE_M / voxel_size_m)))
+
+    @property
+    def edge_m(self) -> float:
+        """Edge of a tile."""
+        return self.cells * self.voxel_size_m
+
+    def codes(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(M,) the tiles of voxels as single numbers, in the order of tiles, by the voxels' keys (M,)."""
+        return ((column_cells(keys) // self.cells) << _CODE_BITS) + row_cells(keys) // self.cells
+
+    def tiles(self, keys: NDArray[np.int64]) -> list[Tile]:
+        """The tiles that voxels lie in, sorted, by the voxels' sorted keys (M,)."""
+        return [_tile(int(code)) for code in _distinct(self.codes(keys))]
+
+    def bounds(self, tile: Tile, margin_m: float = 0.0) -> tuple[Tile, Tile]:
+        """The cells of a tile and a margin around it: the first in x and y, and those after the last."""
+        margin = math.ceil(margin_m / self.voxel_size_m)
+        (x, y), cells = tile, self.cells
+        return (x * cells - margin, y * cells - margin), ((x + 1) * cells + margin, (y + 1) * cells + margin)
+
+    def around(self, low: Tile, high: Tile) -> list[Tile]:
+        """The tiles that have cells between bounds."""
+        xs, ys = (range(low[axis] // self.cells, (high[axis] - 1) // self.cells + 1) for axis in (0, 1))
+        return [(x, y) for x in xs for y in ys]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What a block holds."""
+
+    # x, y: the tile
+    x: int
+    y: int
+    layout: Layout
+
+
+class TileStore(BlockFile):
+    """Voxels on disk, a block for all those of a tile that left memory together.
+
+    A tile that is visited again begins anew in memory; its blocks are added up when it is read. The file grows with
+    what leaves memory, and nothing in it is ever changed: see `BlockFile`.
+    """
+
+    _parts: list[_Part]
+    brightest: float  # the largest intensity of a voxel here
+
+    def __init__(self, directory: Path | None = None, file: Path | None = None) -> None:
+        super().__init__(directory, file)
+        self._parts, self.brightest = [], 0.0
+        self._blocks: dict[Tile, list[int]] = {}
+
+    def _after_restore(self) -> None:
+        super()._after_restore()
+        if len(self._parts) != len(self):
+            raise ValueError(f"{len(self)} blocks are of {len(self._parts)} tiles")
+        self._blocks = {}
+        for index, part in enumerate(self._parts):
+            self._blocks.setdefault((part.x, part.y), []).append(index)
+
+    @property
+    def tiles(self) -> set[Tile]:
+        """The tiles that have voxels here."""
+        return set(self._blocks)
+
+    @property
+    def layout(self) -> Layout:
+        """The columns that any of the voxels has."""
+        return Layout.union([part.layout for part in self._parts])
+
+    def take(self, voxels: Voxels, tiling: Tiling, recent: NDArray[np.int64], most: int) -> Voxels:
+        """Take tiles without a recent voxel from sorted voxels, and if still more than `most` are left, all of them.
+
+        Args:
+            voxels: in memory.
+            tiling: of the map.
+            recent: sorted keys (R,) of the voxels that were added last.
+            most: number of voxels.
+
+        Returns:
+            Those that are left.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        codes = tiling.codes(voxels.keys)
+        tiles = _distinct(codes)
+        of, stays = np.searchsorted(tiles, codes), np.isin(tiles, _distinct(tiling.codes(recent)))
+        if np.count_nonzero(stays[of]) > most:
+            stays[:] = False
+        for index in np.flatnonzero(~stays):
+            self._append(_tile(int(tiles[index])), voxels.chosen(of == index))
+        return voxels.chosen(stays[of])
+
+    def voxels(self, tile: Tile) -> list[Voxels]:
+        """The blocks of a tile, the earliest first, each of them sorted."""
+        return [self._block(index) for index in self._blocks.get(tile, [])]
+
+    def _append(self, tile: Tile, voxels: Voxels) -> None:
+        keys, rows = (np.ascontiguousarray(a, dtype=t) for a, t in ((voxels.keys, "<i8"), (voxels.sums, "<f4")))
+        self.write(keys.tobytes() + rows.tobytes())
+        self._blocks.setdefault(tile, []).append(len(self._parts))
+        self._parts.append(_Part(*tile, voxels.layout))
+        self.brightest = max(self.brightest, voxels.layout.largest_intensity(voxels.sums))
+
+    def _block(self, index: int) -> Voxels:
+        block, layout = self.read(index), self._parts[index].layout
+        count = len(block) // (8 + 4 * layout.width)
+        rows = np.frombuffer(block, dtype="<f4", offset=8 * count).reshape(count, layout.width)
+        return Voxels(np.frombuffer(block, dtype="<i8", count=count), rows, layout)
+
+
+def _distinct(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sorted codes of tiles, each once; in the order of keys they come in few runs."""
+    return np.unique(codes[np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))]) if len(codes) else codes
+
+
+def _tile(code: int) -> Tile:
+    x = (code + (1 << (_CODE_BITS - 1))) >> _CODE_BITS
+    return x, code - (x << _CODE_BITS)

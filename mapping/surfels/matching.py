@@ -1,0 +1,87 @@
+"""Point-to-plane correspondences of a set of points with grids of surfels, kept from one pose to the next."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.mapping.surfels.correspondence_kernels import Surfaces, match_compact, match_planes
+from lidarslam.mapping.surfels.grid import SurfelGrid
+from lidarslam.mapping.surfels.voxel_hash import point_keys
+
+# Largest extent of a compact object along an axis, in cells: evenly filled, a surfel has a standard deviation of 0.8.
+_COMPACT = 0.5
+# No cell has this key.
+_NOWHERE = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """M residuals of points with surfaces, each along one direction."""
+
+    index: NDArray[np.intp]  # (M,) of the point
+    points: FloatArray  # (M, 3) on the surface, in the world
+    normals: FloatArray  # (M, 3) unit, in the world
+    thickness_m: FloatArray  # (M,) standard deviation of the surface along the normal
+    tilt: FloatArray  # (M,) standard deviation of the normal, radians
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def residuals(self, world: FloatArray) -> FloatArray:
+        """Signed distances (M,) of the matched points, at (M, 3) of the world, from their surfaces."""
+        return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
+
+    def first_of_each_point(self) -> "Correspondences":
+        """One residual for each point, the one across its surface."""
+        first = np.flatnonzero(np.diff(self.index, prepend=-1))
+        return Correspondences(
+            self.index[first], self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first]
+        )
+
+
+class Matcher:
+    """Finds the surfaces that N points correspond to, at one pose after another.
+
+    A point that has stayed in its cell keeps its surface: once an iteration moves by a small part of a cell, few are
+    looked up again. The grids must not change meanwhile.
+
+    Args:
+        grids: the finest first; each cell of one lies within a cell of the next.
+        count: N.
+    """
+
+    def __init__(self, grids: Sequence[SurfelGrid], count: int) -> None:
+        self._grids = grids
+        self._cells = np.full(count, _NOWHERE, dtype=np.int64)
+        self.surfaces = Surfaces.none(count)
+
+    def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
+        """Update the surfaces for points (N, 3) of the world, seen from a pose (4, 4)."""
+        points, T = np.ascontiguousarray(points), np.ascontiguousarray(T_world_lidar)
+        cells = point_keys(points, self._grids[0].cell_m)
+        unmatched = np.flatnonzero(cells != self._cells)
+        self._cells = cells
+        if not len(unmatched):
+            return
+        self.surfaces.counts[unmatched] = 0
+        sensor, finest = np.array(T[:3, 3]), None
+        for grid in self._grids:
+            rows = grid.find(points.take(unmatched, axis=0), sensor)
+            surfels = grid.refreshed(rows)
+            if finest is None:
+                finest = np.empty(len(points), dtype=np.int32), surfels
+                finest[0][unmatched] = rows
+            unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, self.surfaces)]
+        assert finest is not None
+        match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
+
+    def correspondences(self) -> Correspondences:
+        """A residual a row, in the order of the points."""
+        found = self.surfaces
+        index, _ = chosen = np.nonzero(np.arange(3) < found.counts[:, None])
+        return Correspondences(
+            index, found.points[index], found.normals[chosen], found.thickness_m[chosen], found.tilt[chosen]
+        )

@@ -1,0 +1,100 @@
+"""The result of a registration attempt, and how good it is."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, inverse, log
+from lidarslam.core.tracking import Status
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import MotionState, Prediction
+from lidarslam.mapping.surfels.registration import Registration
+from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.fit import Fit
+
+# A correction beyond so many standard deviations of the prediction, and beyond degrees and metres, is a jump.
+_MOST_SIGMAS = 5.0
+_LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
+# Share of inliers that a scan needs at its prediction after a lost one.
+_PLAUSIBLE_SHARE = 0.5
+# A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place so many
+# cells away. On simulated recordings the inlier ratio was 57 to 74 % at wrong places, at right ones 94 % and more; the
+# share of inliers depends on how much of the view is new.
+_RELIABLE_RATIO, _RELIABLE_SHARE, _RELIABLE_SUPPORT = 0.85, 0.4, 0.6
+_RIVAL_QUALITY, _RIVAL_CELLS = 1.2, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """A registration attempt."""
+
+    prediction: Prediction  # that the result is compared with
+    surfel_map: SurfelMap  # that the scan was registered to
+    registration: Registration | None  # None where there were too few correspondences
+    fit: Fit  # of the scan to the map
+    status: Status  # by the fit
+    relocalised: bool = False  # whether it began elsewhere than at the prediction
+    ambiguous: bool = False  # whether another displacement fits nearly as well while the velocity is unknown
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the fit suffices at the prediction after a lost scan."""
+        return self.fit.inlier_share > _PLAUSIBLE_SHARE
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether the fit suffices without a prediction."""
+        ratio, share, support = self.fit.inlier_ratio or 0.0, self.fit.inlier_share, self.fit.support or 0.0
+        fits = ratio > _RELIABLE_RATIO and share > _RELIABLE_SHARE and support > _RELIABLE_SUPPORT
+        return self.status is Status.OK and fits
+
+    @property
+    def quality(self) -> float:
+        """Score among attempts: share of inliers times directional support."""
+        return self.fit.inlier_share * (self.fit.support or 0.0)
+
+    @property
+    def T_world_lidar(self) -> FloatArray:
+        """(4, 4) the registered pose; the predicted one without a registration."""
+        return (self.registration or self.prediction).T_world_lidar
+
+    @property
+    def correction(self) -> FloatArray:
+        """(6,) from the predicted pose to the registered one."""
+        return log(inverse(self.prediction.T_world_lidar) @ self.T_world_lidar)
+
+    @property
+    def has_jumped(self) -> bool:
+        """Whether the correction exceeds every motion that the prediction allows for."""
+        sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
+        return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
+
+    def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:
+        """Velocity (6,) after a jump or a relocalisation from the last scan's state.
+
+        After a relocalisation only the estimate within the sweep is known. After a jump one of two sweeps was bent by a
+        wrong velocity: the mean velocity between the two poses.
+        """
+        interval_s = scan.stamp - last.stamp
+        if not self.relocalised:
+            if interval_s > 0.0:
+                return body_velocity(inverse(last.T_world_lidar) @ self.T_world_lidar, interval_s)
+            return np.zeros(6)
+        assert self.registration is not None
+        return self.registration.velocity if continuous_time and scan.sweep.times is not None else np.zeros(6)
+
+    def has_rivals(self, others: Iterable["Attempt"]) -> bool:
+        """Whether the scan fits nearly as well at another place."""
+        apart_m = _RIVAL_CELLS * self.surfel_map.cell_m
+        return any(
+            np.linalg.norm(other.T_world_lidar[:3, 3] - self.T_world_lidar[:3, 3]) > apart_m
+            and _RIVAL_QUALITY * other.quality > self.quality
+            for other in others
+        )
+
+
+def best_of(attempts: Iterable[Attempt]) -> Attempt | None:
+    """The attempt of highest quality; None of none."""
+    return max(attempts, key=lambda attempt: attempt.quality, default=None)

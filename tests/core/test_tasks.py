@@ -1,0 +1,134 @@
+"""Independent tasks: the same results in this process, in several, and on a cluster of which a node dies."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.tasks.start import open_tasks
+from lidarslam.core.tasks.tasks import InOrder, Tasks, Where
+
+# What tasks run is imported by their processes: functions of the standard library and of this program.
+SQUARES = [0.0, 1.0, 4.0, 9.0, 16.0]
+
+
+class BadError(InputError):
+    """An error that does not survive pickling."""
+
+    def __init__(self, first: str, second: int) -> None:
+        super().__init__(f"{first} {second}")
+
+
+def by_value(function: Any) -> Any:
+    """The function as Ray pickles it whole: its processes cannot import a test."""
+    from ray import cloudpickle
+
+    cloudpickle.register_pickle_by_value(sys.modules[function.__module__])
+    return function
+
+
+def square(value: float) -> float:
+    return value**2
+
+
+def fail_at_three(value: float) -> float:
+    if value == 3.0:
+        raise BadError("three", 3)
+    return value
+
+
+def environment(name: str) -> str:
+    return os.environ.get(name, "")
+
+
+def interrupted(file: str) -> str:
+    """What a task makes of Ctrl-C."""
+    Path(file).touch()
+    try:
+        time.sleep(60.0)
+    except KeyboardInterrupt:
+        return "wrote its results"
+    return "slept"
+
+
+@pytest.fixture(params=["serial", "ray"], scope="module")
+def tasks(request: pytest.FixtureRequest) -> Iterator[Tasks]:
+    if request.param == "ray":
+        pytest.importorskip("ray")
+        by_value(square)
+    with open_tasks(Where(2 if request.param == "ray" else 1)) as opened:
+        yield opened
+
+
+def test_results_are_in_order_whoever_is_first(tasks: Tasks) -> None:
+    done: list[tuple[int, float]] = []
+    assert list(tasks.run(square, [0.0, 1.0, 2.0, 3.0, 4.0], lambda *one: done.append(one))) == SQUARES
+    assert sorted(done) == list(enumerate(SQUARES))
+    assert list(tasks.run(square, [0.0, 1.0, 2.0, 3.0, 4.0], ahead=2)) == SQUARES
+    assert list(tasks.run(square, [])) == []
+
+
+def test_an_error_of_a_task_is_that_of_the_user(tasks: Tasks) -> None:
+    with pytest.raises(InputError, match="three 3"):
+        list(tasks.run(fail_at_three, [1.0, 2.0, 3.0, 4.0]))
+
+
+def test_each_process_has_its_share_of_the_cores(tasks: Tasks) -> None:
+    if isinstance(tasks, InOrder):
+        pytest.skip("in this process")
+    share = os.environ.get("OMP_NUM_THREADS") or str(max(1, len(os.sched_getaffinity(0)) // 2))
+    assert list(tasks.run(environment, ["OMP_NUM_THREADS", "NUMBA_NUM_THREADS"])) == [share, share]
+    assert list(tasks.run(environment, ["RAY_USAGE_STATS_ENABLED"])) == ["0"]
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_ctrl_c_interrupts_all_tasks_and_takes_what_they_come_to(tasks: Tasks, tmp_path: Path) -> None:
+    if isinstance(tasks, InOrder):
+        pytest.skip("the task itself is interrupted")
+    files = [str(tmp_path / name) for name in ("one", "two", "never begun")]
+
+    def interrupt() -> None:
+        while not (Path(files[0]).exists() and Path(files[1]).exists()):
+            time.sleep(0.05)
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    done: dict[int, str] = {}
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        list(tasks.run(interrupted, files, done.__setitem__))
+    assert done == {0: "wrote its results", 1: "wrote its results"}
+    assert list(tasks.run(square, [3.0])) == [9.0]  # the processes serve on
+
+
+def test_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "lidarslam.core.tasks.on_ray", raising=False)
+    with pytest.raises(ConfigError, match=r"ray is not installed.* pip install 'lidarslam\[ray\]'"):
+        open_tasks(Where(2))
+    with open_tasks(Where(1)) as serial:
+        assert list(serial.run(square, [2.0])) == [4.0]
+
+
+def test_a_cluster_that_is_not_there_is_named() -> None:
+    pytest.importorskip("ray")
+    with (
+        pytest.raises(ConfigError, match=r"--ray 127.0.0.1:9: no cluster answers there"),
+        open_tasks(Where(cluster="127.0.0.1:9")),
+    ):
+        pass
+
+
+def test_one_job_does_not_load_ray() -> None:
+    code = "from lidarslam.core.tasks.start import *; from lidarslam.core.tasks.tasks import *; import sys\n"
+    code += "with open_tasks(Where()) as tasks: print(list(tasks.run(abs, [-1])), 'ray' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["[1]", "False"]

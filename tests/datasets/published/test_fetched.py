@@ -1,0 +1,133 @@
+"""Sources named by URL: fetched once, whole or not at all."""
+
+import sys
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarslam.cli import main
+from lidarslam.core.errors import InputError
+from lidarslam.datasets.published.fetched import cache_folder, fetch, fetched, is_url, url_of
+from lidarslam.datasets.registry import open_recording
+
+fsspec = pytest.importorskip("fsspec")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("LIDARSLAM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three scans."""
+    folder = tmp_path_factory.mktemp("served") / "walk"
+    folder.mkdir()
+    rng = np.random.default_rng(4)
+    for index in range(3):
+        np.save(folder / f"{index:06d}.npy", rng.uniform(-5.0, 5.0, (200, 3)))
+    np.savetxt(folder / "timestamps.txt", 0.1 * np.arange(3), fmt="%.9f")
+    return folder
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Serves files, and keeps what was asked for."""
+
+    asked: ClassVar[list[str]] = []
+
+    def log_request(self, *_: object) -> None:
+        self.asked.append(self.path)
+
+
+@pytest.fixture
+def server(recording: Path) -> Iterator[str]:
+    Quiet.asked.clear()
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(recording.parent))) as http:
+        threading.Thread(target=http.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{http.server_port}"
+        http.shutdown()
+
+
+def _same_files(one: Path, other: Path) -> bool:
+    names = sorted(path.name for path in one.iterdir())
+    return names == sorted(path.name for path in other.iterdir()) and all(
+        (one / name).read_bytes() == (other / name).read_bytes() for name in names
+    )
+
+
+def test_what_is_a_url() -> None:
+    assert is_url("s3://bucket/office.mcap")
+    assert is_url(Path("https://example.org/office.mcap"))  # a path has one slash less
+    assert not any(map(is_url, ("office.mcap", "/data/office.mcap", "evalio:newer_college_2020/short", "../a:b/c")))
+    assert fetched("office.mcap") == Path("office.mcap")
+
+
+def test_a_folder_is_fetched_once_from_a_server(server: str, recording: Path) -> None:
+    path = fetched(f"{server}/walk/")
+    assert path.name == "walk"
+    assert path.is_relative_to(cache_folder())
+    assert _same_files(path, recording)
+    assert len(open_recording(path)) == 3
+    assert url_of(path) == f"{server}/walk/"
+    assert url_of(recording) is None
+    asked = len(Quiet.asked)
+    assert fetched(f"{server}/walk/") == path
+    assert len(Quiet.asked) == asked
+
+
+@pytest.mark.parametrize("scheme", ["file", "memory"])
+def test_a_folder_is_fetched_from_other_storage(scheme: str, recording: Path) -> None:
+    if scheme == "memory":
+        fsspec.filesystem("memory").put(f"{recording}/", "/data/walk/", recursive=True)
+    url = f"file://{recording}" if scheme == "file" else "memory://data/walk"
+    assert _same_files(fetched(url), recording)
+    assert fetched(Path(url)) == fetched(url)
+
+
+def test_a_file_goes_to_the_same_path_on_another_machine(server: str, recording: Path, cache: Path) -> None:
+    """Where the head of a cluster has it, and nothing was fetched yet."""
+    path = fetched(f"{server}/walk/000001.npy?version=2")
+    assert path.read_bytes() == (recording / "000001.npy").read_bytes()
+    assert path.name == "000001.npy"
+    url = url_of(path)
+    cache.rename(cache.with_name("of the head"))
+    assert url is not None
+    fetch(url, path)
+    assert path.read_bytes() == (recording / "000001.npy").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("memory://data/nothing", "memory://data/nothing: is not there"),
+        ("http://127.0.0.1:9/office.mcap", "http://127.0.0.1:9/office.mcap: "),
+        ("nothing://data/office", "Protocol not known: nothing"),
+    ],
+)
+def test_what_cannot_be_fetched_leaves_nothing(url: str, message: str, cache: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        fetched(url)
+    assert not any(cache.rglob("*"))
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(InputError, match=r"pip install 'lidarslam\[remote\]'"):
+        fetched("s3://bucket/office.mcap")
+
+
+def test_commands_take_urls_as_sources_and_nothing_else(recording: Path) -> None:
+    result = CliRunner().invoke(main, ["info", f"file://{recording}"])
+    assert result.exit_code == 0, result.output
+    assert "scan-folder" in result.output
+    result = CliRunner().invoke(main, ["run", str(recording), "--out", "s3://bucket/run"])
+    assert result.exit_code == 2
+    assert "only sources are fetched" in result.output

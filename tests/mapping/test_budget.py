@@ -1,0 +1,191 @@
+"""The time of a scan: searches pause when it is spent, and go on with later scans."""
+
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from simulated_faults import Faulty, carried_off, covered, index_back
+
+from lidarslam.core.state.stateful import Saved
+from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.tracking import attempts, start_poses
+from lidarslam.mapping.tracking.budget import Budget, Steps, complete
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.simulation.motion.carriers import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensors.scan_patterns import Spinning
+from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.worlds.registry import build_world
+
+AT, COUNT = 50, 90
+REGISTRATION_MS, SCORE_MS, BUDGET_MS = 20.0, 0.5, 50.0
+
+
+@dataclass
+class FakeClock:
+    """Seconds that pass only where they are said to."""
+
+    s: float = 0.0
+    taken_ms: list[float] = field(default_factory=list)
+
+    def __call__(self) -> float:
+        return self.s
+
+    def passes(self, ms: float, function: Callable[..., object]) -> Callable[..., object]:
+        """The function, which takes so long."""
+
+        def timed(*args: object, **kwargs: object) -> object:
+            self.s += 1e-3 * ms
+            return function(*args, **kwargs)
+
+        return timed
+
+
+def counting(last: int) -> Steps[str]:
+    """A computation of some steps."""
+    for _ in range(last):
+        yield
+    return "done"
+
+
+def test_without_a_budget_no_time_is_ever_spent() -> None:
+    clock = FakeClock()
+    budget = Budget(None, clock)
+    for _ in range(5):
+        budget.begin(0.1)
+        clock.s += 1e6
+        assert not budget.is_spent
+        assert budget.run(counting(100)) == ("done",)
+
+
+def test_a_computation_pauses_when_the_time_is_spent_and_goes_on() -> None:
+    clock = FakeClock()
+    budget = Budget(10.0, clock)
+    for _ in range(2):
+        budget.begin(0.1)
+        clock.s += 1.0
+        assert not budget.is_spent  # the first two scans are free
+
+    def slow() -> Steps[int]:
+        for _ in range(25):
+            clock.s += 1e-3
+            yield
+        return 25
+
+    steps, pauses = slow(), 0
+    while True:
+        budget.begin(0.1)
+        done, pauses = budget.run(steps), pauses + 1
+        if done is not None:
+            break
+        assert budget.is_spent
+    assert done == (25,)
+    assert pauses == 3
+
+
+def test_a_computation_goes_on_even_where_nothing_is_left() -> None:
+    clock = FakeClock()
+    budget = Budget(10.0, clock)
+    for _ in range(3):
+        budget.begin(0.1)
+    clock.s += 1.0
+    assert budget.is_spent
+    assert [budget.lets_search_on() for _ in range(4)] == [False, True, False, True]  # at every second scan
+    assert budget.run(taking(clock, 5)) is None
+    assert clock.s == pytest.approx(1.003)  # two steps pass a fifth of 10 ms
+
+
+def taking(clock: FakeClock, steps: int) -> Steps[None]:
+    for _ in range(steps):
+        clock.s += 1.5e-3
+        yield
+
+
+def test_auto_is_half_of_the_shorter_of_the_last_two_intervals() -> None:
+    clock = FakeClock()
+    budget = Budget("auto", clock)
+    for interval_s, length_s in ((np.inf, np.inf), (0.1, np.inf), (0.1, 0.05), (5.0, 0.05), (0.1, 0.05), (0.2, 0.05)):
+        budget.begin(interval_s)
+        clock.s += 0.049
+        assert not budget.is_spent
+        clock.s += 0.002
+        assert budget.is_spent == np.isfinite(length_s)
+
+
+def test_a_complete_computation_gives_its_result() -> None:
+    assert complete(counting(3)) == "done"
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    sensor = find_sensor("vlp-16")
+    assert isinstance(sensor.pattern, Spinning)
+    sensor = replace(sensor, pattern=replace(sensor.pattern, columns=sensor.pattern.columns // 4))
+    world = build_world("office", 0)
+    motion = motion_along_route("tracked", world, 0)
+    return Simulation(world, sensor, motion, mount_pose("upright", motion.sensor_height_m), COUNT)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
+    """A registration and the score of a start pose take time, all else none."""
+    clock = FakeClock()
+    monkeypatch.setattr(attempts, "register", clock.passes(REGISTRATION_MS, attempts.register))
+    monkeypatch.setattr(attempts, "with_mean_velocity", lambda registration, *_: registration)
+    for name in ("start_score", "_information"):
+        monkeypatch.setattr(start_poses, name, clock.passes(SCORE_MS, getattr(start_poses, name)))
+    return clock
+
+
+def results(mapper: SurfelMapper, faulty: Faulty, clock: FakeClock, first: int = 0) -> Iterator[MappedScan]:
+    for scan in faulty.scans[first:]:
+        started = clock.s
+        yield mapper.process(scan, Prior())
+        clock.taken_ms.append(1e3 * (clock.s - started))
+
+
+@pytest.mark.parametrize("fault", ["carried", "covered"])
+def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_recovers(
+    simulation: Simulation, clock: FakeClock, fault: str
+) -> None:
+    if fault == "carried":
+        faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
+    else:
+        faulty = covered(simulation, AT, AT + 10, "empty")
+    mapper = SurfelMapper(MappingConfig(budget_ms=BUDGET_MS), clock)
+    mapped = list(results(mapper, faulty, clock))
+    assert max(clock.taken_ms[2:]) <= BUDGET_MS + REGISTRATION_MS + 1e-6
+    assert any(one.status is Status.LOST for one in mapped[faulty.after :])  # it was spread
+    assert [one.status for one in mapped[-5:]] == [Status.OK] * 5
+    truth = np.linalg.inv(faulty.truth.T_world_lidar[0]) @ faulty.truth.T_world_lidar
+    for one, T in zip(mapped, truth, strict=True):
+        if one.status is Status.OK:
+            assert np.linalg.norm(one.state.T_world_lidar[:3, 3] - T[:3, 3]) < 0.1
+
+
+def test_without_a_budget_the_same_search_takes_one_scan(simulation: Simulation, clock: FakeClock) -> None:
+    faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
+    mapper = SurfelMapper(MappingConfig(), clock)
+    mapped = list(results(mapper, faulty, clock))
+    assert max(clock.taken_ms[2:]) > 3 * BUDGET_MS
+    assert mapped[AT].message.startswith("relocalised")
+
+
+def test_a_search_that_was_under_way_begins_anew_after_a_resumption(simulation: Simulation, clock: FakeClock) -> None:
+    faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
+    config = MappingConfig(budget_ms=BUDGET_MS)
+    mapper = SurfelMapper(config, clock)
+    searching = results(mapper, faulty, clock)
+    while next(searching).status is not Status.LOST:
+        pass
+    number = len(clock.taken_ms) + 1
+    resumed = SurfelMapper(config, clock)
+    resumed.restore(Saved(deepcopy(mapper.state())))
+    mapped = list(results(resumed, faulty, clock, number))
+    assert [one.status for one in mapped[-5:]] == [Status.OK] * 5
