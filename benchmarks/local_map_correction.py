@@ -102,7 +102,7 @@ def take(scans: Sequence[Scan], config: Config, redraws: bool) -> Outcome:
     """All scans through the pipeline."""
     odometry = make_odometry(config.odometry)
     graph = _Graph(config.pose_graph, config.mapping.radius_m, redraws)
-    mapper = _Mapper(config.mapping, SCANS_LATER)
+    mapper = _Mapper(config.mapping, kept_scans=SCANS_LATER)
     results = list(Pipeline(odometry, ScanToMap(mapper), config.global_map, graph).run(scans))
     odometry.close()
     stamps = np.array([result.stamp for result in results])

@@ -165,4 +165,5 @@ def make_localiser(config: Config, inertial: Inertial | None = None) -> Localise
         from lidarslam.mapping.loam.mapper import LoamMapper  # loads Open3D
 
         return ScanToMap(LoamMapper(config.mapping), inertial)
-    return ScanToMap(SurfelMapper(config.mapping, SCANS_LATER if config.pose_graph.enabled else 0), inertial)
+    corrects = config.pose_graph.enabled and config.pose_graph.corrects_local_map
+    return ScanToMap(SurfelMapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0), inertial)

@@ -56,7 +56,7 @@ class Stages(Stateful):
         self._graph = graph
         self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
         mapper = localiser.surfel_mapper
-        self._correction = None if graph is None or mapper is None else MapCorrection(mapper)
+        self._correction = None if graph is None or mapper is None or not mapper.kept_scans else MapCorrection(mapper)
         self._measured_stamp = None
         self.map = MapBuilder(config, store)
 

@@ -49,8 +49,8 @@ class SurfelMapper(Stateful):
 
     Args:
         config: of the mapping.
-        kept_scans: how many of the latest scans are kept, for `redraw`.
         clock: seconds, for the budget of a scan.
+        kept_scans: how many of the latest scans are kept, for `redraw`.
     """
 
     _sampler: Sampler
@@ -63,12 +63,12 @@ class SurfelMapper(Stateful):
     _recent: list[Insertion]
 
     def __init__(
-        self, config: MappingConfig, kept_scans: int = 0, clock: Callable[[], float] = time.perf_counter
+        self, config: MappingConfig, clock: Callable[[], float] = time.perf_counter, kept_scans: int = 0
     ) -> None:
         self._config = config
-        self._budget = Budget(config.budget_ms, clock)
-        self._kept_scans = kept_scans
+        self.kept_scans = kept_scans
         self._scans, self._map_since, self._recent = 0, 0, []
+        self._budget = Budget(config.budget_ms, clock)
         self._sampler = Sampler(config)
         self._tracker = Tracker(config, self._budget)
         self._map = None
@@ -132,9 +132,9 @@ class SurfelMapper(Stateful):
         """Replace the local map by one drawn anew without the latest scans, so many, which are inserted.
 
         Returns:
-            False where another map has begun since, and stays.
+            False where another map has begun since, or a search of the map is under way: the map stays.
         """
-        if self._map is None or self._map_since > self._scans - scans:
+        if self._map is None or self._tracker.is_searching or self._map_since > self._scans - scans:
             return False
         missing = [insertion for insertion in self._recent if insertion.number > self._scans - scans]
         drawn.scans = self._map.scans - len(missing)
@@ -201,8 +201,8 @@ class SurfelMapper(Stateful):
         """Insert a scan, compensated, at its pose."""
         points = transform_points(state.T_world_lidar, scan.sweep.compensated(state.velocity))
         surfel_map.insert(points, scan.elevations, state.T_world_lidar[:3, 3])
-        recent = [one for one in self._recent if one.number > self._scans - self._kept_scans]
-        if self._kept_scans:
+        recent = [one for one in self._recent if one.number > self._scans - self.kept_scans]
+        if self.kept_scans:
             recent.append(Insertion(self._scans, points, scan.elevations, state.T_world_lidar[:3, 3]))
         self._recent = recent
 

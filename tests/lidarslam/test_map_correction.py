@@ -72,7 +72,7 @@ class Keeper:
 
 
 def pipeline_of(odometry: ExternalOdometry, graph: Any, keeper: Keeper | None = None) -> Pipeline:
-    localiser = ScanToMap(SurfelMapper(CONFIG, SCANS_LATER))
+    localiser = ScanToMap(SurfelMapper(CONFIG, kept_scans=SCANS_LATER))
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), graph, keeper)
 
 
@@ -134,7 +134,7 @@ def test_an_error_while_drawing_reaches_the_caller(room_scans: list[Scan], room_
 
 
 def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
-    mapper = SurfelMapper(CONFIG, SCANS_LATER)
+    mapper = SurfelMapper(CONFIG, kept_scans=SCANS_LATER)
     for scan in room_scans[:6]:  # the map begins anew with the second one, when the first one's velocity is known
         mapper.process(scan, Prior())
     begun, cell_m = mapper.local_map, mapper.cell_m
