@@ -27,7 +27,7 @@ from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
 from lidarslam.run.modes.merge.merge import MergeOutcome
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
-from lidarslam.run.summary.summary import WrittenMap
+from lidarslam.run.summary.written_map import WrittenMap
 
 
 def lidarslam(*arguments: object) -> Result:

@@ -19,7 +19,8 @@ from lidarslam.mapping.global_map.moved_points import PlacedViews
 from lidarslam.mapping.pose_graph.g2o import format_g2o
 from lidarslam.mapping.slides.slides import find_contradictions
 from lidarslam.run.loop_closing import GraphOutcome
-from lidarslam.run.summary.summary import RunSummary, WrittenMap, summarise
+from lidarslam.run.summary.summary import RunSummary, summarise
+from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory

@@ -11,12 +11,12 @@ import numpy as np
 
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.timing import Milliseconds, SlowestScan
+from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.storage.directory import SCANS_CSV
 
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
@@ -64,19 +64,6 @@ class GraphSummary:
     def to_json(self) -> dict[str, Any]:
         """The section of summary.json."""
         return asdict(self) | {"loops": [loop.to_json() for loop in self.loops]}
-
-
-@dataclass(frozen=True)
-class WrittenMap:
-    """The map as it was written."""
-
-    # points, voxel_size_m: number of points and edge of a voxel; None without a map
-    points: int
-    voxel_size_m: float | None
-    moved: int  # number of points that were removed as moving objects
-    entropy: float | None = None  # mean map entropy, see `evaluation.map.entropy`; None where it cannot be computed
-    fields: tuple[str, ...] = ()  # the attributes of its points
-    tiled: TiledMap | None = None  # all of it, where `points` are those of an overview
 
 
 @dataclass(frozen=True)
@@ -135,12 +122,7 @@ def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings
     return {
         "loop_closures": 0 if graph is None else graph.closed,
         "pose_graph": None if graph is None else graph.to_json(),
-        "map_points": written.points,
-        "map_voxel_size_m": written.voxel_size_m,
-        "map_points_moved": written.moved,
-        "map_entropy": written.entropy,
-        "map_fields": list(written.fields),
-        "map_tiles": None if written.tiled is None else written.tiled.to_json(),
+        **written.to_json(),
         "warnings": list(warnings),
     }
 

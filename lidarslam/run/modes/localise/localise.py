@@ -24,7 +24,8 @@ from lidarslam.run.request import log_choices
 from lidarslam.run.results import RunOutcome, write_results
 from lidarslam.run.run import open_odometry, require_apart, viewing
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary.summary import WrittenMap, summarise
+from lidarslam.run.summary.summary import summarise
+from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.run.tracking import Progress, Tracked, track
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory

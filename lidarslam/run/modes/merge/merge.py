@@ -19,7 +19,8 @@ from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.run.results import RunOutcome, draw, final_map, write_map, write_results
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.run.summary.summary import GraphSummary, WrittenMap, peak_rss_mb
+from lidarslam.run.summary.summary import GraphSummary, peak_rss_mb
+from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.run.tracking import NoScanError, Progress, Tracked, track
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from lidarslam.run.summary.summary import GraphSummary, WrittenMap, graph_and_map_json
+from lidarslam.run.summary.summary import GraphSummary, graph_and_map_json
+from lidarslam.run.summary.written_map import WrittenMap
 
 
 @dataclass(frozen=True)
