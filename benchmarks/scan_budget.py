@@ -59,7 +59,7 @@ def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Ite
             registration_ms.append(1e3 * (time.thread_time() - started))  # noqa: B023
             return result
 
-        mapper = SurfelMapper(MappingConfig(budget_ms=budget_ms or None), time.thread_time)
+        mapper = SurfelMapper(MappingConfig(budget_ms=budget_ms or None), clock=time.thread_time)
         results, ms = [], []
         with patch.object(attempts, "register", timed):
             for scan in faulty.scans:

@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarslam.mapping.config import GlobalMapConfig
-from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud, VoxelMeans
+from lidarslam.mapping.global_map.global_map import NORMALS_MARGIN_M, GlobalMap, PointCloud, VoxelMeans
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.global_map.tile_store import Tile, Tiling
 
 logger = logging.getLogger(__name__)
 
-# Width of the neighbours' points that take part in the normals of a tile's.
-_MARGIN_M = 10.0
 # Voxels of an overview grow by this factor at a time, which leaves two thirds of the points.
 _COARSER = 2.0**0.25
 
@@ -31,6 +29,10 @@ class TiledMap:
     def total(self) -> int:
         """How many points there are."""
         return sum(self.points.values())
+
+    def to_json(self) -> dict[str, float | int]:
+        """The entry of summary.json."""
+        return {"tiles": len(self.points), "points": self.total, "voxel_size_m": self.tiling.voxel_size_m}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ def _drawn_in_tiles(
     overview = _Overview(global_map.voxel_size_m, global_map.most_points)
     points, moved_in_all = {}, 0
     for tile in tiles:
-        part = global_map.tile(tile, _MARGIN_M)
+        part = global_map.tile(tile, NORMALS_MARGIN_M)
         inside = part.lies_in(tile, config.min_hits)
         moved = seen_through(part.points(config.min_hits), views, part.voxel_size_m)
         moved_in_all += int((moved & inside).sum())

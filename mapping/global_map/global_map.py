@@ -19,6 +19,10 @@ from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys
 _MIN_PENDING = 1_000_000
 # Nearest points that a normal is estimated from.
 _NORMAL_NEIGHBOURS = 20
+# Those of more points are estimated tile by tile: they take half a kilobyte of memory a point. Neighbours of a tile's
+# points are looked for within this distance around it.
+_MANY_POINTS = 2_000_000
+NORMALS_MARGIN_M = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +142,7 @@ class GlobalMap(Stateful):
         """
         voxels = self._voxels(min_hits, left_out)
         points = self._mean_points(voxels)
-        normals = estimate_normals(points)
+        normals = estimate_normals(points) if len(points) <= _MANY_POINTS else self._normals_by_tiles(voxels)
         normals[np.einsum("ij,ij->i", normals, voxels.sums[:, VIEW]) < 0.0] *= -1.0
         return PointCloud(points, normals, voxels.layout.attributes(voxels.sums))
 
@@ -177,6 +181,17 @@ class GlobalMap(Stateful):
         in_memory = self._voxels()
         stored = 0.0 if self._store is None else self._store.brightest
         return max(stored, in_memory.layout.largest_intensity(in_memory.sums))
+
+    def _normals_by_tiles(self, voxels: Voxels) -> FloatArray:
+        whole, codes = GlobalMap(self.voxel_size_m), self.tiling.codes(voxels.keys)
+        whole._merged = voxels
+        order = np.argsort(codes, kind="stable")
+        normals = np.empty((len(voxels), 3))
+        rows_of_tiles = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+        for tile, rows in zip(whole.tiles(), rows_of_tiles, strict=True):
+            part = whole.tile(tile, NORMALS_MARGIN_M)
+            normals[rows] = estimate_normals(part.points())[part.lies_in(tile)]
+        return normals
 
     def _wait(self, voxels: Voxels) -> None:
         with self._lock:

@@ -10,8 +10,8 @@ from lidarslam.mapping.pose_graph.edges import squared_error
 # An optimisation takes time in proportion to the keyframes. The next one waits for the hundredth part of their number,
 # so that its time for each keyframe does not grow: none waits with 100 keyframes, 300 m or so with 10,000.
 _PART = 100
-# Only a closure farther from the present poses than its own deviation moves them: squared, in six dimensions.
-_DEVIATIONS = 6.0
+# Expected squared Mahalanobis distance of a closure: only beyond it does one move the poses.
+_EXPECTED = 6.0
 
 
 class RelaxSchedule(Stateful):
@@ -34,7 +34,7 @@ class RelaxSchedule(Stateful):
         if _PART * (len(poses) - self._keyframes) < len(poses):
             return False
         waiting, self._waiting = self._waiting, []
-        if not any(squared_error(closure, poses) > _DEVIATIONS for closure in waiting):
+        if not any(squared_error(closure, poses) > _EXPECTED for closure in waiting):
             return False
         self._keyframes = len(poses)
         return True

@@ -49,8 +49,8 @@ class SurfelMapper(Stateful):
 
     Args:
         config: of the mapping.
-        clock: seconds, for the budget of a scan.
         kept_scans: how many of the latest scans are kept, for `redraw`.
+        clock: seconds, for the budget of a scan.
     """
 
     _sampler: Sampler
@@ -63,12 +63,12 @@ class SurfelMapper(Stateful):
     _recent: list[Insertion]
 
     def __init__(
-        self, config: MappingConfig, clock: Callable[[], float] = time.perf_counter, kept_scans: int = 0
+        self, config: MappingConfig, kept_scans: int = 0, clock: Callable[[], float] = time.perf_counter
     ) -> None:
         self._config = config
+        self._budget = Budget(config.budget_ms, clock)
         self.kept_scans = kept_scans
         self._scans, self._map_since, self._recent = 0, 0, []
-        self._budget = Budget(config.budget_ms, clock)
         self._sampler = Sampler(config)
         self._tracker = Tracker(config, self._budget)
         self._map = None

@@ -9,22 +9,22 @@ the change is expected to go on as between the motions before.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.odometry.alignment.correspondences import Motion
 from lidarslam.odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
-from lidarslam.odometry.alignment.steps import gauss_newton_step
+from lidarslam.odometry.alignment.steps import take_step, write_velocities
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 
 # Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
 _COARSE_M = 0.5
 _ANNEALED = 0.5
-# A motion that changes by less than this in a step has converged, and no step is larger: radians and metres.
-_CONVERGED, _LARGEST_STEP = 1e-4, 0.3
+# A motion that changes by less than this in a step has converged: radians and metres.
+_CONVERGED = 1e-4
 # Standard deviation of points about their planes, and the share of points with independent errors: neighbours share
 # theirs. Together the information of one point, 1/m^2.
 _RESIDUAL_M, _INDEPENDENT = 0.03, 0.05
@@ -37,7 +37,6 @@ _NEGLIGIBLE = 0.02
 _NEGLIGIBLE_PRIOR = 1e-9
 # Part of a scan that another must have in view for what is not in view to be left out.
 _MOSTLY_IN_VIEW = 0.5
-_NOTHING = np.zeros((6, 6))
 
 
 class Effort(NamedTuple):
@@ -97,50 +96,33 @@ def align_each(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Eff
 
 
 def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterations: int) -> Alignment:
-    T_prev_curr, innovation, prior = start.T_prev_curr, np.zeros(6), start
-    T_curr_prev = inverse(start.T_prev_curr)
-    for done in np.linspace(0.0, 1.0, iterations).tolist():
-        scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
-        H, g = cost.normal_equations(_motion(T_prev_curr, innovation, sweeps)[0], scale_m)
-        if done >= _ANNEALED and prior is start and start.information is not None:
-            seen = INFORMATION_PER_M2 * _marginal(H)
-            prior = replace(start, information=_where_unseen(start.information, seen))
-        step, change = _solve(T_prev_curr, innovation, H, g, prior, T_curr_prev)
-        T_prev_curr, innovation = exp(step) @ T_prev_curr, innovation + change
-        if done >= _ANNEALED and float(np.abs(step).max()) < _CONVERGED:
-            break
-    motion, change = _motion(T_prev_curr, innovation, sweeps)
-    counted = np.zeros((6, 6)) if prior.information is None else prior.information
-    return _alignment(T_prev_curr, change, cost.fit(motion), counted)
-
-
-def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> tuple[Motion, FloatArray]:
-    """The motion, and the change (6,) of velocity, which goes on as before but for the innovation."""
-    velocity, change, last = log(T_prev_curr) / sweeps.interval_s, innovation, sweeps.last
-    if last is not None:
-        share = sweeps.interval_s / (sweeps.interval_s + last.interval_s)
-        change = innovation + share * (velocity - last.velocity)
-    return Motion(np.ascontiguousarray(T_prev_curr), velocity - change, velocity + change), change
-
-
-def _solve(
-    T_prev_curr: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, prior: InitialEstimate,
-    T_curr_prev: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """One Gauss-Newton step (6,) of the motion, from the left, and one (6,) of the innovation.
-
-    T_curr_prev (4, 4) is the inverse of the prior's motion.
-    """
-    expected, away, information = _innovation_information(), _NOTHING[0], _NOTHING
-    if prior.change_information is not None:
-        expected = expected + prior.change_information
-    if prior.information is not None:
-        away, information = log(T_prev_curr @ T_curr_prev), prior.information
+    T_prev_curr, innovation = np.array(start.T_prev_curr, dtype=np.float64), np.zeros(6)
+    T_curr_prev, prior, is_seen = inverse(start.T_prev_curr), start.information, start.information is None
+    information, expected = np.zeros((6, 6)) if prior is None else prior, _innovation_information()
+    if start.change_information is not None:
+        expected = expected + start.change_information
     # Arrays of another layout would be compiled for anew.
     information, expected = np.ascontiguousarray(information), np.ascontiguousarray(expected)
-    delta = gauss_newton_step(H, g, INFORMATION_PER_M2, information, away, expected, innovation)
-    step = delta[:6] * (_LARGEST_STEP / max(float(np.abs(delta[:6]).max()), _LARGEST_STEP))
-    return step, delta[6:]
+    for done in np.linspace(0.0, 1.0, iterations).tolist():
+        scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
+        H, g = cost.normal_equations(_motion(T_prev_curr, innovation, sweeps), scale_m)
+        H, g = INFORMATION_PER_M2 * H, INFORMATION_PER_M2 * g
+        if done >= _ANNEALED and not is_seen:
+            information, is_seen = _where_unseen(information, _marginal(H, INFORMATION_PER_M2)), True
+        largest = take_step(T_prev_curr, innovation, H, g, T_curr_prev, information, expected)
+        if done >= _ANNEALED and largest < _CONVERGED:
+            break
+    motion = _motion(T_prev_curr, innovation, sweeps)
+    return _alignment(T_prev_curr, 0.5 * (motion.late - motion.early), cost.fit(motion), information)
+
+
+def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> Motion:
+    """The motion, whose change of velocity goes on as before but for the innovation."""
+    early, late, last, share = np.empty(6), np.empty(6), innovation, 0.0
+    if sweeps.last is not None:
+        last, share = sweeps.last.velocity, sweeps.interval_s / (sweeps.interval_s + sweeps.last.interval_s)
+    write_velocities(T_prev_curr, innovation, sweeps.interval_s, share, last, early, late)
+    return Motion(T_prev_curr, early, late)
 
 
 def _innovation_information() -> FloatArray:
@@ -175,7 +157,7 @@ def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: Flo
     return Alignment(
         T_prev_curr=T_prev_curr,
         velocity_change=change,
-        information=_marginal(fit.H),
+        information=_marginal(fit.H, 1.0),
         prior_information=prior,
         inlier_share=fit.inlier_share,
         # Points that leave the other image's view do not count, unless they are most of the scan.
@@ -186,9 +168,13 @@ def _alignment(T_prev_curr: FloatArray, change: FloatArray, fit: Fit, prior: Flo
     )
 
 
-def _marginal(H: FloatArray) -> FloatArray:
-    """(6, 6) information of the motion, with the change of velocity marginalised by Schur's complement."""
-    across, changes = H[:6, 6:], H[6:, 6:] + _innovation_information() / INFORMATION_PER_M2
+def _marginal(H: FloatArray, per_m2: float) -> FloatArray:
+    """(6, 6) information of the motion, with the change of velocity marginalised by Schur's complement.
+
+    H (12, 12) is in units of `per_m2`.
+    """
+    expected = (per_m2 / INFORMATION_PER_M2) * _innovation_information()
+    across, changes = H[:6, 6:], H[6:, 6:] + expected
     return np.asarray(H[:6, :6] - across @ np.linalg.solve(changes, across.T), dtype=np.float64)
 
 

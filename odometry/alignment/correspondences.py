@@ -68,16 +68,21 @@ def correspond(size: int, planes: Planes, motion: Motion, scale_m: np.float32, i
 
     The time of a pixel is found by projecting without motion within the previous sweep, which is exact but at its seam.
     """
-    _move(size, motion.T.astype(np.float32), motion.late.astype(np.float32), work)
-    _project(size, planes, work)
-    if planes.rolling:
-        _look_up(size, planes.pixels, work)
-        _take_back(size, motion.early.astype(np.float32), work)
+    _move(size, _single(motion.T.reshape(16)), _single(motion.late), work)
+    for taken_back in range(2 if planes.rolling else 1):
+        if taken_back:
+            _take_back(size, _single(motion.early), work)
         _project(size, planes, work)
-    for k in range(size):
-        work[POINT_T + k] += work[_T + k]
-    _look_up(size, planes.pixels, work)
+        _look_up(size, planes.pixels, work)
     _judge(size, scale_m, is_robust, work)
+
+
+@compiled_part
+def _single(values: FloatArray) -> Floats:
+    rounded = np.empty(len(values), dtype=np.float32)
+    for i in range(len(values)):
+        rounded[i] = values[i]
+    return rounded
 
 
 @compiled_part
@@ -102,24 +107,24 @@ def _compensate(
 
 @compiled_part
 def _move(size: int, T: Floats, late: Floats, work: Floats) -> None:
-    """Take points and normals to the frame of the previous sweep; their pixels' seconds are not known yet."""
+    """Take points and normals to the frame of the previous sweep by T_prev_curr, row by row (16,)."""
     for k in range(size):
         x, y, z = _compensate(work[_POINT_X + k], work[_POINT_Y + k], work[_POINT_Z + k], work[POINT_T + k], late)
-        work[X + k] = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        work[Y + k] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-        work[Z + k] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        work[_T + k] = _ZERO
+        work[X + k] = T[0] * x + T[1] * y + T[2] * z + T[3]
+        work[Y + k] = T[4] * x + T[5] * y + T[6] * z + T[7]
+        work[Z + k] = T[8] * x + T[9] * y + T[10] * z + T[11]
     for k in range(size):
         u, v, w = work[_POINT_U + k], work[_POINT_V + k], work[_POINT_W + k]
-        work[TURNED_U + k] = T[0, 0] * u + T[0, 1] * v + T[0, 2] * w
-        work[TURNED_V + k] = T[1, 0] * u + T[1, 1] * v + T[1, 2] * w
-        work[TURNED_W + k] = T[2, 0] * u + T[2, 1] * v + T[2, 2] * w
+        work[TURNED_U + k] = T[0] * u + T[1] * v + T[2] * w
+        work[TURNED_V + k] = T[4] * u + T[5] * v + T[6] * w
+        work[TURNED_W + k] = T[8] * u + T[9] * v + T[10] * w
 
 
 @compiled_part
 def _take_back(size: int, early: Floats, work: Floats) -> None:
-    """Take points from the middle of the previous sweep to the time of their pixels."""
+    """Take points from the middle of the previous sweep to the time of their pixels, which their own seconds get."""
     for k in range(size):
+        work[POINT_T + k] += work[_T + k]
         x, y, z = _compensate(work[X + k], work[Y + k], work[Z + k], -work[_T + k], early)
         work[X + k], work[Y + k], work[Z + k] = x, y, z
 

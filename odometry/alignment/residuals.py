@@ -54,11 +54,13 @@ def accumulate(
         How many points are in view, and how many are inliers.
     """
     work = np.zeros(SIZE, dtype=np.float32)
-    seen, matches = 0.0, 0.0
+    seen, matches = 0, 0
     for begin in range(0, count, BLOCK):
         size = min(BLOCK, count - begin)
         for quantity in range(7):
-            work[quantity * STRIDE : quantity * STRIDE + size] = points[quantity, begin : begin + size]
+            row = points[quantity]
+            for k in range(size):
+                work[quantity * STRIDE + k] = row[begin + k]
         correspond(size, planes, motion, np.float32(scale_m), is_robust, work)
         _weigh(size, np.float32(scale_m), is_robust, work)
         for p in range(7):
@@ -70,8 +72,9 @@ def accumulate(
                     total[p + 6, 12 if last else q + 6] += by_time if last else by_time_twice
                     if not last:
                         total[p, q + 6] += by_time
-        counts = _products(size, IN_VIEW, IN_VIEW, INLIER, work)
-        seen, matches = seen + counts[0], matches + counts[1]
+        for k in range(size):
+            seen += 1 if work[IN_VIEW + k] > _ZERO else 0
+            matches += 1 if work[INLIER + k] > _ZERO else 0
         if not is_robust:
             for p in range(3):
                 for q in range(p, 3):
@@ -79,7 +82,7 @@ def accumulate(
                     in_view[p, q] += sums[0]
                     inlier[p, q] += sums[1]
     _mirror(total, in_view, inlier)
-    return int(seen), int(matches)
+    return seen, matches
 
 
 @compiled_part

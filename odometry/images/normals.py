@@ -75,16 +75,21 @@ def surface_normals(image: Floats, patches: Sequence[Patch] = PATCHES) -> Floats
 def _pad(image: Floats, rows: int, columns: int, padded: Floats) -> None:
     """Write (4, H + 2 rows, W + 2 columns or more) columns that go round, empty rows above and below; empty is far."""
     height, width = image.shape[1:]
-    padded[:3, :rows], padded[:3, rows + height :] = _ZERO, _ZERO
-    padded[3, :rows], padded[3, rows + height :] = _FAR, _FAR
     for channel in range(4):
-        for i in range(height):
-            row = padded[channel, rows + i]
-            row[columns : columns + width] = image[channel, i]
-            if channel == 3:
-                for j in range(columns, columns + width):
-                    row[j] = row[j] if row[j] > _ZERO else _FAR
-            row[:columns], row[columns + width :] = row[width : width + columns], row[columns : len(row) - width]
+        empty = _FAR if channel == 3 else _ZERO
+        for i in range(height + 2 * rows):
+            row, inside = padded[channel, i], i >= rows and i < rows + height
+            for j in range(len(row)):
+                row[j] = empty
+            if not inside:
+                continue
+            shown = image[channel, i - rows]
+            for j in range(width):
+                row[columns + j] = shown[j] if channel < 3 or shown[j] > _ZERO else _FAR
+            for j in range(columns):
+                row[j] = row[width + j]
+            for j in range(columns + width, len(row)):
+                row[j] = row[j - width]
 
 
 @compiled

@@ -27,7 +27,7 @@ def test_a_small_graph_is_optimised_at_every_closure_that_contradicts_it():
 def test_the_wait_grows_with_the_graph():
     found = dues(range(4000, 4200))
     assert found[0] == 4000
-    assert set(np.diff(found).tolist()) == {41}
+    assert set(np.diff(found).tolist()) <= {41, 42}
 
 
 def test_a_closure_that_had_to_wait_is_not_forgotten():

@@ -14,6 +14,7 @@ from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map import drawing, tile_store
+from lidarslam.mapping.global_map import global_map as module
 from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap, PointCloud
 from lidarslam.mapping.global_map.moved_points import PlacedViews, Views
@@ -27,7 +28,8 @@ CONFIG = GlobalMapConfig(voxel_size_m=VOXEL_M, most_points=MOST, fields=("intens
 @pytest.fixture(autouse=True)
 def _small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tile_store, "_EDGE_M", 4.03)  # no whole number of voxels
-    monkeypatch.setattr(drawing, "_MARGIN_M", 1.5)
+    monkeypatch.setattr(drawing, "NORMALS_MARGIN_M", 1.5)
+    monkeypatch.setattr(module, "NORMALS_MARGIN_M", 1.5)
 
 
 def street(number: int) -> tuple[FloatArray, FloatArray, PointAttributes]:
@@ -153,6 +155,15 @@ def test_an_overview_may_have_fewer_points_than_there_are_tiles() -> None:
     assert drawn.tiled is not None
     assert (drawn.tiled.total, len(drawn.tiled.points)) == (120, 60)
     assert 5 < len(drawn.cloud) <= 20
+
+
+def test_normals_of_many_points_are_those_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = walked(GlobalMap(VOXEL_M))
+    expected = built.cloud(left_out=np.arange(len(built.points())) % 5 == 0)
+    monkeypatch.setattr(module, "_MANY_POINTS", 1000)
+    found = built.cloud(left_out=np.arange(len(built.points())) % 5 == 0)
+    np.testing.assert_array_equal(found.points, expected.points)
+    assert np.mean(np.einsum("ij,ij->i", found.normals, expected.normals) > 1.0 - 1e-6) > 0.999
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("LIDARSLAM_CACHE") or Path(cache) / "lidarslam").absolute()
 
 
-def fetched(source: str | Path) -> Path:
+def fetched(source: str | os.PathLike[str]) -> Path:
     """The path of a source, which is fetched first where it is named by URL and not there yet.
 
     Over http a folder is known by the slash at the end of its URL.

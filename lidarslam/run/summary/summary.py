@@ -140,14 +140,9 @@ def graph_and_map_json(graph: GraphSummary | None, written: WrittenMap, warnings
         "map_points_moved": written.moved,
         "map_entropy": written.entropy,
         "map_fields": list(written.fields),
-        "map_tiles": None if written.tiled is None else _tiles_json(written.tiled),
+        "map_tiles": None if written.tiled is None else written.tiled.to_json(),
         "warnings": list(warnings),
     }
-
-
-def _tiles_json(tiled: TiledMap) -> dict[str, Any]:
-    tiling = tiled.tiling
-    return {"tiles": len(tiled.points), "points": tiled.total, "voxel_size_m": tiling.voxel_size_m}
 
 
 def summarise(
