@@ -30,7 +30,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("LIDARSLAM_CACHE") or Path(cache) / "lidarslam").absolute()
 
 
-def fetched(source: str | Path) -> Path:
+def fetched(source: str | os.PathLike[str]) -> Path:
     """The path of a source, which is fetched first where it is named by URL and not there yet.
 
     Over http a folder is known by the slash at the end of its URL.
@@ -38,7 +38,7 @@ def fetched(source: str | Path) -> Path:
     Raises:
         InputError: it cannot be fetched.
     """
-    parts = _URL.fullmatch(str(source))
+    parts = _URL.fullmatch(os.fspath(source))
     if parts is None:
         return Path(source)
     scheme, rest = parts[1], parts[2]
