@@ -5,7 +5,8 @@
 
 The recordings are simulated. The cluster's nodes are on this machine, with one CPU each; the killed one dies with all
 its processes when a third of the runs have been started. `run again` are runs that were started more than once;
-`equal` says whether the files of the comparison's folder are those of one job, but for times and memory.
+`same files` says whether configuration, trajectories and map of every run are those of one job, to the byte, and
+`figures` is the largest relative difference of an error in comparison.json. The second row is one job again.
 """
 
 import argparse
@@ -29,7 +30,6 @@ from lidarslam.simulation.recording.request import RecordRequest
 
 WORLDS = ("office", "street", "hall", "tunnel")
 SAME = ("config.yaml", "map.ply", "odometry.tum", "trajectory.tum", "trajectory.kitti")
-TIMES = ("ms_per_scan_median", "ms_per_scan_p95", "stage_ms", "peak_rss_mb", "wall_s")
 
 # Notes the start of a method, and becomes its process.
 NOTED = """
@@ -57,17 +57,34 @@ def started(file: Path) -> list[str]:
     return file.read_text().splitlines() if file.exists() else []
 
 
-def contents(out: Path) -> dict[str, Any]:
-    """The folder of a comparison without times."""
-    files: dict[str, Any] = {str(p.relative_to(out)): p.read_bytes() for name in SAME for p in out.rglob(name)}
-    for path in out.rglob("comparison.json"):
-        content = json.loads(path.read_text())
-        for sequence in content.get("sequences", [content]):
-            for method in sequence["methods"].values():
-                for key in TIMES:
-                    method.pop(key)
-        files[str(path.relative_to(out))] = content
-    return files
+def contents(out: Path) -> dict[str, bytes]:
+    """The files of the runs in the folder of a comparison that hold no times."""
+    return {str(path.relative_to(out)): path.read_bytes() for name in SAME for path in out.rglob(name)}
+
+
+def figures(out: Path) -> dict[str, float]:
+    """The errors of all runs, by their names in comparison.json."""
+    content = json.loads((out / "comparison.json").read_text())
+    found: dict[str, float] = {}
+
+    def walk(value: Any, name: str) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                walk(inner, f"{name}/{key}")
+        elif isinstance(value, float):
+            found[name] = value
+
+    for sequence in content.get("sequences", [content]):
+        for method, entry in sequence["methods"].items():
+            walk(entry["metrics"], f"{sequence['sequence']}/{method}")
+    return found
+
+
+def largest_difference(one: dict[str, float], other: dict[str, float]) -> float:
+    """Of two sets of figures, relative; infinite where they are not of the same names."""
+    if one.keys() != other.keys():
+        return float("inf")
+    return max((abs(value - other[name]) / max(abs(value), 1e-300) for name, value in one.items()), default=0.0)
 
 
 @contextmanager
@@ -105,14 +122,16 @@ def main() -> None:
         entries = make_recordings(folder / "recordings", options.recordings, options.scans)
         (folder / "noted.py").write_text(NOTED)
 
-        def run(label: str, where: Callable[[Path], Any]) -> tuple[float, list[str], dict[str, Any]]:
+        def run(
+            label: str, where: Callable[[Path], Any]
+        ) -> tuple[float, list[str], dict[str, bytes], dict[str, float]]:
             out, starts = folder / label.replace(" ", "_"), folder / f"{label}.txt"
             command = (sys.executable, str(folder / "noted.py"), str(starts))
             with where(starts) as chosen:
                 begun = time.perf_counter()
                 compare(CompareRequest(out, entries, methods, where=chosen), quiet, command)
                 wall_s = time.perf_counter() - begun
-            return wall_s, started(starts), contents(out)
+            return wall_s, started(starts), contents(out), figures(out)
 
         @contextmanager
         def on_cluster(starts: Path, kill_after: int | None = None) -> Iterator[Where]:
@@ -123,21 +142,24 @@ def main() -> None:
         third = options.recordings * len(methods) // 3
         ways: dict[str, Callable[[Path], Any]] = {
             "1 job": lambda _: nullcontext(Where()),
+            "1 job, again": lambda _: nullcontext(Where()),
             "2 jobs": lambda _: nullcontext(Where(2)),
             "cluster of 2 nodes": on_cluster,
             "one of them killed": lambda starts: on_cluster(starts, third),
         }
         compare(CompareRequest(folder / "warm", entries[:1], methods), quiet)
-        print("| | wall time, s | of one job | runs started | run again | equal |\n|---|---:|---:|---:|---|---|")
-        first: tuple[float, list[str], dict[str, Any]] | None = None
+        print("| | wall time, s | of one job | runs started | run again | same files | figures |")
+        print("|---|---:|---:|---:|---|---|---:|")
+        first = None
         for label, where in ways.items():
-            wall_s, starts, files = run(label, where)
-            first = first or (wall_s, starts, files)
+            done = run(label, where)
+            wall_s, starts, files, errors = done
+            first = first or done
             again = ", ".join(each for each, times in Counter(starts).items() if times > 1) or "none"
-            equal = "yes" if files == first[2] else "no"
-            print(
-                f"| {label} | {wall_s:.0f} | {wall_s / first[0]:.2f} | {len(starts)} | {again} | {equal} |", flush=True
-            )
+            same = "yes" if files == first[2] else "no"
+            difference = largest_difference(first[3], errors)
+            row = (label, f"{wall_s:.0f}", f"{wall_s / first[0]:.2f}", len(starts), again, same, f"{difference:.0e}")
+            print("| " + " | ".join(map(str, row)) + " |", flush=True)
 
 
 if __name__ == "__main__":

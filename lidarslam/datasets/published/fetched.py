@@ -38,7 +38,7 @@ def fetched(source: str | os.PathLike[str]) -> Path:
     Raises:
         InputError: it cannot be fetched.
     """
-    parts = _URL.fullmatch(str(source))
+    parts = _URL.fullmatch(os.fspath(source))
     if parts is None:
         return Path(source)
     scheme, rest = parts[1], parts[2]
