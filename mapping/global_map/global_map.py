@@ -16,7 +16,7 @@ from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
-_MIN_PENDING = 1_000_000
+_MIN_PENDING = 250_000
 # Nearest points that a normal is estimated from.
 _NORMAL_NEIGHBOURS = 20
 # Those of more points are estimated tile by tile: they take half a kilobyte of memory a point. Neighbours of a tile's
