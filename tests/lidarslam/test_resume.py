@@ -494,7 +494,7 @@ def test_damaged_submaps_are_told(run: Run, whole: Callable[[str], Whole], sourc
     path.write_bytes(b"\0" * 1000 + path.read_bytes()[1000:])
     ended = run(source, out, *expected.arguments, "--resume")
     assert ended.status == 1
-    assert "submaps.bin: is damaged (submap 0)" in ended.said
+    assert "submaps.bin: is damaged (block 0)" in ended.said
 
 
 def test_a_run_killed_before_its_first_state_begins_again(
