@@ -25,7 +25,7 @@ import logging
 import multiprocessing
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -107,8 +107,9 @@ def simulate(options: argparse.Namespace, sink: Connection) -> None:
         simulation.world, sensor, simulation.motion, simulation.T_body_lidar, options.scans, options.seed
     )
     sink.send(simulation.ground_truth)
-    for scan in simulation.scans():
-        sink.send(scan)
+    with suppress(BrokenPipeError):  # the drive was ended
+        for scan in simulation.scans():
+            sink.send(scan)
     sink.close()
 
 
