@@ -139,6 +139,8 @@ def _carry_out(shared: tuple[Callable[[T], R], str], item: T) -> R | LidarSlamEr
         return ConfigError(f"a node of the cluster has lidarslam {version('lidarslam')} and not {expected}; update it")
     for name in _THREADS:
         os.environ.setdefault(name, os.environ.get("OMP_NUM_THREADS", "1"))
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # inherited of nohup; Ray interrupts a task by this signal
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return function(item)
     except LidarSlamError as error:
