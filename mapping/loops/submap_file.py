@@ -1,13 +1,12 @@
 """Sparse submaps on disk: those of hours of recording would take hundreds of megabytes of memory."""
 
-import tempfile
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from weakref import finalize
 
 import numpy as np
 
+from lidarslam.core.state.block_file import BlockFile
 from lidarslam.mapping.loops.sparse_submap import PIXELS, SparseSubmap
 
 # Submaps that stay in memory, those used last: about 15 MB.
@@ -22,14 +21,12 @@ class SubmapFile:
     """
 
     def __init__(self, directory: Path | None = None) -> None:
-        self._file = tempfile.TemporaryFile(dir=directory)  # noqa: SIM115
-        finalize(self, self._file.close)
-        self._starts: list[int] = []
+        self._blocks = BlockFile(directory)
         self._points: list[int] = []
         self._recent = lru_cache(_KEPT)(self._read)
 
     def __len__(self) -> int:
-        return len(self._starts)
+        return len(self._points)
 
     def __getitem__(self, index: int) -> SparseSubmap:
         if not -len(self) <= index < len(self):
@@ -48,14 +45,12 @@ class SubmapFile:
         record = np.zeros((), _record(len(submap)))
         for name in record.dtype.names or ():
             record[name] = getattr(submap, name)
-        self._starts.append(self._file.seek(0, 2))
+        self._blocks.write(record.tobytes())
         self._points.append(len(submap))
-        self._file.write(record.tobytes())
 
     def _read(self, index: int) -> SparseSubmap:
         kind = _record(self._points[index])
-        self._file.seek(self._starts[index])
-        record = np.frombuffer(self._file.read(kind.itemsize), kind)[0]
+        record = np.frombuffer(self._blocks.read(index), kind)[0]
         values = {name: record[name] for name in kind.names or ()}
         return SparseSubmap(**values | {name: float(values[name]) for name in ("range_m", "cell_m")})
 
