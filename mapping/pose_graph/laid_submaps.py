@@ -71,8 +71,9 @@ class LaidSubmaps(Stateful):
             return None
         self._poses, self._held = list(targets), np.flatnonzero(relative < 1.0).tolist()
         self._redraws.append(len(targets))
-        step = 1 + sum(len(submap(key)) for key in self._held) // _MOST_POINTS
-        submaps = ((targets[key], submap(key).rows[::step]) for key in self._held)
+        held = [submap(key).rows for key in self._held]
+        step = 1 + sum(map(len, held)) // _MOST_POINTS
+        submaps = ((targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True))
         return draw_local_map(submaps, cell_m, self._radius_m)
 
     def _is_off(self, targets: FloatArray, near: NDArray[np.intp], cell_m: float) -> bool:
