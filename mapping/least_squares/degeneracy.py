@@ -26,15 +26,14 @@ def find_degeneracy(jacobian: FloatArray, weights: FloatArray, tilt: FloatArray,
         tilt: (M,) standard deviation of each normal, radians.
         lever_m: root mean square range of the points.
     """
-    total = float(weights.sum())
-    if total <= 0.0:
+    constraint = (jacobian * weights[:, None]).T @ jacobian
+    return degenerate_directions(constraint, float(weights @ tilt**2), float(weights.sum()), lever_m)
+
+
+def degenerate_directions(constraint: FloatArray, tilt: float, weight: float, lever_m: float) -> Degeneracy:
+    """As `find_degeneracy`, from the weighted sums of `J^T J` (6, 6) and of the squared tilt, and the total weight."""
+    if weight <= 0.0:
         return Degeneracy(np.eye(6), lever_m)
-    constraint = (jacobian * weights[:, None]).T @ jacobian / total
-    return degenerate_directions(constraint, float(weights @ tilt**2) / total, lever_m)
-
-
-def degenerate_directions(constraint: FloatArray, squared_tilt: float, lever_m: float) -> Degeneracy:
-    """As `find_degeneracy`, from the weighted means (6, 6) of `J^T J` and of the squared tilt."""
     scale = lever_scale(lever_m)
-    shares, axes = np.linalg.eigh(constraint / np.outer(scale, scale))
-    return Degeneracy(axes[:, shares < max(_LEAST_SHARE, _NOISE_FACTOR * squared_tilt)].T, lever_m)
+    shares, axes = np.linalg.eigh(constraint / weight / np.outer(scale, scale))
+    return Degeneracy(axes[:, shares < max(_LEAST_SHARE, _NOISE_FACTOR * (tilt / weight))].T, lever_m)

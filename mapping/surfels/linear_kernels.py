@@ -64,7 +64,8 @@ def accumulate(
         total: (13, 13), zero, written: the Hessian of pose and velocity, and in the last column the gradient.
 
     Returns:
-        The sum of the weights, and the mean squares of the normals' standard deviation and of the times.
+        The sums of the weights and of the weighted squares of the normals' standard deviations, and the mean square of
+        the times.
     """
     block = np.empty((_BLOCK, 13))
     weights, tilts, times = 0.0, 0.0, 0.0
@@ -84,4 +85,4 @@ def accumulate(
             tilts += weight * row[TILT] * row[TILT]
             times += t * t
         total += np.dot(block[:size].T, block[:size])
-    return weights, tilts / max(weights, 1e-300), times / max(len(rows), 1)
+    return weights, tilts, times / max(len(rows), 1)

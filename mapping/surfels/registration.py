@@ -152,12 +152,8 @@ class _System:
             return None
         rows, total = rows[:count], np.zeros((13, 13))
         scale = max(_SCALE_PER_MEDIAN * float(np.median(np.abs(rows[:, RESIDUAL]))), _LEAST_SCALE * cell_m)
-        weights, squared_tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, total)
-        lever_m = float(np.sqrt(squared / count))
-        if weights > 0.0:
-            degeneracy = degenerate_directions(total[:6, :6] / weights, squared_tilt, lever_m)
-        else:
-            degeneracy = Degeneracy(np.eye(6), lever_m)
+        weight, tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, total)
+        degeneracy = degenerate_directions(total[:6, :6], tilt, weight, float(np.sqrt(squared / count)))
         return cls(total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION, degeneracy, squared_time)
 
 
