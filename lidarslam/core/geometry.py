@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 # Below this angle the closed forms lose digits to cancellation and their Taylor series are exact to rounding.
-_SMALL_ANGLE = 1e-4
+SMALL_ANGLE = 1e-4
 
 
 def make_transform(R: ArrayLike, t: ArrayLike) -> FloatArray:
@@ -57,7 +57,7 @@ def rotation_angle(T: FloatArray) -> FloatArray:
 
 def _series(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3, finite at zero."""
-    small = angle < _SMALL_ANGLE
+    small = angle < SMALL_ANGLE
     a = np.where(small, 1.0, angle)
     a2 = angle**2
     sin_a, half = np.sin(a), np.sin(0.5 * a)
@@ -92,7 +92,7 @@ def log(T: FloatArray) -> FloatArray:
     omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec().reshape(*T.shape[:-2], 3)
     angle = np.linalg.norm(omega, axis=-1)
     s, c, _ = _series(angle)
-    small = angle < _SMALL_ANGLE
+    small = angle < SMALL_ANGLE
     a2 = np.where(small, 1.0, angle**2)
     coefficient = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - s / (2.0 * c)) / a2)
     K = skew(omega)
@@ -106,7 +106,7 @@ def _exp_one(xi: FloatArray) -> FloatArray:
     angle = math.sqrt(a * a + b * b + c * c)
     if not math.isfinite(angle):
         return np.full((4, 4), np.nan)
-    s, v, j = _coefficients(angle)
+    s, v, j = coefficients(angle)
     aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
     u, w, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x v
     return np.array(
@@ -135,10 +135,10 @@ def _log_one(T: FloatArray) -> FloatArray:
     angle = 2.0 * math.atan2(sine, abs(w))
     scale = math.copysign(angle / sine if sine > 0.0 else 0.0, w)
     a, b, c = scale * i, scale * j, scale * k
-    if angle < _SMALL_ANGLE:
+    if angle < SMALL_ANGLE:
         coefficient = 1.0 / 12.0 + angle**2 / 720.0
     else:
-        s, v, _ = _coefficients(angle)
+        s, v, _ = coefficients(angle)
         coefficient = (1.0 - s / (2.0 * v)) / angle**2
     u, g, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x t
     return np.array(
@@ -151,9 +151,9 @@ def _log_one(T: FloatArray) -> FloatArray:
     )
 
 
-def _coefficients(angle: float) -> tuple[float, float, float]:
-    """As `_series`."""
-    if angle < _SMALL_ANGLE:
+def coefficients(angle: float) -> tuple[float, float, float]:
+    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3 of an angle; also compiled, see `lidarslam.odometry.alignment`."""
+    if angle < SMALL_ANGLE:
         a2 = angle * angle
         return 1.0 - a2 / 6.0, 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
     sine, half = math.sin(angle), math.sin(0.5 * angle)

@@ -5,15 +5,15 @@ import math
 import numpy as np
 
 from lidarslam.core.compiled import compiled, compiled_part
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import SMALL_ANGLE, FloatArray, coefficients
 
 # Information that keeps the normal equations solvable.
 _DAMPING = 1e-3
 # No step of the motion is larger: radians and metres.
 _LARGEST_STEP = 0.3
-# As in `lidarslam.core.geometry`.
-_SMALL_ANGLE = 1e-4
 _UNKNOWNS = 12
+
+_coefficients = compiled_part(coefficients)
 
 
 @compiled
@@ -107,16 +107,6 @@ def _multiply(T_a_b: FloatArray, T_b_c: FloatArray, T_a_c: FloatArray) -> None:
 
 
 @compiled_part
-def _coefficients(angle: float) -> tuple[float, float, float]:
-    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3."""
-    if angle < _SMALL_ANGLE:
-        squared = angle * angle
-        return 1.0 - squared / 6.0, 0.5 - squared / 24.0, 1.0 / 6.0 - squared / 120.0
-    sine, half = math.sin(angle), math.sin(0.5 * angle)
-    return sine / angle, 2.0 * half * half / (angle * angle), (angle - sine) / (angle * angle * angle)
-
-
-@compiled_part
 def _exp(xi: FloatArray, T: FloatArray) -> None:
     """Write `lidarslam.core.geometry.exp` of the first six numbers."""
     a, b, c, x, y, z = xi[0], xi[1], xi[2], xi[3], xi[4], xi[5]
@@ -166,7 +156,7 @@ def _log(T: FloatArray, xi: FloatArray) -> None:
     scale = math.copysign(angle / sine if sine > 0.0 else 0.0, w)
     a, b, c = scale * a, scale * b, scale * c
     s, v, _ = _coefficients(angle)
-    near = angle < _SMALL_ANGLE
+    near = angle < SMALL_ANGLE
     coefficient = 1.0 / 12.0 + angle * angle / 720.0 if near else (1.0 - s / (2.0 * v)) / (angle * angle)
     x, y, z = T[0, 3], T[1, 3], T[2, 3]
     u, g, h = b * z - c * y, c * x - a * z, a * y - b * x  # omega x t
