@@ -86,7 +86,7 @@ class Row:
 
 
 class TimedCheckpoints(Checkpoints):
-    """Knows how long the last one took."""
+    """Measures the time of the last one."""
 
     save_s = 0.0
 

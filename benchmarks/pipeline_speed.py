@@ -53,7 +53,7 @@ class Times:
     """Seconds of one run after its first few scans."""
 
     wall: float
-    processor: float  # of all threads; NaN where it cannot be told from other work
+    processor: float  # of all threads; NaN where it cannot be separated from other work
     scan_ms: list[float]  # of single scans
     stage_ms: dict[str, list[float]] = field(default_factory=dict)  # of the stages of ours, of single scans
 

@@ -19,7 +19,7 @@ _FREE_SCANS = 2
 
 
 class Budget:
-    """Tells whether a scan's time is spent.
+    """The time of a scan, and whether it is spent.
 
     Args:
         budget_ms: milliseconds a scan; auto: half of the time between scans; None: not bounded.

@@ -1,4 +1,4 @@
-"""Blocks of bytes in a file that is only appended to, and belongs to a saved state up to where that state knows it."""
+"""Blocks of bytes in an append-only file; a saved state has those that were written before it."""
 
 import os
 import tempfile
