@@ -2,19 +2,46 @@
 
 import contextlib
 import logging
+import os
 import signal
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from types import FrameType
+from typing import Any
 
 logger = logging.getLogger(__name__)
 
-_REQUESTS = (signal.SIGTERM, signal.SIGHUP)
+_REQUESTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)  # of a program that does not handle them
 # Requests while results are written: so many, each at least so long after the one before, abandon them. A key that is
 # held down or hit repeatedly is one request.
 _INSISTENT = 3
 _APART_S = 0.5
+# A request that comes in a finaliser is taken up after so long.
+_AFTER_FINALISER_S = 0.05
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, as a handler of signals; where Python would drop it, a moment later.
+
+    Exceptions of finalisers (`__del__`, callbacks of weak references) are printed and forgotten, requests to end among
+    them.
+    """
+    if not _is_postponed(number, frame):
+        signal.default_int_handler(number, frame)
+
+
+def _is_postponed(number: int, frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_name == "__del__" or frame.f_code.co_filename == weakref.__file__:
+            again = threading.Timer(_AFTER_FINALISER_S, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextlib.contextmanager
@@ -24,9 +51,9 @@ def ended_like_interrupted() -> Iterator[None]:
         yield
         return
     earlier = [(number, signal.getsignal(number)) for number in _REQUESTS]
-    taken = [(number, handler) for number, handler in earlier if handler is signal.SIG_DFL]
+    taken = [(number, handler) for number, handler in earlier if handler in _DEFAULTS]
     for number, _ in taken:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
     try:
         yield
     finally:
@@ -43,25 +70,28 @@ class Interruptions:
     def __init__(self) -> None:
         self._is_writing = False
         self._insisted, self._last_s = 0, -_APART_S
-        self._taken: list[int] = []
+        self._taken: dict[int, Any] = {}  # the handlers to put back
 
     def __enter__(self) -> "Interruptions":
         if threading.current_thread() is threading.main_thread():
-            numbers = (signal.SIGINT, *_REQUESTS)
-            self._taken = [number for number in numbers if signal.getsignal(number) is signal.default_int_handler]
+            earlier = {number: signal.getsignal(number) for number in _REQUESTS}
+            raising = (interrupt, signal.default_int_handler)
+            self._taken = {number: handler for number, handler in earlier.items() if handler in raising}
             for number in self._taken:
                 signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number in self._taken:
-            signal.signal(number, signal.default_int_handler)
+        for number, handler in self._taken.items():
+            signal.signal(number, handler)
 
     def protect_results(self) -> None:
         """From here on no request ends anything, unless it is insistent."""
         self._is_writing = True
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if _is_postponed(number, frame):
+            return
         first, self._is_writing = not self._is_writing, True
         recent, self._last_s = time.monotonic() - self._last_s < _APART_S, time.monotonic()
         if first:

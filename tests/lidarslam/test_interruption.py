@@ -1,17 +1,21 @@
 """Ctrl-C at any time of a run, once and several times."""
 
+import contextlib
 import logging
 import signal
+import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from lidarslam.cli import main
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.run import interruption
-from lidarslam.run.interruption import Interruptions
+from lidarslam.run.interruption import Interruptions, ended_like_interrupted
 
 pytestmark = pytest.mark.usefixtures("interruptible")
 
@@ -146,6 +150,25 @@ def test_presses_in_quick_succession_are_one(caplog: pytest.LogCaptureFixture) -
         for _ in range(20):
             press()
     assert len(caplog.records) <= 1
+
+
+class _InterruptedWhenDropped:
+    def __del__(self) -> None:
+        press()
+
+
+@pytest.mark.parametrize("is_weak", [False, True], ids=["finaliser", "weak reference"])
+@pytest.mark.parametrize("is_run", [False, True], ids=["command", "run"])
+def test_a_request_in_a_finaliser_is_not_lost(is_weak: bool, is_run: bool) -> None:
+    with ended_like_interrupted(), Interruptions() if is_run else contextlib.nullcontext():
+        if is_weak:
+            ended: object = np.zeros(3)
+            weakref.finalize(ended, press)
+        else:
+            ended = _InterruptedWhenDropped()
+        with pytest.raises(KeyboardInterrupt):
+            del ended
+            time.sleep(60)
 
 
 def test_the_handlers_are_as_before() -> None:
