@@ -33,7 +33,7 @@ _VIEW_RANGES, _VIEW_CELLS, _PLACES = 3.0, 4.0, 24
 # Changes of the yaw rate tried on a scan that fits poorly, rad/s: from full speed one way to full speed the other.
 _YAW_RATES = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
 _YAW_STEP_DEG = 15.0
-# Points that are registered first from a pose found by search, and the share of the best quality above which all are.
+# Points that are registered first; of poses found by search, those above this share of the best quality have all.
 _FEW_POINTS, _LIKELY = 800, 0.5
 # Displacements tried where the velocity is unknown: the speed of a car, at most the median range, and their spacing in
 # cells, within reach of the coarse cells.
