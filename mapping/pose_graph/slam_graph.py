@@ -24,7 +24,6 @@ from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure, RelativePose
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import refine
-from lidarslam.mapping.loops.revisits import as_registered
 from lidarslam.mapping.pose_graph.attitude import Attitude, measured_attitude
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, first_connected, squared_error, trajectory_edges
@@ -63,7 +62,7 @@ class SlamGraph(Stateful):
     _relaxing: RelaxSchedule
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
     _laid: LaidSubmaps  # in the running local map
-    _looked_at: int  # closures that the local map has been compared with
+    _is_map_due: bool  # whether closures have been refined since the local map was compared with them
     _motion: MotionSinceKeyframe
     _path_m: float
     _segment: int
@@ -76,7 +75,6 @@ class SlamGraph(Stateful):
         local_radius_m: float = 0.0,
     ) -> None:
         self._config = config
-        self._local_radius_m = local_radius_m
         self._selector = KeyframeSelector(config.keyframes)
         self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
         self._store = SubmapStore(directory, file)
@@ -84,7 +82,7 @@ class SlamGraph(Stateful):
         self.scan_poses, self.keyframe_ms, self._first_scans = [], [], [0]
         self._keyframes, self._poses, self._edges, self._closures = [], [], [], []
         self._unrefined, self._attitudes, self._relaxing = [], [], RelaxSchedule()
-        self._laid, self._looked_at = LaidSubmaps(local_radius_m), 0
+        self._laid, self._is_map_due = LaidSubmaps(local_radius_m), False
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
     def _after_restore(self) -> None:
@@ -127,15 +125,16 @@ class SlamGraph(Stateful):
     def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
         """The local map drawn anew without the latest scan, in the frame of registration, with cells of that edge.
 
-        None unless loop closures since the last call show that submaps lie elsewhere in the local map, or are missing.
+        None unless loop closures refined since the last call show that submaps lie elsewhere in the local map, or are
+        missing.
         """
-        new, self._looked_at = self._closures[self._looked_at :], len(self._closures)
-        if not any(closure.accepted for closure in new):
+        is_due, self._is_map_due = self._is_map_due, False
+        if not is_due:
             return None
         certain = [one for one in self._accepted() if squared_error(one, self._poses) < CHI_SQUARED_99]
         members = connected_with_last(self._keyframes, certain, self._first_scans[-1])
-        T_odom_world = self.scan_poses[self._keyframes[-1].scan] @ inverse(self._poses[-1])
-        return self._laid.redrawn(T_odom_world @ np.array(self._poses), members, cell_m, self._means)
+        targets = self.scan_poses[self._keyframes[-1].scan] @ inverse(self._poses[-1]) @ np.array(self._poses)
+        return self._laid.redrawn(targets, members, cell_m, self._means, scan=len(self.scan_poses) - 1)
 
     def finish(self) -> Corrected | None:
         """Optimise everything; None when there is no keyframe."""
@@ -207,7 +206,8 @@ class SlamGraph(Stateful):
         else:
             T_first_second = inverse(self.scan_poses[last.scan]) @ scan.T_world_lidar
             key = len(self._keyframes)
-            self._edges += trajectory_edges(key, T_first_second, motion, last.covariance, scan.covariance)
+            one_map = not self._laid.is_exchanged(last.scan, len(self.scan_poses) - 1)
+            self._edges += trajectory_edges(key, T_first_second, motion, last.covariance, scan.covariance, one_map)
             self._poses.append(self._poses[-1] @ T_first_second)
             self._segment += motion.lost  # the drift model does not hold across
         self._laid.follow(scan.T_world_lidar)
@@ -223,15 +223,18 @@ class SlamGraph(Stateful):
         found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
-        self._refine_closures(until=index - REACH)
-        if self._relaxing.is_due(found, self._poses):
+        refined = self._refine_closures(until=index - REACH)
+        self._is_map_due = self._is_map_due or bool(refined)
+        if self._relaxing.is_due([*found, *refined], self._poses):
             self._poses = list(relax(np.array(self._poses), self._edges, self._accepted(), self._attitudes))
 
-    def _refine_closures(self, until: int) -> None:
+    def _refine_closures(self, until: int) -> list[LoopClosure]:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""
-        for row in [row for row in self._unrefined if self._closures[row].second <= until]:
+        rows = [row for row in self._unrefined if self._closures[row].second <= until]
+        for row in rows:
             self._unrefined.remove(row)
             self._closures[row] = self._refined(self._closures[row])
+        return [self._closures[row] for row in rows]
 
     def _refined(self, closure: LoopClosure) -> LoopClosure:
         """A closure registered on all points of both submaps and their neighbours."""
@@ -240,7 +243,6 @@ class SlamGraph(Stateful):
         target, source = (near.submap(key, self._config.loops.max_range_m, cell_m) for key in ends)
         closure = refine(target, source, closure, near.drift(closure.first) + near.drift(closure.second)) or closure
         first, second = self._keyframes[closure.first], self._keyframes[closure.second]
-        if first.segment != second.segment or self._laid.redrawn_between(closure.first, closure.second):
+        if first.segment != second.segment:
             return closure
-        way = np.array(self.scan_poses[first.scan : second.scan + 1])
-        return as_registered(closure, way, first.covariance, second.covariance, self._local_radius_m)
+        return self._laid.measured(closure, first, second, self.scan_poses)
