@@ -5,7 +5,7 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
-from lidarslam.core.degeneracy import AXES
+from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Saved, Shape, State

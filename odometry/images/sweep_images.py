@@ -6,13 +6,13 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.directions.spin_axis import image_axes
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.odometry.config import ImageConfig
 from lidarslam.odometry.images.normals import FINE_PATCHES, PATCHES, surface_normals
 from lidarslam.odometry.images.projection import Floats, ImageGrid, Points, Projection, project
-from lidarslam.odometry.images.spin_axis import image_axes
 
 # The grid of a scan of fewer points, as of a covered sensor, is replaced by that of a scan of more.
 _ENOUGH_POINTS = 200
