@@ -19,7 +19,7 @@ from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
 from lidarslam.simulation.sensors.table import find_sensor
-from lidarslam.simulation.world import build_world
+from lidarslam.simulation.worlds.registry import build_world
 
 SCANS = 17  # of which the guess looks at every fourth
 ROLL = np.round(Rotation.from_euler("x", 90, degrees=True).as_matrix())
@@ -27,7 +27,7 @@ ROLL = np.round(Rotation.from_euler("x", 90, degrees=True).as_matrix())
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A street as an HDL-64E sees it, upright and rolled by 90 degrees."""
+    """A street as an HDL-32E sees it, upright and rolled by 90 degrees."""
     world = build_world("street", 3)
     motion = motion_along_route("car", world, 3)
     T_body_lidar = mount_pose("upright", motion.sensor_height_m)
