@@ -205,10 +205,10 @@ def test_scans_without_surfaces_show_nothing(points):
 
 def test_recordings_are_opened_upright(tmp_path: Path):
     R = turn(*QUARTERS["left"])
-    for number, points in enumerate(street()):
+    for number, points in enumerate(street(17)):
         np.save(tmp_path / f"{number:06d}.npy", points @ R.T)
     T = make_transform(R.T, np.zeros(3))
-    write_tum(tmp_path / "ground_truth.tum", Trajectory(0.1 * np.arange(5.0), np.tile(T, (5, 1, 1))))
+    write_tum(tmp_path / "ground_truth.tum", Trajectory(0.1 * np.arange(17.0), np.tile(T, (17, 1, 1))))
 
     def opened(mounting: Mounting) -> MountedRecording:
         return open_recording(tmp_path, ReaderConfig(mounting=mounting))

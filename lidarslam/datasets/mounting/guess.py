@@ -74,7 +74,7 @@ def _decide(found: Sequence[FloatArray], unclear: Sequence[FloatArray]) -> Guess
 def _upwards(points: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     """The upwards direction (3,), if it is far from z and clear; and the spin axis (3,) if z is neither."""
     seen = planes(points)
-    if any(_may_be_upright(plane, None) for plane in seen if plane.height_m < _MOST_HEIGHT_M):
+    if not seen or any(_may_be_upright(plane, None) for plane in seen if plane.height_m < _MOST_HEIGHT_M):
         return None, None
     R_image_recorded = image_axes(points)
     axis = None if np.array_equal(R_image_recorded, np.eye(3)) else R_image_recorded[2]
