@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from lidarslam.config.settings import load_config
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting, ReaderConfig, RollPitchYaw
@@ -55,7 +56,9 @@ class From:
     def __len__(self) -> int:
         return len(self._recording) - self._start
 
-    def scans(self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None) -> Iterator:
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
         """The scans, counted from the start."""
         stop = None if stop is None else stop + self._start
         return self._recording.scans(start + self._start, stop, step, faults)
@@ -80,10 +83,11 @@ def main() -> None:
             turned = MountedRecording(From(recorded, start), TURNS[name])  # type: ignore[arg-type]
             back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
             given: RollPitchYaw = tuple(np.round(back, 6).tolist())  # type: ignore[assignment]
-            for setting, mounting in (("as it is", "upright"), ("guessed", "auto"), ("set", given)):
+            settings: dict[str, Mounting] = {"as it is": "upright", "guessed": "auto", "set": given}
+            for setting, mounting in settings.items():
                 if name == "none" and setting == "set":
                     continue
-                mounted = MountedRecording(turned, mounting)  # type: ignore[arg-type]
+                mounted = MountedRecording(turned, mounting)
                 cells = [run(mounted, method, arguments.scans) for method in arguments.methods]
                 print(f"| {start} | {name} | {shown(mounted, setting, mounting)} | {' | '.join(cells)} |", flush=True)
 

@@ -103,6 +103,8 @@ class Imager(Stateful):
             raise ValueError(f"the images are not {size[0]} x {size[1]}")
         if not self._config.rows <= self._alignment_rows <= max(_MOST_ROWS, self._config.rows):
             raise ValueError(f"{self._alignment_rows} rows are no image")
+        if not np.allclose(self._R_image_lidar @ self._R_image_lidar.T, np.eye(3)):
+            raise ValueError("the images' axes are no rotation")
 
     def images(self, scan: Scan) -> ScanImages:
         """The scan as images, normals included."""
