@@ -53,9 +53,10 @@ def _decide(found: Sequence[FloatArray], unclear: Sequence[FloatArray]) -> Guess
     mean = np.sum(found, axis=0) if found else np.zeros(3)
     agreeing = [up for up in found if up @ mean > _ALIKE * np.linalg.norm(mean)]
     if len(agreeing) >= _SOME_SCANS:
-        mounting = mounting_with_up(np.sum(agreeing, axis=0) / np.linalg.norm(np.sum(agreeing, axis=0)))
+        up = np.sum(agreeing, axis=0)
+        mounting = mounting_with_up(up / np.linalg.norm(up))
         setting = f"--set reader.mounting={written(mounting)}"
-        if len(agreeing) >= _ENOUGH_SCANS and mounting != "upright":
+        if len(agreeing) >= _ENOUGH_SCANS:
             return Guess(
                 mounting,
                 f"the ground in the first scans shows that z is not up; taken as {setting}, which makes this certain"
