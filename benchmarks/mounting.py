@@ -82,7 +82,7 @@ def main() -> None:
         for name in arguments.turns:
             turned = MountedRecording(From(recorded, start), TURNS[name])  # type: ignore[arg-type]
             back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
-            given: RollPitchYaw = tuple(np.round(back, 6).tolist())  # type: ignore[assignment]
+            given: RollPitchYaw = tuple(np.round(back, 6).tolist())
             settings: dict[str, Mounting] = {"as it is": "upright", "guessed": "auto", "set": given}
             for setting, mounting in settings.items():
                 if name == "none" and setting == "set":
