@@ -56,7 +56,8 @@ class OdometryConfig(BaseModel):
     kiss_icp: KissConfig = KissConfig()
     imu_rotation_deg: tuple[float, float, float] | None = Field(
         None,
-        description="roll, pitch, yaw of the IMU in the LiDAR frame; null: the recording's, else found by its turns",
+        description="roll, pitch, yaw of the IMU in the LiDAR's recorded axes; null: the recording's, else found by its"
+        " turns",
     )
 
     @property

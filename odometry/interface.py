@@ -1,9 +1,12 @@
 """The protocol of every odometry method."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Protocol
 
-from lidarslam.core.geometry import FloatArray
+import numpy as np
+
+from lidarslam.core.directions.degeneracy import AXES
+from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Saved, Shape, State
 
@@ -19,6 +22,18 @@ class Motion:
     # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the method has none
     covariance: Annotated[FloatArray, Shape(6, 6)] | None = None
     degenerate: tuple[str, ...] = ()  # names of the degenerate directions, where the method finds them
+
+    def in_axes(self, R_new_old: FloatArray) -> "Motion":
+        """The motion in other axes (3, 3) of the LiDAR; degenerate directions take the names of the nearest axes."""
+        T = make_transform(R_new_old, np.zeros(3))
+        A = np.kron(np.eye(2), R_new_old)
+        named = np.abs(A[:, [AXES.index(name) for name in self.degenerate]])
+        return replace(
+            self,
+            T_prev_curr=T @ self.T_prev_curr @ inverse(T),
+            covariance=None if self.covariance is None else A @ self.covariance @ A.T,
+            degenerate=tuple(AXES[index] for index in sorted(set(named.argmax(axis=0).tolist()))),
+        )
 
 
 class Odometry(Protocol):

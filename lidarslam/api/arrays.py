@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import Mounting
+from lidarslam.datasets.mounting.rotation import transform_of, turned
 
 # No sweep lasts longer, and no clock reading is smaller.
 _LONGEST_OFFSET_S = 10.0
@@ -17,13 +19,14 @@ _LATEST_STAMP_S = 1e11
 _MOST_INTERVALS = 4.0
 
 
-def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float) -> Scan:
-    """A scan, of copies, without the invalid points: NaN, at the origin, beyond 10 km.
+def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, mounting: Mounting = "auto") -> Scan:
+    """A scan, of copies, in upright axes, without the invalid points: NaN, at the origin, beyond 10 km.
 
     Args:
         points: (N, 3) or more columns, of which the first three are x, y, z in metres.
         point_times: (N,) seconds from the stamp.
         stamp: seconds.
+        mounting: of the points' axes; auto: upright.
 
     Raises:
         InputError: an array has another shape, or a time is not in seconds.
@@ -34,7 +37,8 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float) ->
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"points must be (N, 3) or (N, 3 and more), x, y, z first; got the shape {table.shape}")
     times = None if point_times is None else _times(point_times, len(table))
-    return Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times)
+    scan = Scan.from_raw(np.array(table[:, :3], dtype=np.float64), stamp, times)
+    return turned(scan, transform_of(mounting))
 
 
 def check_stamp(stamp: float, last: float | None) -> float:

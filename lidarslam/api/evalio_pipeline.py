@@ -21,6 +21,7 @@ from lidarslam.config.settings import load_config
 from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.mounting.rotation import transform_of
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +39,7 @@ class LidarSlam(Pipeline):
         super().__init__()
         self._parameters = dict(_DEFAULTS)
         self._T_lidar_imu: FloatArray = np.eye(4)
+        self._T_upright_recorded: FloatArray = np.eye(4)
         self._slam: Slam | None = None
 
     @staticmethod
@@ -85,7 +87,9 @@ class LidarSlam(Pipeline):
         settings = [f"{name}.method={given[name]}" for name in ("odometry", "mapping") if given[name]]
         config = str(given["config"])
         file = shipped_files(CONFIGS).get(config, Path(config)) if config else None
-        self._slam = Slam(load_config(file, settings))
+        loaded = load_config(file, settings)
+        self._T_upright_recorded = transform_of(loaded.reader.mounting)
+        self._slam = Slam(loaded)
 
     def add_imu(self, mm: ImuMeasurement) -> None:
         """The IMU is not used."""
@@ -99,7 +103,7 @@ class LidarSlam(Pipeline):
         except InputError as error:
             logger.warning("%s", error)
             return
-        self.save(mm.stamp, SE3.from_mat(scan.T_world_lidar @ self._T_lidar_imu))
+        self.save(mm.stamp, SE3.from_mat(scan.T_world_lidar @ self._T_upright_recorded @ self._T_lidar_imu))
 
     def map(self) -> dict[str, list[Point]]:
         """No map is shown."""

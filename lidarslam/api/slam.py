@@ -83,8 +83,8 @@ class Slam:
 
         Args:
             points: (N, 3) or more columns, of which the first three are x, y, z: metres, in the LiDAR frame (x forward,
-                z up) of the instant each was measured at. Or a `Scan`, which has times and stamp of its own, and
-                whatever else goes into maps.
+                z up; others are turned by `reader.mounting`) of the instant each was measured at. Or a `Scan` in that
+                frame, which has times and stamp of its own, and whatever else goes into maps.
             point_times: (N,) seconds from the stamp at which each point was measured; None when the points are
                 motion compensated, or the times unknown.
             stamp: seconds, after that of the scan before; the pose belongs to this instant. None, then for all scans:
@@ -180,7 +180,8 @@ class Slam:
             raise InputError("give a stamp with every scan or with none")
         last = self._last_stamp
         seconds = check_stamp(self._count / self._config.reader.rate_hz if stamp is None else stamp, last)
-        scan = points if isinstance(points, Scan) else make_scan(points, point_times, seconds)
+        mounting = self._config.reader.mounting
+        scan = points if isinstance(points, Scan) else make_scan(points, point_times, seconds, mounting)
         longest_s = 0.0 if last is None else max(self._longest_interval_s, seconds - last)
         if last is not None:
             check_sweep(scan, longest_s)

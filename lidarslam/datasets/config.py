@@ -1,11 +1,15 @@
 """Settings of the readers."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 TimeReference = Literal["auto", "relative", "absolute", "azimuth", "none"]
+MountingName = Literal["upright", "upside-down", "left", "right", "forward", "backward", "camera"]
+_Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
+RollPitchYaw = tuple[_Angle, _Angle, _Angle]
+Mounting = Literal["auto"] | MountingName | RollPitchYaw
 
 
 class ReaderConfig(BaseModel):
@@ -24,4 +28,9 @@ class ReaderConfig(BaseModel):
     time_reference: TimeReference = Field(
         "auto",
         description="per-point time: relative to the scan's stamp, a reading of a clock, from the azimuth, or none",
+    )
+    mounting: Mounting = Field(
+        "auto",
+        description="where the recorded z axis points: upright, upside-down, left, right, forward, backward, camera, or"
+        " roll, pitch, yaw of the recorded axes in degrees; auto: seen from the ground",
     )

@@ -9,9 +9,10 @@ from typing import NamedTuple, cast
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
+from lidarslam.datasets.mounting.recording import MountedRecording
 from lidarslam.datasets.published.evalio_names import is_of_evalio, located
+from lidarslam.datasets.published.unrecognised import absent, result_of_program, unrecognised
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.unrecognised import absent, result_of_program, unrecognised
 
 logger = logging.getLogger(__name__)
 
@@ -163,7 +164,7 @@ def recognise(source: Path) -> str | None:
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
-    """Open a recording; scans are read later, one at a time.
+    """Open a recording, in upright axes; scans are read later, one at a time.
 
     Raises:
         InputError: the source cannot be read by the chosen reader.
@@ -174,4 +175,7 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     logger.info("reader: %s, %s: %s", name, why, READERS[name].reads)
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
-    return cast(Recording, import_module(READERS[name].module).open_recording(source, config))
+    recording = cast(Recording, import_module(READERS[name].module).open_recording(source, config))
+    if config.mounting == "upright":
+        return recording
+    return MountedRecording(recording, config.mounting)

@@ -1,6 +1,7 @@
 """The GNSS track of a recording: KITTI's GPS/IMU unit, or sensor_msgs/NavSatFix in a bag."""
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.raw import KittiRawRecording
+from lidarslam.datasets.mounting.recording import recorded_axes
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import deserialize
@@ -26,7 +28,7 @@ def read_gnss(source: Path, config: ReaderConfig) -> GnssTrack:
     Raises:
         InputError: the recording cannot be read, or has none.
     """
-    recording = open_recording(source, config)
+    recording, T_upright_recorded = recorded_axes(open_recording(source, config))
     track = None
     if isinstance(recording, KittiRawRecording):
         track = _of_drive(recording)
@@ -35,7 +37,7 @@ def read_gnss(source: Path, config: ReaderConfig) -> GnssTrack:
     if track is None:
         readable = "KITTI raw drives with oxts, and bags with sensor_msgs/NavSatFix"
         raise InputError(f"{source}: has no GNSS positions; it is read from {readable}")
-    return track
+    return replace(track, lidar_antenna=T_upright_recorded[:3, :3] @ track.lidar_antenna)
 
 
 def _of_drive(drive: KittiRawRecording) -> GnssTrack | None:

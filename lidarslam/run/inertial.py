@@ -11,6 +11,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
+from lidarslam.datasets.mounting.recording import recorded_axes
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.inertial.mounting import Mounting, MountingError, Turns, find_mounting
@@ -51,7 +52,8 @@ def open_inertial(config: Config, recording: Recording, chosen: range) -> Inerti
         return None
     T_lidar_imu = samples.T_lidar_imu
     if config.odometry.imu_rotation_deg is not None:
-        T_lidar_imu = make_transform(_rotation(config.odometry.imu_rotation_deg), np.zeros(3))
+        T_recorded_imu = make_transform(_rotation(config.odometry.imu_rotation_deg), np.zeros(3))
+        T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
     if T_lidar_imu is None:
         logger.info("finding how the IMU is mounted")
         T_lidar_imu = _found(config, recording, chosen, samples)

@@ -20,7 +20,7 @@ from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.point_attributes import read_colours, read_intensities
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
-from lidarslam.datasets.unrecognised import absent
+from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.not_a_run import not_a_run

@@ -4,8 +4,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
+from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.datasets.registry import choose_reader
-from lidarslam.datasets.unrecognised import absent
 from lidarslam.storage import directory as files
 
 _LISTED = 5

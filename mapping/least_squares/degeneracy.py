@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy, lever_scale
+from lidarslam.core.directions.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray
 
 # Least mean constraint of a direction. Noisy normals of a corridor's walls constrain it as well: the share that their

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy
+from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, inverse, log, orthonormalize, transform_points
 from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, find_degeneracy
 from lidarslam.mapping.least_squares.gauss_newton import (

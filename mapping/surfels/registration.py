@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy
+from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, degenerate_directions
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity

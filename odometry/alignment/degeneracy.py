@@ -6,7 +6,7 @@ normals, and is biased towards no motion; so is a network's estimate from the sa
 
 import numpy as np
 
-from lidarslam.core.degeneracy import Degeneracy, lever_scale
+from lidarslam.core.directions.degeneracy import Degeneracy, lever_scale
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
 from lidarslam.odometry.images.sweep_images import SweepImages
 

@@ -6,6 +6,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.directions.spin_axis import image_axes
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.odometry.config import ImageConfig
@@ -30,7 +32,7 @@ _MEDIAN_STEP = 4
 class SweepImages:
     """A sweep as images, float32."""
 
-    # (3, H, W) metres in the LiDAR frame at the time of each point; zero where empty
+    # (3, H, W) metres in the images' axes at the time of each point; zero where empty
     points: Annotated[Floats, Shape(3, None, None)]
     normals: Annotated[Floats, Shape(3, None, None)]  # (3, H, W) unit, zero where there is none
     # (H, W) seconds from the middle of the sweep; all zero where unknown or already compensated
@@ -73,23 +75,26 @@ class ScanImages:
 
     network: SweepImages
     alignment: SweepImages
+    R_image_lidar: Annotated[FloatArray, Shape(3, 3)]  # the axes of the images, whose z is the spin axis
 
 
 class Imager(Stateful):
-    """Makes images of one sensor's scans, on the grid of the first scan with points enough.
+    """Makes images of one sensor's scans, about the axis and on the grid of the first scan with points enough.
 
     The network's images are always of the same size. Alignment sees as many rows as the sensor has rings, from those of
     the network to 64, because an image that shows the nearest point of several rings biases it along the way.
     """
 
     _grid: ImageGrid | None
-    _grid_points: int  # of the scan that the grid is from
+    _grid_points: int  # of the scan that axes and grid are from
+    _R_image_lidar: Annotated[FloatArray, Shape(3, 3)]
     _alignment_rows: int
 
     def __init__(self, config: ImageConfig) -> None:
         self._config = config
         self._grid = None
         self._grid_points = 0
+        self._R_image_lidar = np.eye(3)
         self._alignment_rows = config.rows
 
     def _after_restore(self) -> None:
@@ -98,24 +103,34 @@ class Imager(Stateful):
             raise ValueError(f"the images are not {size[0]} x {size[1]}")
         if not self._config.rows <= self._alignment_rows <= max(_MOST_ROWS, self._config.rows):
             raise ValueError(f"{self._alignment_rows} rows are no image")
+        if not np.allclose(self._R_image_lidar @ self._R_image_lidar.T, np.eye(3)):
+            raise ValueError("the images' axes are no rotation")
 
     def images(self, scan: Scan) -> ScanImages:
         """The scan as images, normals included."""
-        grid = self._grid_of(scan)
+        grid, points = self._grid_and_points(scan)
         if self._alignment_rows == grid.rows:
-            coarse = _images(project(scan.points, [grid])[0], grid, scan)
-            return ScanImages(coarse, coarse)
+            coarse = _images(project(points, [grid])[0], grid, scan)
+            return ScanImages(coarse, coarse, self._R_image_lidar)
         fine = ImageGrid(self._alignment_rows, grid.columns, grid.elevation_low, grid.elevation_high)
-        shown = project(scan.points, [grid, fine])
-        return ScanImages(_images(shown[0], grid, scan), _images(shown[1], fine, scan, is_fine=True))
+        shown = project(points, [grid, fine])
+        images = _images(shown[0], grid, scan), _images(shown[1], fine, scan, is_fine=True)
+        return ScanImages(*images, self._R_image_lidar)
 
-    def _grid_of(self, scan: Scan) -> ImageGrid:
-        if self._grid is None or self._grid_points < min(_ENOUGH_POINTS, len(scan)):
-            points = scan.points.astype(np.float32)
+    def _grid_and_points(self, scan: Scan) -> tuple[ImageGrid, FloatArray]:
+        """The grid, and the points (N, 3) of the scan in the images' axes."""
+        is_first = self._grid is None or self._grid_points < min(_ENOUGH_POINTS, len(scan))
+        if is_first:
+            self._R_image_lidar = image_axes(scan.points)
+        turned = scan.points
+        if not np.array_equal(self._R_image_lidar, np.eye(3)):
+            turned = np.ascontiguousarray(turned @ self._R_image_lidar.T)
+        if self._grid is None or is_first:
+            points = turned.astype(np.float32)
             self._grid = ImageGrid.around(points, self._config.rows, self._config.columns)
             self._grid_points = len(scan)
             self._alignment_rows = rows_of_sensor(points, scan.rings, self._grid)
-        return self._grid
+        return self._grid, turned
 
 
 def _images(projection: Projection, grid: ImageGrid, scan: Scan, is_fine: bool = False) -> SweepImages:

@@ -84,7 +84,17 @@ class LearnedOdometry(Stateful):
         """The motion since the last scan that had points."""
         if not len(scan):
             return Motion(np.eye(4), 0, "the scan is empty")
-        images, middle, last = self._imager.images(scan), scan.stamp + scan.middle_offset_s, self._last
+        images = self._imager.images(scan)
+        motion = self._estimate(scan, images)
+        has_own_axes = np.array_equal(images.R_image_lidar, np.eye(3))
+        return motion if has_own_axes else motion.in_axes(images.R_image_lidar.T)
+
+    def _estimate(self, scan: Scan, images: ScanImages) -> Motion:
+        """The motion in the images' axes."""
+        middle, last = scan.stamp + scan.middle_offset_s, self._last
+        if last is not None and not np.array_equal(last.images.R_image_lidar, images.R_image_lidar):
+            self._forget()
+            last = None
         shown = images.network
         if last is None or self._described is None or middle <= last.middle:
             self._described = self._search.describe(shown.points, shown.normals)

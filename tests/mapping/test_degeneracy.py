@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarslam.core.degeneracy import Degeneracy
+from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.mapping.least_squares.degeneracy import find_degeneracy
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.alignment import search
 from lidarslam.odometry.config import ImageConfig, LearnedConfig, OdometryConfig
@@ -342,3 +343,26 @@ def test_without_alignment_the_motion_is_the_networks(box_room):
     np.testing.assert_allclose(motions[1].T_prev_curr, guess, atol=1e-6)
     assert motions[1].covariance is not None
     assert motions[1].points_used > 1000
+
+
+@pytest.mark.parametrize("angles_deg", [(90, 0, 0), (0, 90, 0), (-90, 0, 0), (30, 50, 0)])
+def test_recorded_axes_do_not_matter(box_room, angles_deg):
+    """A sensor spins about one of its axes, which need not be called z."""
+    scans = box_room.scans(3, TWIST)
+    R = Rotation.from_euler("xyz", angles_deg, degrees=True).as_matrix()
+    turned = [replace(scan, points=np.ascontiguousarray(scan.points @ R.T)) for scan in scans]
+    T = make_transform(R, np.zeros(3))
+    for motion, expected in zip(estimates(turned, Told(np.eye(4))), estimates(scans, Told(np.eye(4))), strict=True):
+        assert motion.failure is None
+        np.testing.assert_allclose(inverse(T) @ motion.T_prev_curr @ T, expected.T_prev_curr, atol=0.01)
+        assert motion.degenerate == expected.degenerate == ()
+
+
+def test_a_motion_in_other_axes():
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    R = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    motion = Motion(exp([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]), 7, None, covariance, ("yaw", "x", "y")).in_axes(R)
+    np.testing.assert_allclose(log(motion.T_prev_curr), [0.1, -0.3, 0.2, 1.0, -3.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(motion.covariance, np.diag([1.0, 3.0, 2.0, 4.0, 6.0, 5.0]), atol=1e-12)
+    assert motion.degenerate == ("pitch", "x", "z")
+    assert motion.points_used == 7

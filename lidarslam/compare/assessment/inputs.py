@@ -14,8 +14,8 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text.trajectory_io import read_kitti_poses, read_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.datasets.registry import READERS, open_recording
-from lidarslam.datasets.unrecognised import absent
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.storage import directory as files
 from lidarslam.storage.finished_run import read_trajectory

@@ -6,6 +6,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting.rotation import transform_of, turned
 from lidarslam.datasets.ros import livox
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
@@ -24,7 +25,7 @@ _OTHER_SENSOR = "scans were left out: they come from another sensor; name one wi
 class LiveScan:
     """A scan with what its message says beside the points."""
 
-    scan: Scan
+    scan: Scan  # in upright axes
     stamp_ns: int  # of the header, or of the publication where the header has none
     frame_id: str  # the sensor's frame
 
@@ -33,7 +34,7 @@ class CloudDecoder:
     """Scans from the messages of one topic, in the order of their stamps.
 
     The sensor is that of the first message unless `reader.frame_id` names one, and unit and reference of the point
-    times are inferred from the first messages, as for a bag.
+    times are inferred from the first messages, as for a bag. Without `reader.mounting` the axes stay as they are.
     """
 
     def __init__(self, config: ReaderConfig, message_type: str, faults: Faults) -> None:
@@ -46,6 +47,7 @@ class CloudDecoder:
         self._clouds: list[TimedCloud] = []
         self._point_time: PointTimeModel | None = None
         self._is_settled = config.time_reference == "none"
+        self.T_upright_recorded = transform_of(config.mounting)
 
     def scan(self, raw: bytes, published_ns: int) -> LiveScan | None:
         """The scan of a serialised message; None where it cannot be used, which is counted."""
@@ -63,7 +65,8 @@ class CloudDecoder:
         self._last_ns, self._frame_id = stamp_ns, frame_id
         model = self._point_time
         offsets = None if model is None else field_offsets(cloud, model, stamp)
-        return LiveScan(timed_scan(cloud, offsets, stamp, model is not None, self._faults), stamp_ns, frame_id)
+        scan = timed_scan(cloud, offsets, stamp, model is not None, self._faults)
+        return LiveScan(turned(scan, self.T_upright_recorded), stamp_ns, frame_id)
 
     def _stamp_ns(self, header_ns: int, published_ns: int) -> int:
         """The header's stamp; the time of publication where the first header has none."""

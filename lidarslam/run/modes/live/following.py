@@ -9,7 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
 from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
@@ -121,6 +121,7 @@ class Follower:
         """Once the frame of the LiDAR is known."""
         body = self._request.base_frame or lidar_frame
         T_body_lidar = np.eye(4) if self._request.base_frame is None else self._static_transform(body, lidar_frame)
+        T_body_lidar = T_body_lidar @ inverse(self._decoder.T_upright_recorded)
         return PosePublisher(self._publish_odometry, self._publish_tf, self._request.odom_frame, body, T_body_lidar)
 
     def _static_transform(self, base: str, lidar: str) -> FloatArray:

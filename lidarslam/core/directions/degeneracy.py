@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 
-_NAMES = ("roll", "pitch", "yaw", "x", "y", "z")
+AXES = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
 def lever_scale(lever_m: float) -> FloatArray:
@@ -33,7 +33,7 @@ class Degeneracy:
             axis = int(left.diagonal().argmax())
             left = left - np.outer(left[:, axis], left[axis]) / left[axis, axis]
             axes.append(axis)
-        return tuple(_NAMES[axis] for axis in sorted(axes))
+        return tuple(AXES[axis] for axis in sorted(axes))
 
     @property
     def rows(self) -> FloatArray:

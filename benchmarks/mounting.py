@@ -1,0 +1,122 @@
+"""Recordings in turned axes: errors and lost scans as they are, as guessed, and with `reader.mounting` set.
+
+    python benchmarks/mounting.py recordings/street --scans 40 --starts 0 60
+    python benchmarks/mounting.py KITTI --sequence 04 --methods learned constant-velocity+map kiss-icp
+
+Every scan and the ground truth are turned about the sensor before the program sees them. `as it is` is
+`reader.mounting=upright`; `guessed` is the default, with what it came to.
+"""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.config.settings import load_config
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan
+from lidarslam.core.tracking import Status
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import Mounting, ReaderConfig, RollPitchYaw
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import take_in
+from lidarslam.datasets.mounting.recording import MountedRecording
+from lidarslam.datasets.recording import Recording
+from lidarslam.datasets.registry import open_recording
+from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
+from lidarslam.odometry.registry import make_odometry
+from lidarslam.pipeline.localisation import make_localiser
+from lidarslam.pipeline.pipeline import Pipeline
+
+TURNS: dict[str, RollPitchYaw] = {
+    "none": (0.0, 0.0, 0.0),
+    "roll 90": (90.0, 0.0, 0.0),
+    "roll -90": (-90.0, 0.0, 0.0),
+    "roll 180": (180.0, 0.0, 0.0),
+    "pitch 90": (0.0, 90.0, 0.0),
+    "roll 45": (45.0, 0.0, 0.0),
+    "odd": (70.0, 25.0, 110.0),
+}
+METHODS = ("learned", "learned+map", "constant-velocity+map", "kiss-icp")
+
+
+class From:
+    """A recording from one of its scans on."""
+
+    def __init__(self, recording: Recording, start: int) -> None:
+        self._recording, self._start = recording, start
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._recording, name)
+
+    def __len__(self) -> int:
+        return len(self._recording) - self._start
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans, counted from the start."""
+        stop = None if stop is None else stop + self._start
+        return self._recording.scans(start + self._start, stop, step, faults)
+
+
+def main() -> None:
+    """Print a table, a row for each turn and setting."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path)
+    parser.add_argument("--sequence")
+    parser.add_argument("--starts", type=int, nargs="+", default=[0])
+    parser.add_argument("--scans", type=int, default=40)
+    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--turns", nargs="+", default=list(TURNS), choices=list(TURNS))
+    arguments = parser.parse_args()
+    recorded = open_recording(arguments.source, ReaderConfig(sequence=arguments.sequence, mounting="upright"))
+    print(f"ATE [m] / lost scans of {arguments.scans}; {recorded.name}\n")
+    print(f"| start | turned by | reader.mounting | {' | '.join(arguments.methods)} |")
+    print("|---" * (3 + len(arguments.methods)) + "|")
+    for start in arguments.starts:
+        for name in arguments.turns:
+            turned = MountedRecording(From(recorded, start), TURNS[name])  # type: ignore[arg-type]
+            back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
+            given: RollPitchYaw = tuple(np.round(back, 6).tolist())
+            settings: dict[str, Mounting] = {"as it is": "upright", "guessed": "auto", "set": given}
+            for setting, mounting in settings.items():
+                if name == "none" and setting == "set":
+                    continue
+                mounted = MountedRecording(turned, mounting)
+                cells = [run(mounted, method, arguments.scans) for method in arguments.methods]
+                print(f"| {start} | {name} | {shown(mounted, setting, mounting)} | {' | '.join(cells)} |", flush=True)
+
+
+def shown(recording: MountedRecording, setting: str, mounting: Mounting) -> str:
+    """The setting, and a guess by what became of z."""
+    if mounting != "auto":
+        return setting
+    tilt_deg = np.rad2deg(np.arccos(np.clip(recording.T_upright_recorded[2, 2], -1.0, 1.0)))
+    return f"{setting}: turned by {tilt_deg:.0f} degrees"
+
+
+def run(recording: MountedRecording, method: str, count: int) -> str:
+    """The error of a method over the first scans, and how many were lost."""
+    odometry, _, mapping = method.partition("+")
+    config = load_config(settings=[f"odometry.method={odometry}", f"mapping.method={'surfels' if mapping else 'off'}"])
+    stamps, poses, lost = list[float](), list[FloatArray](), 0
+    scans = islice(take_in(recording, range(count), Faults()), count)
+    with closing(make_odometry(config.odometry)) as estimator:
+        for result in Pipeline(estimator, make_localiser(config), config.global_map).run(scans):
+            stamps.append(result.stamp)
+            poses.append(result.T_world_lidar)
+            lost += result.status is Status.LOST
+    truth = recording.ground_truth
+    if truth is None:
+        return f"- / {lost}"
+    errors = evaluate_trajectory(Trajectory(np.array(stamps), np.array(poses)), truth).errors
+    return f"{errors.ate_rmse_m:.3f} / {lost}"
+
+
+if __name__ == "__main__":
+    main()

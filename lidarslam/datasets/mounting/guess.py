@@ -1,0 +1,108 @@
+"""A guess of the mounting by the ground in the first scans, cautious: recordings that are upright are left alone."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.directions.spin_axis import image_axes
+from lidarslam.core.geometry import FloatArray
+from lidarslam.datasets.config import Mounting
+from lidarslam.datasets.mounting.ground import Plane, planes
+from lidarslam.datasets.mounting.rotation import mounting_with_up, written
+
+# A plane that faces up within this may be the ground of a sensor that is upright, or held at an angle.
+_UPRIGHT = np.cos(np.deg2rad(50.0))
+# No sensor but one that flies is farther above the ground.
+_MOST_HEIGHT_M = 4.0
+# Ground is seen within this of the spin axis, and the scans agree within as much.
+_ALIKE = np.cos(np.deg2rad(25.0))
+_SCANS = 5
+_ENOUGH_SCANS, _SOME_SCANS = 4, 2
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What the first scans show of the mounting."""
+
+    mounting: Mounting = "upright"  # that acts
+    warning: str | None = None  # what was guessed, or cannot be decided; with the setting
+
+
+UPRIGHT = Guess()
+
+
+def guess_mounting(scans: Iterable[FloatArray]) -> Guess:
+    """The guess from the points (N, 3) of scans, of which no more are taken than needed."""
+    found: list[FloatArray] = []
+    unclear: list[FloatArray] = []
+    for number, points in enumerate(scans):
+        if number == _SCANS:
+            break
+        up, axis = _upwards(points)
+        if up is not None:
+            found.append(up)
+        elif axis is not None:
+            unclear.append(axis)
+        if number == 0 and not found and not unclear:
+            return UPRIGHT
+    return _decide(found, unclear)
+
+
+def _decide(found: Sequence[FloatArray], unclear: Sequence[FloatArray]) -> Guess:
+    mean = np.sum(found, axis=0) if found else np.zeros(3)
+    agreeing = [up for up in found if up @ mean > _ALIKE * np.linalg.norm(mean)]
+    if len(agreeing) >= _SOME_SCANS:
+        up = np.sum(agreeing, axis=0)
+        mounting = mounting_with_up(up / np.linalg.norm(up))
+        setting = f"--set reader.mounting={written(mounting)}"
+        if len(agreeing) >= _ENOUGH_SCANS:
+            return Guess(
+                mounting,
+                f"the ground in the first scans shows that z is not up; taken as {setting}, which makes this certain"
+                " (--set reader.mounting=upright leaves the scans as they are)",
+            )
+        return Guess(warning=f"z may not be up in this recording; if so, use {setting}")
+    if len(unclear) >= _ENOUGH_SCANS:
+        ways = " or ".join(written(mounting_with_up(sign * unclear[0])) for sign in (1.0, -1.0))
+        return Guess(
+            warning="the scans were not taken about the z axis, and no ground shows which way is up; if it is not z,"
+            f" use --set reader.mounting={ways}"
+        )
+    return UPRIGHT
+
+
+def _upwards(points: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
+    """The upwards direction (3,), if it is far from z and clear; and the spin axis (3,) if z is neither."""
+    seen = planes(points)
+    if not seen or any(_may_be_upright(plane, None) for plane in seen if plane.height_m < _MOST_HEIGHT_M):
+        return None, None
+    R_image_recorded = image_axes(points)
+    axis = None if np.array_equal(R_image_recorded, np.eye(3)) else R_image_recorded[2]
+    grounds = [plane for plane in seen if plane.up[2] < _UPRIGHT and _is_ground(plane, seen, axis)]
+    largest = max(grounds, key=lambda plane: plane.share, default=None)
+    if any(_may_be_upright(plane, largest) for plane in seen):
+        return None, None
+    if largest is not None:
+        return largest.up, axis
+    return None, axis if axis is not None and abs(axis[2]) < _UPRIGHT else None
+
+
+def _is_ground(plane: Plane, seen: Sequence[Plane], axis: FloatArray | None) -> bool:
+    """Whether a plane is the ground without doubt; less is asked of one that the sensor spins parallel to."""
+    if plane.height_m > _MOST_HEIGHT_M:
+        return False
+    if axis is not None and abs(plane.up @ axis) > _ALIKE:
+        return plane.share > 0.03 and plane.sectors >= 6 and plane.beyond < 0.02
+    opposite = max((other.share for other in seen if other.up @ plane.up < -_ALIKE), default=0.0)
+    is_alone = opposite < 0.25 * plane.share
+    return plane.share > 0.08 and plane.sectors >= 9 and plane.beyond < 0.01 and is_alone
+
+
+def _may_be_upright(plane: Plane, ground: Plane | None) -> bool:
+    """Whether a plane that faces up may be the ground, so that the recording is upright."""
+    if plane.up[2] < _UPRIGHT or plane.share < 0.01 or plane.sectors < 4:
+        return False
+    if plane.height_m < _MOST_HEIGHT_M:
+        return plane.beyond < 0.03
+    return plane.beyond < 0.01 and (ground is None or plane.share > ground.share)

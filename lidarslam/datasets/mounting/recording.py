@@ -1,0 +1,114 @@
+"""A recording in upright axes."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import Mounting
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting.guess import UPRIGHT, Guess, guess_mounting
+from lidarslam.datasets.mounting.rotation import transform_of, turned, written
+from lidarslam.datasets.recording import Recording, RecordingInfo
+
+# Scans from one that a guess looks at to the next.
+_STEP = 4
+
+
+class MountedRecording:
+    """A recording whose LiDAR frame is turned to x forward, z up: scans, ground truth and extrinsics.
+
+    Args:
+        recorded: in its own axes.
+        mounting: of these; auto: guessed from the first scans, when it is needed.
+    """
+
+    def __init__(self, recorded: Recording, mounting: Mounting) -> None:
+        self.recorded = recorded
+        self._mounting = mounting
+
+    @cached_property
+    def _guess(self) -> Guess:
+        if self._mounting != "auto":
+            return Guess(self._mounting)
+        try:
+            return guess_mounting(scan.points for scan in self.recorded.scans(step=_STEP, faults=Faults()))
+        except InputError:  # raised again when the scans are read
+            return UPRIGHT
+
+    @cached_property
+    def T_upright_recorded(self) -> FloatArray:
+        """(4, 4) the rotation from the recorded axes."""
+        return transform_of(self._guess.mounting)
+
+    @property
+    def _is_turned(self) -> bool:
+        return not np.array_equal(self.T_upright_recorded, np.eye(4))
+
+    @property
+    def name(self) -> str:
+        """A short name."""
+        return self.recorded.name
+
+    def __len__(self) -> int:
+        return len(self.recorded)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """T_world_lidar, of the upright axes; the world is the truth's."""
+        truth = self.recorded.ground_truth
+        if truth is None or not self._is_turned:
+            return truth
+        return Trajectory(truth.stamps, truth.T_world_lidar @ inverse(self.T_upright_recorded))
+
+    @property
+    def T_cam_lidar(self) -> FloatArray | None:
+        """Extrinsic calibration of a KITTI recording."""
+        T_cam_recorded = self.recorded.T_cam_lidar
+        if T_cam_recorded is None or not self._is_turned:
+            return T_cam_recorded
+        return np.asarray(T_cam_recorded @ inverse(self.T_upright_recorded), dtype=np.float64)
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """The samples of the IMU, with its extrinsic calibration to the upright axes."""
+        samples = self.recorded.imu
+        if samples is None or samples.T_lidar_imu is None or not self._is_turned:
+            return samples
+        return replace(samples, T_lidar_imu=self.T_upright_recorded @ samples.T_lidar_imu)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Of the recording, and of a guess."""
+        warning = self._guess.warning
+        return (*self.recorded.warnings, *(() if warning is None else (warning,)))
+
+    def scans(
+        self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
+    ) -> Iterator[Scan]:
+        """The scans with the indices of `range(start, stop, step)`, in upright axes."""
+        T = self.T_upright_recorded  # guessed before the first scan: two passes through one file may not alternate
+        scans = self.recorded.scans(start, stop, step, faults)
+        return (turned(scan, T) for scan in scans) if self._is_turned else scans
+
+    def describe(self) -> RecordingInfo:
+        """The contents of the recording, and its mounting unless it is upright."""
+        info, notes = self.recorded.describe(), []
+        if self._guess.warning is not None:
+            notes.append(f"{self._guess.warning[0].upper()}{self._guess.warning[1:]}.")
+        elif self._is_turned:
+            notes.append(f"The scans are turned upright, as reader.mounting={written(self._guess.mounting)}.")
+        return replace(info, first=turned(info.first, self.T_upright_recorded), notes=(*info.notes, *notes))
+
+
+def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
+    """The recording in its own axes, and T_upright_recorded (4, 4)."""
+    if isinstance(recording, MountedRecording):
+        return recording.recorded, recording.T_upright_recorded
+    return recording, np.eye(4)

@@ -1,0 +1,59 @@
+"""Mountings by their names or angles, as rotations."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.config import Mounting, MountingName, RollPitchYaw
+
+# Roll, pitch, yaw in degrees of the recorded axes: which way the recorded z axis points, seen by who looks along x.
+_ANGLES_DEG: dict[MountingName, RollPitchYaw] = {
+    "upright": (0.0, 0.0, 0.0),
+    "upside-down": (180.0, 0.0, 0.0),
+    "left": (-90.0, 0.0, 0.0),
+    "right": (90.0, 0.0, 0.0),
+    "forward": (0.0, 90.0, 0.0),
+    "backward": (0.0, -90.0, 0.0),
+    "camera": (-90.0, 0.0, -90.0),
+}
+_SNAPPED = np.cos(np.deg2rad(20.0))
+
+
+def transform_of(mounting: Mounting) -> FloatArray:
+    """T_upright_recorded (4, 4), a rotation; exact of quarter turns, and the identity where it is `auto`."""
+    if mounting == "auto" or mounting == "upright":  # noqa: PLR1714 - mypy narrows by it
+        return np.eye(4)
+    from scipy.spatial.transform import Rotation  # takes a while to load
+
+    angles = _ANGLES_DEG[mounting] if isinstance(mounting, str) else mounting
+    R = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    whole = np.round(R)
+    return make_transform(whole if np.abs(R - whole).max() < 1e-12 else R, np.zeros(3))
+
+
+def turned(scan: Scan, T_upright_recorded: FloatArray) -> Scan:
+    """A scan of the recorded axes in upright ones, by a rotation (4, 4)."""
+    if np.array_equal(T_upright_recorded, np.eye(4)):
+        return scan
+    return replace(scan, points=np.ascontiguousarray(scan.points @ T_upright_recorded[:3, :3].T))
+
+
+def mounting_with_up(up: FloatArray) -> Mounting:
+    """The mounting whose upwards direction, a unit vector (3,) in the recorded axes, is this or nearly so.
+
+    It has a name where one is near; the yaw stays open and is small.
+    """
+    named = {name: transform_of(name)[2, :3] for name in _ANGLES_DEG if name != "camera"}
+    for name, direction in named.items():
+        if direction @ up > _SNAPPED:
+            return name
+    roll = float(np.arctan2(up[1], up[2]))
+    pitch = float(np.arctan2(-up[0], np.hypot(up[1], up[2])))
+    return (float(np.round(np.rad2deg(roll))), float(np.round(np.rad2deg(pitch))), 0.0)
+
+
+def written(mounting: Mounting) -> str:
+    """As the value of `--set reader.mounting=`."""
+    return mounting if isinstance(mounting, str) else "[" + ",".join(f"{angle:g}" for angle in mounting) + "]"

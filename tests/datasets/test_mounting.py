@@ -1,0 +1,238 @@
+"""Recordings whose axes are not x forward, z up: as set, and as the ground shows."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.directions.spin_axis import image_axes
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.scan import Scan
+from lidarslam.core.text.trajectory_io import write_tum
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.config import Mounting, ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting.guess import UPRIGHT, guess_mounting
+from lidarslam.datasets.mounting.recording import MountedRecording
+from lidarslam.datasets.mounting.rotation import mounting_with_up, transform_of, written
+from lidarslam.datasets.recording import RecordingInfo
+from lidarslam.datasets.registry import open_recording
+
+QUARTERS = {"left": (90, 0, 0), "right": (-90, 0, 0), "backward": (0, 90, 0), "forward": (0, -90, 0)}
+HEIGHT_M = 1.7
+# Corners of boxes: two rows of houses, parked cars, a wall across.
+BOXES = [
+    ((-60.0, 9.0, -HEIGHT_M), (12.0, 15.0, 7.0)),
+    ((16.0, 8.0, -HEIGHT_M), (60.0, 15.0, 5.0)),
+    ((-60.0, -17.0, -HEIGHT_M), (60.0, -11.0, 9.0)),
+    ((4.0, 4.0, -HEIGHT_M), (8.0, 6.0, -0.2)),
+    ((-9.0, -7.0, -HEIGHT_M), (-5.0, -5.2, 0.1)),
+    ((45.0, -11.0, -HEIGHT_M), (46.0, 9.0, 3.0)),
+]
+
+
+def turn(roll: float, pitch: float, yaw: float) -> FloatArray:
+    return np.asarray(Rotation.from_euler("xyz", (roll, pitch, yaw), degrees=True).as_matrix())
+
+
+def rays(low_deg: float = -25.0, high_deg: float = 10.0, rings: int = 32) -> FloatArray:
+    elevations, azimuths = np.meshgrid(np.deg2rad(np.linspace(low_deg, high_deg, rings)), np.linspace(0.0, 6.27, 720))
+    across = np.cos(elevations)
+    parts = across * np.cos(azimuths), across * np.sin(azimuths), np.sin(elevations)
+    return np.stack(parts, axis=-1).reshape(-1, 3)
+
+
+def cast(directions: FloatArray, x: float, boxes: list, ceiling_m: float = np.inf) -> FloatArray:
+    """Points (N, 3) that a sensor at x along a street, or in a room, measures."""
+    origin = np.array([x, 0.0, 0.0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ranges = np.where(directions[:, 2] < 0.0, -HEIGHT_M / directions[:, 2], ceiling_m / directions[:, 2])
+        for low, high in boxes:
+            near, far = (np.array(corner) - origin for corner in (low, high))
+            enter = np.minimum(near / directions, far / directions).max(axis=1)
+            leave = np.maximum(near / directions, far / directions).min(axis=1)
+            ranges = np.where((enter > 0.0) & (enter < leave), np.minimum(ranges, enter), ranges)
+    noise = np.random.default_rng(round(1e3 * x)).normal(0.0, 0.01, len(ranges))
+    seen = ranges < 70.0
+    return (ranges + noise)[seen, None] * directions[seen]
+
+
+def street(count: int = 5) -> list[FloatArray]:
+    return [cast(rays(), 0.8 * number, BOXES) for number in range(count)]
+
+
+def corridor(count: int = 5) -> list[FloatArray]:
+    """Two metres wide and 2.6 high."""
+    walls = [((-40.0, 1.0, -2.0), (40.0, 1.2, 2.0)), ((-40.0, -1.2, -2.0), (40.0, -1.0, 2.0))]
+    return [cast(rays(-15.0, 15.0), 0.2 * number, walls, ceiling_m=0.9) for number in range(count)]
+
+
+class Recorded:
+    """A recording in memory, with all that a mounting turns."""
+
+    name = "memory"
+    warnings = ("old",)
+    T_cam_lidar = make_transform(turn(10, 20, 30), np.array([0.1, 0.2, 0.3]))
+    truth = Trajectory(np.arange(3.0), np.stack([make_transform(turn(0, 0, a), np.ones(3)) for a in (0, 30, 60)]))
+    samples = ImuSamples(np.arange(3.0), np.ones((3, 3)), np.ones((3, 3)), T_cam_lidar)
+
+    def __init__(self, clouds: list[FloatArray]) -> None:
+        self._scans = [Scan(points, float(number)) for number, points in enumerate(clouds)]
+        self.passes = 0
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    @property
+    def ground_truth(self) -> Trajectory:
+        return self.truth
+
+    @property
+    def imu(self) -> ImuSamples:
+        return self.samples
+
+    def scans(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        step: int = 1,
+        faults: Faults | None = None,  # noqa: ARG002
+    ) -> Iterator[Scan]:
+        self.passes += 1
+        return iter(self._scans[start:stop:step])
+
+    def describe(self) -> RecordingInfo:
+        return RecordingInfo("memory", len(self), self._scans[0], 1.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("mounting", "z", "x"),
+    [
+        ("upright", (0, 0, 1), (1, 0, 0)),
+        ("upside-down", (0, 0, -1), (1, 0, 0)),
+        ("left", (0, 1, 0), (1, 0, 0)),
+        ("right", (0, -1, 0), (1, 0, 0)),
+        ("forward", (1, 0, 0), (0, 0, -1)),
+        ("backward", (-1, 0, 0), (0, 0, 1)),
+        ("camera", (1, 0, 0), (0, -1, 0)),
+    ],
+)
+def test_a_name_says_where_the_recorded_z_axis_points(mounting, z, x):
+    R = transform_of(mounting)[:3, :3]
+    np.testing.assert_array_equal(R @ [0, 0, 1], z)
+    np.testing.assert_array_equal(R @ [1, 0, 0], x)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
+
+
+def test_angles_are_those_of_the_recorded_axes():
+    np.testing.assert_allclose(transform_of((10.0, 20.0, 30.0))[:3, :3], turn(10, 20, 30), atol=1e-15)
+    odd = turn(70, 25, 110)
+    mounting = mounting_with_up(odd.T[:, 2])
+    assert not isinstance(mounting, str)
+    np.testing.assert_allclose((transform_of(mounting)[:3, :3] @ odd.T)[:, 2], [0, 0, 1], atol=0.02)
+    assert written(mounting).count(",") == 2
+
+
+def test_scans_truth_and_extrinsics_are_turned_together():
+    clouds = [points[::50] @ turn(*QUARTERS["left"]).T for points in street(2)]
+    recorded = Recorded(clouds)
+    mounted = MountedRecording(recorded, "left")
+    T = transform_of("left")
+    for scan, points in zip(mounted.scans(), clouds, strict=True):
+        np.testing.assert_allclose(scan.points, points @ T[:3, :3].T)
+    # What a point of the recorded axes is in the truth's world, and the camera and the LiDAR of the IMU, stay.
+    np.testing.assert_allclose(mounted.ground_truth.T_world_lidar @ T, recorded.ground_truth.T_world_lidar, atol=1e-12)
+    np.testing.assert_allclose(mounted.T_cam_lidar @ T, recorded.T_cam_lidar, atol=1e-12)
+    np.testing.assert_allclose(mounted.imu.T_lidar_imu, T @ recorded.imu.T_lidar_imu, atol=1e-12)
+    assert mounted.warnings == ("old",)
+    assert "reader.mounting=left" in mounted.describe().notes[-1]
+    assert recorded.passes == 1, "nothing is to be guessed"
+
+
+def test_an_upright_recording_is_left_alone():
+    recorded = Recorded(street(2))
+    mounted = MountedRecording(recorded, "auto")
+    assert [scan.points is own.points for scan, own in zip(mounted.scans(), recorded.scans(), strict=True)] == [
+        True
+    ] * 2
+    assert mounted.ground_truth is recorded.ground_truth
+    assert mounted.warnings == recorded.warnings
+
+
+@pytest.mark.parametrize("name", [*QUARTERS, "upside-down"])
+def test_the_ground_shows_a_turned_sensor(name):
+    R = turn(*QUARTERS.get(name, (180, 0, 0)))
+    guess = guess_mounting(points @ R.T for points in street())
+    assert guess.mounting == name
+    assert guess.warning is not None
+    assert f"--set reader.mounting={name}" in guess.warning
+
+
+def test_an_odd_attitude_is_guessed_by_its_angles():
+    R = turn(70, 25, 110)
+    guess = guess_mounting(points @ R.T for points in street())
+    up = (transform_of(guess.mounting)[:3, :3] @ R)[2]
+    assert up[2] > np.cos(np.deg2rad(2.0))
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120)])
+def test_a_sensor_that_is_tilted_is_left_alone(angles):
+    assert guess_mounting(points @ turn(*angles).T for points in street()) == UPRIGHT
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (180, 0, 0), (25, 0, 0)])
+def test_walls_of_a_corridor_are_no_ground(angles):
+    assert guess_mounting(points @ turn(*angles).T for points in corridor()) == UPRIGHT
+
+
+def test_what_only_some_scans_show_is_a_warning_and_no_more():
+    R, grass = turn(*QUARTERS["left"]), np.random.default_rng(0).normal(0.0, 5.0, (4000, 3))
+    guess = guess_mounting([street(1)[0] @ R.T, street(2)[1] @ R.T, grass, grass, grass])
+    assert guess.mounting == "upright"
+    assert guess.warning is not None
+    assert "--set reader.mounting=left" in guess.warning
+
+
+@pytest.mark.parametrize(
+    "points", [np.empty((0, 3)), np.ones((3, 3)), np.ones((500, 3)), np.eye(3).repeat(400, axis=0)]
+)
+def test_scans_without_surfaces_show_nothing(points):
+    assert guess_mounting([points] * 5) == UPRIGHT
+
+
+def test_recordings_are_opened_upright(tmp_path: Path):
+    R = turn(*QUARTERS["left"])
+    for number, points in enumerate(street(17)):
+        np.save(tmp_path / f"{number:06d}.npy", points @ R.T)
+    T = make_transform(R.T, np.zeros(3))
+    write_tum(tmp_path / "ground_truth.tum", Trajectory(0.1 * np.arange(17.0), np.tile(T, (17, 1, 1))))
+
+    def opened(mounting: Mounting) -> MountedRecording:
+        return open_recording(tmp_path, ReaderConfig(mounting=mounting))
+
+    upright, guessed, given = opened("upright"), opened("auto"), opened("left")
+    assert any("--set reader.mounting=left" in warning for warning in guessed.warnings)
+    for recording in (guessed, given):
+        first, own = next(iter(recording.scans())), next(iter(upright.scans()))
+        np.testing.assert_array_equal(first.points, own.points @ transform_of("left")[:3, :3].T)
+        np.testing.assert_allclose(recording.ground_truth.T_world_lidar[0], np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize("angles", [(90, 0, 0), (0, 90, 0), (45, 0, 0), (30, 40, 110)])
+def test_the_axis_that_a_sensor_spins_about_is_found(angles):
+    R = turn(*angles)
+    found = image_axes(street(1)[0] @ R.T)
+    np.testing.assert_allclose(np.abs(found[2] @ R), [0.0, 0.0, 1.0], atol=0.01)
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "directions",
+    [rays(), rays(-45.0, 45.0), rays(0.0, 89.0), rays()[rays()[:, 0] > 0.6], np.empty((0, 3)), np.full((9, 3), np.nan)],
+    ids=["spinning", "wide", "dome", "forward", "none", "invalid"],
+)
+def test_images_of_other_sensors_keep_their_axes(directions):
+    np.testing.assert_array_equal(image_axes(5.0 * directions), np.eye(3))
