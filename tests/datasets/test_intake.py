@@ -53,7 +53,7 @@ class Recorded:
     def __init__(self, stamps):
         self.stamps = stamps
 
-    def scans(self, start, stop, step, faults):
+    def scans(self, start, stop, step, _):
         return (Scan(np.ones((3, 3)), stamp) for stamp in self.stamps[start:stop:step])
 
 

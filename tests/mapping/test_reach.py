@@ -58,7 +58,7 @@ def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(
 
 
 def test_a_map_far_from_its_origin_is_refused(rng: np.random.Generator) -> None:
-    points = rng.uniform(-5.0, 5.0, (500, 3)) + [4.5e6, 5e6, 0.0]
+    points = np.add(rng.uniform(-5.0, 5.0, (500, 3)), [4.5e6, 5e6, 0.0])
     fixed = FixedMap(points, np.tile([0.0, 0.0, 1.0], (500, 1)))
     for use in (lambda: fixed.region(points[0], 10.0, 0.1), lambda: fixed.views(0.1)):
         with pytest.raises(InputError, match=r"up to 5,000 km from its origin, and cells of 0\.1 m reach 105 km"):
