@@ -226,9 +226,7 @@ def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, Fie
         if key not in section.model_fields:
             return depth, field
         field = section.model_fields[key]
-        section = next(
-            (part for part in (field.annotation, *get_args(field.annotation)) if _is_section(part)), BaseModel
-        )
+        section = next(filter(_is_section, (field.annotation, *get_args(field.annotation))), BaseModel)
     return len(location), field
 
 
