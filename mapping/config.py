@@ -13,7 +13,7 @@ MapField = Literal["intensity", "rgb", "ring", "time"]
 """An attribute of the points of a map."""
 MapFormat = Literal["pcd", "laz", "e57"]
 """What a map can be written as beside .ply."""
-BudgetMs = Annotated[float, Field(gt=0.0)] | Literal["auto"] | None
+BudgetMs = Annotated[float, Field(ge=1.0, le=1e6)] | Literal["auto"] | None
 """Milliseconds that a scan may take; auto: half of the time between scans; None: not bounded."""
 
 
@@ -45,31 +45,37 @@ class MappingConfig(BaseModel):
     method: MappingName = Field("surfels", description="surfels, loam (LOAM's mapping) or off (the odometry alone)")
     cell_m: float | None = Field(
         None,
-        ge=0.01,
+        ge=0.02,
+        le=10.0,
         description="edge of the finest surfel cells, spacing of LOAM's maps; null: a thirtieth of the median range",
     )
-    radius_m: float = Field(100.0, ge=1.0, description="radius of the local map around the sensor")
-    min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are ignored")
-    max_range_m: float = Field(100.0, gt=0.0, description="farther points are ignored")
+    radius_m: float = Field(100.0, ge=1.0, le=10_000.0, description="radius of the local map around the sensor")
+    min_range_m: float = Field(
+        0.5, ge=0.0, le=10_000.0, description="nearer points, mostly the carrier itself, are ignored"
+    )
+    max_range_m: float = Field(100.0, ge=1.0, le=10_000.0, description="farther points are ignored")
     keypoints: int = Field(
-        3000, ge=100, description="points of a scan that are registered, at most (LOAM: planar ones)"
+        3000, ge=100, le=10**6, description="points of a scan that are registered, at most (LOAM: planar ones)"
     )
     continuous_time: bool = Field(
         True, description="surfels only: estimate the velocity during the sweep together with its pose"
     )
     prior_rotation_deg: float = Field(
         3.0,
-        gt=0.0,
+        ge=0.01,
+        le=180.0,
         description="standard deviation of an odometry's rotation about each axis, where it gives none",
     )
     prior_translation_m: float = Field(
         0.15,
-        gt=0.0,
+        ge=1e-3,
+        le=100.0,
         description="standard deviation of an odometry's translation along each axis, where it gives none",
     )
     prior_caution: float = Field(
         10.0,
-        gt=0.0,
+        ge=1.0,
+        le=1000.0,
         description="factor on the standard deviations of an odometry: its errors are correlated in time",
     )
     budget_ms: BudgetMs = Field(
@@ -112,17 +118,20 @@ class GlobalMapConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     voxel_size_m: float | None = Field(
-        None, ge=0.01, description="one point a voxel; null: follows the median range of the first scan"
+        None, ge=0.01, le=10.0, description="one point a voxel; null: follows the median range of the first scan"
     )
-    min_range_m: float = Field(0.5, ge=0.0, description="nearer points, mostly the carrier itself, are left out")
-    max_range_m: float = Field(80.0, gt=0.0, description="farther points, sparse and noisy, are left out")
-    min_hits: int = Field(1, ge=1, description="scans' points a voxel needs before it is written")
+    min_range_m: float = Field(
+        0.5, ge=0.0, le=10_000.0, description="nearer points, mostly the carrier itself, are left out"
+    )
+    max_range_m: float = Field(80.0, ge=1.0, le=10_000.0, description="farther points, sparse and noisy, are left out")
+    min_hits: int = Field(1, ge=1, le=1000, description="scans' points a voxel needs before it is written")
     leave_out_moved: bool = Field(
         True, description="leave out what other scans saw through where it was: people and vehicles that passed"
     )
     most_points: int | None = Field(
         20_000_000,
         ge=1000,
+        le=10**9,
         description="a larger map lies on disk, is written in tiles, map/, and map.ply is thinned to so many points;"
         " null: any number",
     )
@@ -143,9 +152,9 @@ class KeyframeConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     distance_m: float | None = Field(
-        None, gt=0.0, description="way from one to the next; null: a quarter of the median range, 0.5 to 4 m"
+        None, ge=0.1, le=100.0, description="way from one to the next; null: a quarter of the median range, 0.5 to 4 m"
     )
-    turn_deg: float = Field(25.0, gt=0.0, le=180.0, description="turn from one to the next")
+    turn_deg: float = Field(25.0, ge=1.0, le=180.0, description="turn from one to the next")
 
 
 class LoopConfig(BaseModel):
@@ -153,12 +162,15 @@ class LoopConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_range_m: float = Field(60.0, ge=1.0, description="farther points of a keyframe are left out")
+    max_range_m: float = Field(60.0, ge=1.0, le=10_000.0, description="farther points of a keyframe are left out")
     drift_percent: float = Field(
-        1.0, gt=0.0, description="standard deviation of the drift; in attitude 2 degrees in 100 m for each percent"
+        1.0,
+        ge=0.01,
+        le=100.0,
+        description="standard deviation of the drift; in attitude 2 degrees in 100 m for each percent",
     )
     min_way_m: float | None = Field(
-        None, ge=0.0, description="shorter ways back are no loops; null: three median ranges, at least 10 m"
+        None, ge=0.0, le=1e6, description="shorter ways back are no loops; null: three median ranges, at least 10 m"
     )
     min_overlap: float = Field(0.75, ge=0.0, le=1.0, description="inliers among what two keyframes see of each other")
 

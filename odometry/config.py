@@ -1,7 +1,7 @@
 """Settings of the odometry methods, and the description of a network that its weights carry; imports no method."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from typing_extensions import Self
@@ -10,6 +10,7 @@ from lidarslam.core.limits import require_range_left
 
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
 NetworkName = Literal["correlation", "delora"]
+Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 
 
 class LearnedConfig(BaseModel):
@@ -21,7 +22,7 @@ class LearnedConfig(BaseModel):
         None, description="file of `lidarslam train` or folder of `lidarslam export`; null: the shipped network"
     )
     device: str = Field("cpu", min_length=1, description="torch's name of the device, such as cpu or cuda")
-    threads: int = Field(1, ge=1, description="of the network; mapping works beside it")
+    threads: int = Field(1, ge=1, le=256, description="of the network; mapping works beside it")
     alignment: bool = Field(True, description="false: the network's motion as it is, for ablations")
 
 
@@ -30,13 +31,17 @@ class KissConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    max_range_m: float = Field(100.0, gt=0.0, description="points farther away are left out")
-    min_range_m: float = Field(0.0, ge=0.0, description="points nearer are left out")
-    voxel_size_m: float | None = Field(None, gt=0.0, description="of the map; null: a hundredth of max_range_m")
-    max_points_per_voxel: int = Field(20, ge=1, description="of the map")
-    initial_threshold_m: float = Field(2.0, gt=0.0, description="first distance of correspondences, adapted later")
+    max_range_m: float = Field(100.0, ge=1.0, le=1000.0, description="points farther away are left out")
+    min_range_m: float = Field(0.0, ge=0.0, le=1000.0, description="points nearer are left out")
+    voxel_size_m: float | None = Field(
+        None, ge=0.05, le=10.0, description="of the map; null: a hundredth of max_range_m"
+    )
+    max_points_per_voxel: int = Field(20, ge=1, le=1000, description="of the map")
+    initial_threshold_m: float = Field(
+        2.0, ge=0.1, le=100.0, description="first distance of correspondences, adapted later"
+    )
     deskew: bool = Field(True, description="compensate the sensor's motion within each scan")
-    threads: int = Field(0, ge=0, description="0: all cores")
+    threads: int = Field(0, ge=0, le=256, description="0: all cores")
 
     @model_validator(mode="after")
     def _ranges_leave_something(self) -> Self:
@@ -54,7 +59,7 @@ class OdometryConfig(BaseModel):
     )
     learned: LearnedConfig = LearnedConfig()
     kiss_icp: KissConfig = KissConfig()
-    imu_rotation_deg: tuple[float, float, float] | None = Field(
+    imu_rotation_deg: tuple[Degrees, Degrees, Degrees] | None = Field(
         None,
         description="roll, pitch, yaw of the IMU in the LiDAR's recorded axes; null: the recording's, else found by its"
         " turns",

@@ -99,7 +99,7 @@ def test_the_readers_options_stay_text(text: str) -> None:
         (["odometry.colour=1"], r"no odometry\.colour; there are: method"),
         (
             ["global_map.voxel_size_m=-1"],
-            r"global_map\.voxel_size_m=-1: input should be greater than or equal",
+            r"global_map\.voxel_size_m=-1: expected 0\.01 to 10$",
         ),
         (["odometry.method=loam"], r"odometry\.method='loam': input should be 'learned'"),
         (["global_map"], r"expected key\.path=value"),

@@ -1,6 +1,5 @@
 """`lidarslam compare` behind its options."""
 
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import reader_settings
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.text.plain_text import command_line
 from lidarslam.evaluation.comparison.gates import Gate, format_gates, judge_comparison, require_methods
 from lidarslam.run.interruption import ended_like_interrupted
 from lidarslam.run.progress import show_count
@@ -80,7 +80,7 @@ def run_compare(
         where=where,
         overwrite=overwrite,
         reuse=reuse,
-        command=shlex.join(["lidarslam", *sys.argv[1:]]),
+        command=command_line("lidarslam", *sys.argv[1:]),
     )
     with ended_like_interrupted():  # or the methods would outlive a request to end
         if benchmark is not None:

@@ -16,7 +16,7 @@ from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
-from lidarslam.core.text.plain_text import as_typed
+from lidarslam.core.text.plain_text import as_typed, command_line
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
@@ -83,7 +83,7 @@ def format_demo(demo: Demo) -> str:
     return f"""
 {format_comparison(demo.outcome.comparison, demo.out)}
 maps      {", ".join(str(picture) for picture in demo.pictures)}
-replay    {as_typed("lidarslam")} view {demo.out / REPLAY} --web
+replay    {command_line(as_typed("lidarslam"), "view", str(demo.out / REPLAY), "--web")}
 
 Open {demo.out / REPORT_HTML} in a browser. KISS-ICP predicts constant velocity, and a turn on the spot breaks that; the
 network measures a turn whatever its size, and the map corrects the rest."""

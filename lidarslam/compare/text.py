@@ -1,11 +1,10 @@
 """Output of `lidarslam compare`: a line for each finished method, and tables at the end."""
 
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 from lidarslam.compare.plan import REPORT_HTML, REPORT_MD
-from lidarslam.core.text.plain_text import as_typed
+from lidarslam.core.text.plain_text import as_typed, command_line, joined
 from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.quantities import QUANTITIES
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
@@ -35,7 +34,7 @@ def format_result(recording: str, result: MethodResult, reused: bool = False) ->
 
 def format_comparison(comparison: Comparison, out: Path) -> str:
     """The tables, and where to look."""
-    return "\n".join(_lines(comparison, out))
+    return joined(_lines(comparison, out))
 
 
 def _lines(comparison: Comparison, out: Path) -> Iterator[str]:
@@ -54,7 +53,7 @@ def _lines(comparison: Comparison, out: Path) -> Iterator[str]:
     yield f"report    {out / REPORT_HTML}, {out / REPORT_MD}, {out / COMPARISON}"
     runs = [str(out / result.run) for sequence in comparison.sequences[:1] for result in sequence.methods if result.run]
     if runs:
-        yield f"look      {shlex.join([as_typed('lidarslam'), 'view', *runs])}"
+        yield f"look      {command_line(as_typed('lidarslam'), 'view', *runs)}"
 
 
 def _table(sequence: SequenceComparison) -> Table:

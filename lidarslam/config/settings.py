@@ -12,8 +12,10 @@ from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from lidarslam.config.bounds import bounds_text
 from lidarslam.config.shipped import CONFIGS, shipped_files
 from lidarslam.config.yaml_text import YamlError, parse_yaml, read_yaml, settings_as_yaml
 from lidarslam.core.errors import ConfigError
@@ -30,6 +32,8 @@ SOURCES_SECTION = "trained_on"
 _DESCRIPTIONS = (RUN_SECTION, SOURCES_SECTION)
 
 _MOST_FAULTS = 5
+# Pydantic's names for numbers beyond their bounds, and for words in the place of a number.
+_BEYOND = ("greater_than_equal", "less_than_equal", "literal_error")
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 80
 _SHORT.maxlong = 40
@@ -42,9 +46,9 @@ class ViewerConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    scan_points: int = Field(20_000, ge=1, description="points of a scan that are shown")
-    map_points: int = Field(200_000, ge=1, description="points of the map that are shown")
-    map_every: int = Field(20, ge=1, description="scans between two views of the growing map")
+    scan_points: int = Field(20_000, ge=1, le=10**7, description="points of a scan that are shown")
+    map_points: int = Field(200_000, ge=1, le=10**8, description="points of the map that are shown")
+    map_every: int = Field(20, ge=1, le=10**6, description="scans between two views of the growing map")
 
 
 class CheckpointConfig(BaseModel):
@@ -52,8 +56,10 @@ class CheckpointConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    interval_s: float = Field(10.0, ge=0.0, description="least time between checkpoints; they take 2 % of it at most")
-    every_scans: int | None = Field(None, ge=1, description="instead, scans between checkpoints")
+    interval_s: float = Field(
+        10.0, ge=0.0, le=1e6, description="least time between checkpoints; they take 2 % of it at most"
+    )
+    every_scans: int | None = Field(None, ge=1, le=10**6, description="instead, scans between checkpoints")
 
 
 class Config(BaseModel):
@@ -188,8 +194,10 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
     faults = error.errors(include_url=False)
-    explained = [_explain_fault(fault, model) for fault in faults[:_MOST_FAULTS]]
-    explained += [f"and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
+    # A value that may be one of several kinds has a fault for each.
+    explained = list(dict.fromkeys(_explain_fault(fault, model) for fault in faults))
+    further = len(explained) - _MOST_FAULTS
+    explained = explained[:_MOST_FAULTS] + ([f"and {further} more"] if further > 0 else [])
     return f"configuration ({origin}): {'; '.join(explained)}"
 
 
@@ -203,7 +211,27 @@ def _explain_fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
     if fault["type"] == "value_error":
         # Keys that contradict each other: the input would be their whole section, the validator names the two.
         return f"{key}: {fault['ctx']['error']}"
-    return f"{key}={_short(fault['input'])}: {fault['msg'].lower()}"
+    depth, field = _field_at(location, model)
+    bounds = None if field is None else bounds_text(field)
+    if bounds is None:
+        return f"{key}={_short(fault['input'])}: {fault['msg'].lower()}"
+    expected = f"expected {bounds}" if fault["type"] in _BEYOND else fault["msg"].lower()
+    return f"{'.'.join(location[:depth])}={_short(fault['input'])}: {expected}"
+
+
+def _field_at(location: Sequence[str], model: type[BaseModel]) -> tuple[int, FieldInfo | None]:
+    """The setting at a place, None of a section, and how many keys lead to it: a kind or an index may follow."""
+    section, field = model, None
+    for depth, key in enumerate(location):
+        if key not in section.model_fields:
+            return depth, field
+        field = section.model_fields[key]
+        section = next(filter(_is_section, (field.annotation, *get_args(field.annotation))), BaseModel)
+    return len(location), field
+
+
+def _is_section(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
 def _short(value: object) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
+from lidarslam.config.bounds import bounds_text
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.text.plain_text import one_line
 
@@ -102,10 +103,10 @@ def _section(settings: BaseModel, indent: str) -> Iterator[str]:
             yield f"{indent}# {_FIRST_CLAUSE.split(title.strip())[0]}"
             yield f"{indent}{name}:"
             yield from _section(value, f"{indent}  ")
-        elif field.description:
-            yield f"{plain[name]:{column}}  # {field.description}"
         else:
-            yield plain[name]
+            bounds = bounds_text(field)
+            comment = " ".join(filter(None, (field.description, bounds and f"[{bounds}]")))
+            yield f"{plain[name]:{column}}  # {comment}" if comment else plain[name]
 
 
 def _is_section(value: Any) -> bool:

@@ -6,6 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 TimeReference = Literal["auto", "relative", "absolute", "azimuth", "none"]
+Name = Annotated[str, Field(min_length=1)]
 MountingName = Literal["upright", "upside-down", "left", "right", "forward", "backward", "camera"]
 _Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
 RollPitchYaw = tuple[_Angle, _Angle, _Angle]
@@ -17,13 +18,13 @@ class ReaderConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    name: str | None = Field(None, description="name of the reader; null: the one that recognises the source")
-    topic: str | None = Field(None, description="point cloud topic of a bag; null: the only one there is")
-    frame_id: str | None = Field(None, description="sensor's frame in a bag's topic; null: that of the first scans")
-    imu_topic: str | None = Field(None, description="IMU topic of a bag; null: the one nearest to the point clouds'")
-    sequence: str | None = Field(None, description="sequence of a data set's root, such as 04 of KITTI odometry")
-    rate_hz: float = Field(10.0, gt=0.0, description="scans a second, for recordings without stamps")
-    time_field: str | None = Field(None, description="point field with the per-point time; null: found by its name")
+    name: Name | None = Field(None, description="name of the reader; null: the one that recognises the source")
+    topic: Name | None = Field(None, description="point cloud topic of a bag; null: the only one there is")
+    frame_id: Name | None = Field(None, description="sensor's frame in a bag's topic; null: that of the first scans")
+    imu_topic: Name | None = Field(None, description="IMU topic of a bag; null: the one nearest to the point clouds'")
+    sequence: Name | None = Field(None, description="sequence of a data set's root, such as 04 of KITTI odometry")
+    rate_hz: float = Field(10.0, ge=0.1, le=1000.0, description="scans a second, for recordings without stamps")
+    time_field: Name | None = Field(None, description="point field with the per-point time; null: found by its name")
     time_unit: TimeUnit = Field("auto", description="unit of the per-point time; auto: inferred from the values")
     time_reference: TimeReference = Field(
         "auto",

@@ -19,9 +19,14 @@ _CELL_M = 0.02
 _FAR_M = 400.0
 _FEW_POINTS = 50
 _SAMPLE = 4096
+# No LiDAR makes a thousand scans a second.
+_LEAST_INTERVAL_S = 0.999e-3
 
 _THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most so many, one in a cell of 2 cm"
 _MILLIMETRES = "scans look like millimetres, where metres are expected: convert the points"
+_TOO_FAST = (
+    "scans are stamped within a millisecond of the one before, which no LiDAR does: check the unit of the stamps"
+)
 _ONE_PLACE = "scans have all their points at one place and carry no geometry"
 
 
@@ -44,7 +49,17 @@ def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Sca
         InputError: the recording is damaged where no scan can be left out, or its clock was set back.
     """
     scans = recording.scans(chosen.start, chosen.stop, chosen.step, faults)
-    return in_stamp_order((look_at(scan, faults) for scan in scans), lambda scan: scan.stamp, faults)
+    ordered = in_stamp_order((look_at(scan, faults) for scan in scans), lambda scan: scan.stamp, faults)
+    return _with_paces_checked(ordered, faults)
+
+
+def _with_paces_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
+    latest = -np.inf
+    for scan in scans:
+        if scan.stamp - latest < _LEAST_INTERVAL_S:
+            faults.note(_TOO_FAST, f"{1e6 * (scan.stamp - latest):.3g} microseconds at {scan.stamp:.9f}")
+        latest = scan.stamp
+        yield scan
 
 
 def look_at(scan: Scan, faults: Faults) -> Scan:

@@ -23,6 +23,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from lidarslam.core.files import cannot_write, make_directory
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import PointAttributes, Scan
+from lidarslam.datasets.ros.made_messages import write_chunk_checksums
 from lidarslam.exports import ros_messages as ros
 from lidarslam.exports.run_scans import RunScans
 from lidarslam.mapping.global_map.global_map import PointCloud
@@ -77,6 +78,8 @@ def export_bag(
             writer = _writer(place, out.suffix)
             with writer:
                 messages = _write(_Topics(writer), run, lidar_frame, with_clouds, count)
+            for written in place.glob("*.mcap"):
+                write_chunk_checksums(written)
             made = place / f"{place.name}{out.suffix}" if out.suffix in (".mcap", ".db3") else place
             made.replace(out)
     except (OSError, sqlite3.Error) as error:

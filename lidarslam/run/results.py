@@ -86,6 +86,10 @@ def write_results(
     metrics = _write_trajectories(directory, tracked)
     written = write_map(directory, drawn, map_formats)
     log.warnings.extend(tracked.faults.warnings())
+    if drawn.warning is not None:
+        log.warn(drawn.warning)
+    if drawn.cloud is not None and not len(drawn.cloud):
+        log.warn("the map is empty: min_range_m, max_range_m and min_hits of global_map leave no point")
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
     summary = summarise(log, written, skipped, closed, contradictions)

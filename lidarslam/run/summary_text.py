@@ -1,10 +1,9 @@
 """The text that `lidarslam run` prints at the end."""
 
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.core.text.plain_text import as_typed, count, scan_span, small_length
+from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, scan_span, small_length
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.run.results import RunOutcome
@@ -20,7 +19,7 @@ _LISTED = 3
 
 def format_outcome(out: Path, outcome: RunOutcome) -> str:
     """A run in a few lines: size, speed, map, loops, accuracy, warnings, and where the files are."""
-    return "\n".join(_lines(out, outcome))
+    return joined(_lines(out, outcome))
 
 
 def format_stop(out: Path, outcome: RunOutcome) -> str:
@@ -49,9 +48,9 @@ def _lines(out: Path, outcome: RunOutcome) -> Iterator[str]:
         yield f"warning: {warning}"
     yield from _lost(summary)
     yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
-    yield f"next: {shlex.join([as_typed('lidarslam'), 'view', str(out)])}"
+    yield f"next: {command_line(as_typed('lidarslam'), 'view', str(out))}"
     if outcome.metrics is not None:
-        yield f"      {shlex.join([as_typed('lidarslam'), 'evaluate', str(out)])}"
+        yield f"      {command_line(as_typed('lidarslam'), 'evaluate', str(out))}"
 
 
 def _speed(realtime_factor: float | None) -> str:

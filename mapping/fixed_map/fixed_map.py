@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.surfels.voxel_hash import point_keys
+from lidarslam.mapping.surfels.voxel_hash import point_keys, require_reach
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 
 # Least edge of a surfel cell in spacings of the map's points. With fewer points in and around a cell normals are
@@ -52,6 +52,7 @@ class FixedMap:
         """The map from above, for surfel cells of an edge, in parts that overlap; kept for the next call."""
         if self._views[0] != cell_m:
             pixel_m = _VIEW_SCALE * cell_m
+            require_reach(self._points, cell_m)
             _, kept = np.unique(point_keys(self._points, 0.5 * pixel_m), return_index=True)
             points = self._points[kept]
             parts = _parts(points[:, :2], _VIEW_CELLS * pixel_m, _OVERLAP_CELLS * pixel_m)

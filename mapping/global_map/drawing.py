@@ -10,6 +10,7 @@ from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import NORMALS_MARGIN_M, GlobalMap, PointCloud, VoxelMeans
 from lidarslam.mapping.global_map.moved_points import PlacedViews, seen_through
 from lidarslam.mapping.global_map.tile_store import Tile, Tiling
+from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +45,7 @@ class DrawnMap:
     voxel_size_m: float | None
     moved: int = 0  # number of points that were removed as moving objects
     tiled: TiledMap | None = None  # all of the map, where `cloud` is an overview
+    warning: str | None = None  # points that lie beyond the reach of the voxels
 
 
 WriteTile = Callable[[Tile, PointCloud, float], None]
@@ -60,10 +62,20 @@ def drawn_map(
     if global_map is None:
         return DrawnMap(None, None)
     if not global_map.is_whole:
-        return _drawn_in_tiles(global_map, views, config, write_tile)
+        return replace(_drawn_in_tiles(global_map, views, config, write_tile), warning=_warning(global_map))
     moved = seen_through(global_map.points(config.min_hits), views, global_map.voxel_size_m)
     cloud = global_map.cloud(config.min_hits, moved)
-    return DrawnMap(_with_fields(cloud, config), global_map.voxel_size_m, int(moved.sum()))
+    return DrawnMap(_with_fields(cloud, config), global_map.voxel_size_m, int(moved.sum()), None, _warning(global_map))
+
+
+def _warning(global_map: GlobalMap) -> str | None:
+    if not global_map.beyond:
+        return None
+    size_m = global_map.voxel_size_m
+    return (
+        f"{global_map.beyond:,} points lie farther from the first scan than voxels of {size_m:g} m reach,"
+        f" {reach_m(size_m) / 1000.0:.0f} km, and are not in the map; set a larger global_map.voxel_size_m"
+    )
 
 
 def _drawn_in_tiles(

@@ -13,7 +13,8 @@ from lidarslam.mapping.global_map import kernels
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
 from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
-from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys
+from lidarslam.mapping.surfels.cell_kernels import EMPTY
+from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
@@ -72,12 +73,13 @@ class GlobalMap(Stateful):
 
     voxel_size_m: float
     most_points: int | None
+    beyond: int  # number of points that were left out: farther from the origin than voxels reach
     _merged: Voxels
     _pending: list[Voxels]
     _store: TileStore | None  # None where the number of voxels is not bounded
 
     def __init__(self, voxel_size_m: float, most_points: int | None = None, store: TileStore | None = None) -> None:
-        self.voxel_size_m, self.most_points = voxel_size_m, most_points
+        self.voxel_size_m, self.most_points, self.beyond = voxel_size_m, most_points, 0
         self._store = None if most_points is None else TileStore() if store is None else store
         self._merged, self._pending = Voxels.join([]), []
         self._after_restore()
@@ -105,9 +107,9 @@ class GlobalMap(Stateful):
         layout = Layout.of(attributes)
         keys, sums = np.empty(len(points), dtype=np.int64), np.empty((len(points), layout.width), dtype=np.float32)
         T = np.ascontiguousarray(T_world_lidar)
-        kernels.write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
+        beyond = kernels.write_sums(np.ascontiguousarray(points), T, self.voxel_size_m, keys, sums)
         layout.write(attributes, sums)
-        self._wait(Voxels(keys, sums, layout))
+        self._wait(Voxels(keys, sums, layout), keys == EMPTY if beyond else None)
 
     def add_means(self, means: VoxelMeans, T_world_map: FloatArray) -> None:
         """Add the voxels of another map, as if its points were added here."""
@@ -119,7 +121,8 @@ class GlobalMap(Stateful):
         )  # within the voxel, where float32 is exact enough
         sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
         sums[:, :COUNT] *= means.rows[:, COUNT, None]
-        self._wait(Voxels(keys, sums, means.layout))
+        is_beyond = np.abs(world).max(axis=1, initial=0.0) >= reach_m(self.voxel_size_m)
+        self._wait(Voxels(keys, sums, means.layout), is_beyond if is_beyond.any() else None)
 
     def means(self, min_hits: int = 1, left_out: NDArray[np.bool_] | None = None) -> VoxelMeans:
         """The voxels so far, arguments as in `cloud`."""
@@ -193,8 +196,11 @@ class GlobalMap(Stateful):
             normals[rows] = estimate_normals(part.points())[part.lies_in(tile)]
         return normals
 
-    def _wait(self, voxels: Voxels) -> None:
+    def _wait(self, voxels: Voxels, is_beyond: NDArray[np.bool_] | None = None) -> None:
         with self._lock:
+            if is_beyond is not None:
+                self.beyond += int(np.count_nonzero(is_beyond))
+                voxels = voxels.chosen(~is_beyond)
             self._pending.append(voxels)
             self._pending_size += len(voxels.keys)
             most_waiting = max(_MIN_PENDING, len(self._merged) // 2)

@@ -11,21 +11,30 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import cell_of, key_of
+from lidarslam.mapping.surfels.cell_kernels import EMPTY, OFFSET, cell_of, key_of
 
 Keys = NDArray[np.int64]
 Sums = NDArray[np.float32]
 
 
 @compiled
-def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Sums) -> None:
-    """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame."""
+def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, keys: Keys, sums: Sums) -> int:
+    """Write keys (N,) and the first seven columns of rows (N, C) of the points (N, 3) of a scan, in the LiDAR frame.
+
+    Returns:
+        Number of points beyond the reach of the voxels, whose keys are `EMPTY`.
+    """
     T, sensor = T_world_lidar, T_world_lidar[:3, 3]
+    reach, beyond = (OFFSET - 2) * voxel_size_m, 0
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if not (abs(x) < reach and abs(y) < reach and abs(z) < reach):
+            keys[n] = EMPTY
+            beyond += 1
+            continue
         u, v, w = sensor[0] - x, sensor[1] - y, sensor[2] - z
         distance = math.sqrt(u * u + v * v + w * w)
         i, j, k = cell_of(x / voxel_size_m), cell_of(y / voxel_size_m), cell_of(z / voxel_size_m)
@@ -33,6 +42,7 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
         # Within the voxel float32 is exact enough.
         sums[n, 0], sums[n, 1], sums[n, 2] = x - i * voxel_size_m, y - j * voxel_size_m, z - k * voxel_size_m
         sums[n, 3], sums[n, 4], sums[n, 5], sums[n, 6] = u / distance, v / distance, w / distance, 1.0
+    return beyond
 
 
 @compiled

@@ -19,6 +19,7 @@ from lidarslam.mapping.loam.registration import FeatureMaps, register
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
 from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
+from lidarslam.mapping.surfels.voxel_hash import beyond_reach, reach_m
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.pose_status import reservation
@@ -56,6 +57,8 @@ class LoamMapper(Stateful):
         predicted = _predict(scan.stamp, prior, last, self._config)
         if len(features) < MIN_POINTS:
             mapped = _lost(predicted, None, f"only {len(features)} features within range")
+        elif float(np.abs(predicted.T_world_lidar[:3, 3]).max()) + self._config.max_range_m > reach_m(spacing_m):
+            mapped = _lost(predicted, None, beyond_reach(spacing_m))
         elif not len(self._edges) + len(self._planes):
             mapped = MappedScan(predicted, predicted.T_world_lidar, False, Status.OK, added=True)
             self._insert(features, predicted)

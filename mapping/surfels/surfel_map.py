@@ -10,6 +10,7 @@ from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.surfels.cell_kernels import write_views
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.matching import Correspondences, Matcher
+from lidarslam.mapping.surfels.voxel_hash import reach_m, require_reach
 
 # Sizes of the grids, in cells. A point's correspondence is the plane of the finest grid that has one.
 LEVELS = (1, 2, 4)
@@ -43,7 +44,12 @@ class SurfelMap(Stateful):
 
     @classmethod
     def of_cloud(cls, points: FloatArray, normals: FloatArray, cell_m: float, radius_m: float) -> "SurfelMap":
-        """The surfels of points (N, 3) of the world whose normals (N, 3) face the side that was seen."""
+        """The surfels of points (N, 3) of the world whose normals (N, 3) face the side that was seen.
+
+        Raises:
+            InputError: points lie beyond the reach of the cells.
+        """
+        require_reach(points, cell_m)
         surfel_map = cls(cell_m, radius_m)
         # No plane of a merged map is that of a single ring.
         elevations = np.where(np.arange(len(points)) % 2, _ANY_HEIGHT_RAD, -_ANY_HEIGHT_RAD)
@@ -56,6 +62,10 @@ class SurfelMap(Stateful):
     def _after_restore(self) -> None:
         if len(self._grids) != len(LEVELS):
             raise ValueError(f"{len(self._grids)} grids instead of {len(LEVELS)}")
+
+    def reaches(self, sensor: FloatArray, range_m: float) -> bool:
+        """Whether there are cells for all points within a range of a position (3,)."""
+        return float(np.abs(sensor).max()) + range_m < reach_m(self.cell_m)
 
     def __len__(self) -> int:
         """Number of cells in all grids."""

@@ -3,11 +3,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels import cell_kernels as kernels
 from lidarslam.mapping.surfels.cell_kernels import ABSENT, Keys, Rows
 
-__all__ = ["ABSENT", "Keys", "Rows", "VoxelHash", "cell_keys", "key_cells", "key_steps", "point_keys"]
+__all__ = [
+    "ABSENT", "Keys", "Rows", "VoxelHash", "beyond_reach", "cell_keys", "key_cells", "key_steps", "point_keys",
+    "reach_m", "require_reach",
+]  # fmt: skip
 
 _STRIDES = np.array([kernels.STRIDE_X, kernels.STRIDE_Y, 1], dtype=np.int64)
 
@@ -27,8 +31,28 @@ def key_cells(keys: Keys) -> NDArray[np.int64]:
     return np.stack([part & mask for part in shifted], axis=-1) - kernels.OFFSET
 
 
+def reach_m(cell_m: float) -> float:
+    """The least coordinate beyond which points share the outermost cells."""
+    return (kernels.OFFSET - 2) * cell_m
+
+
+def beyond_reach(cell_m: float) -> str:
+    """Why a scan is lost that lies farther from the first one than the map has cells."""
+    return f"beyond the reach of a map with cells of {cell_m:g} m, {reach_m(cell_m) / 1000.0:.0f} km"
+
+
+def require_reach(points: FloatArray, cell_m: float) -> None:
+    """InputError for points (N, 3) beyond the reach of cells."""
+    farthest_m = float(np.abs(points).max(initial=0.0))
+    if not farthest_m < reach_m(cell_m):
+        raise InputError(
+            f"the map's points lie up to {farthest_m / 1000.0:,.0f} km from its origin, and cells of {cell_m:g} m reach"
+            f" {reach_m(cell_m) / 1000.0:,.0f} km: shift the map towards its origin"
+        )
+
+
 def point_keys(points: FloatArray, cell_m: float) -> Keys:
-    """Keys (N,) of the cells that points (N, 3) lie in."""
+    """Keys (N,) of the cells that points (N, 3) lie in; beyond their reach, of the outermost ones."""
     keys = np.empty(len(points), dtype=np.int64)
     kernels.point_keys(np.ascontiguousarray(points), cell_m, keys)
     return keys

@@ -21,6 +21,7 @@ from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
 from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.surfels.voxel_hash import beyond_reach
 from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
@@ -112,6 +113,8 @@ class SurfelMapper(Stateful):
         prediction = self._tracker.predict(scan, prior, last)
         if scan.is_sparse:
             return self._lose(scan, prediction, surfel_map, None, _sparse_message(scan))
+        if not surfel_map.reaches(prediction.T_world_lidar[:3, 3], self._config.max_range_m):
+            return self._lose(scan, prediction, surfel_map, None, beyond_reach(surfel_map.cell_m))
         # Register the keypoints to the surfels; where that fails, relocalise.
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.status is Status.LOST or attempt.registration is None:

@@ -34,17 +34,17 @@ class TrainingConfig(BaseModel):
     network: NetworkConfig = NetworkConfig()
     images: ImageConfig = ImageConfig()
     geometric: LossConfig | None = Field(LossConfig(), description="the geometric losses; null: none")
-    alignment_weight: float = Field(1.0, ge=0.0, description="of the distance from the pseudo-labels")
+    alignment_weight: float = Field(1.0, ge=0.0, le=1e6, description="of the distance from the pseudo-labels")
     teacher: Teacher = Field(
         "alignment",
         description="pseudo-labels of recordings: alignment of consecutive scans, or mapping without a network",
     )
-    steps: int = Field(12_000, ge=1, description="of the optimizer")
-    batch: int = Field(16, ge=1, description="pairs a step, of each process")
-    learning_rate: float = Field(1e-3, gt=0.0, description="the highest, after the warm-up")
-    warmup_steps: int = Field(300, ge=0, description="in which the learning rate rises")
-    seed: int = Field(0, ge=0, description="of weights, pairs and augmentation")
-    hold_out: float = Field(0.1, ge=0.0, lt=1.0, description="part of the recordings kept for validation")
+    steps: int = Field(12_000, ge=1, le=10**9, description="of the optimizer")
+    batch: int = Field(16, ge=1, le=10**4, description="pairs a step, of each process")
+    learning_rate: float = Field(1e-3, ge=1e-9, le=1.0, description="the highest, after the warm-up")
+    warmup_steps: int = Field(300, ge=0, le=10**9, description="in which the learning rate rises")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="of weights, pairs and augmentation")
+    hold_out: float = Field(0.1, ge=0.0, le=0.9, description="part of the recordings kept for validation")
 
     @model_validator(mode="after")
     def _something_is_minimised(self) -> Self:
@@ -58,7 +58,7 @@ class SimulatedConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    recordings: int = Field(0, ge=0, description="how many")
-    scans: int = Field(60, ge=2, description="of each")
+    recordings: int = Field(0, ge=0, le=10**6, description="how many")
+    scans: int = Field(60, ge=2, le=10**5, description="of each")
     worlds: tuple[str, ...] | None = Field(None, description="of those recordings, only the ones in these; null: all")
     sensors: tuple[str, ...] | None = Field(None, description="and only the ones of these; null: all")

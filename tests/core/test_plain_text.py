@@ -1,12 +1,14 @@
 """What comes out of a file cannot steer a terminal."""
 
+import os
+import subprocess
 import unicodedata
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarslam.core.text.plain_text import one_line, printable
+from lidarslam.core.text.plain_text import command_line, joined, one_line, printable
 
 
 @pytest.mark.parametrize(
@@ -45,3 +47,17 @@ def test_the_middle_of_a_long_text_is_left_out() -> None:
     assert shown.startswith("begin")
     assert shown.endswith("xend")
     assert len(shown) < 120
+
+
+def test_a_line_break_in_a_name_is_no_line() -> None:
+    assert joined(["written to a\nb", "next"]) == "written to a\\nb\nnext"
+
+
+@pytest.mark.parametrize(
+    "name", ["new\nline", "it's\t\\ \x1b[2J", "plain", "a b", "$HOME\r`x`", os.fsdecode(b"bad\xff'"), "abc\u202egnp"]
+)
+def test_a_command_with_any_name_is_one_line_that_a_shell_reads_back(name: str) -> None:
+    typed = command_line("printf", "%s", name)
+    assert typed.isprintable()
+    printed = subprocess.run(["bash", "-c", typed], capture_output=True, check=True, env={"LC_ALL": "C.UTF-8"}).stdout
+    assert printed == os.fsencode(name)

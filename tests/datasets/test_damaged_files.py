@@ -320,3 +320,31 @@ def test_pickled_objects_are_never_unpickled(tmp_path):
     with pytest.raises(InputError, match="allow_pickle=False"):
         next(open_recording(tmp_path).scans())
     assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith((".pcd", ".ply"))])
+def test_a_header_that_promises_no_points_where_there_are_some(tmp_path, table, name):
+    lie = FORMATS[name](table).replace(b"POINTS 120", b"POINTS 0").replace(b"element vertex 120", b"element vertex 0")
+    (tmp_path / name).write_bytes(lie)
+    with pytest.raises(InputError, match=r"promises no points, and .* bytes follow|is truncated"):
+        next(open_recording(tmp_path).scans())
+
+
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("name", [name for name in FORMATS if name.endswith(".ply")])
+def test_a_header_that_promises_other_elements_than_there_are(tmp_path, table, name, before):
+    header, body = FORMATS[name](table).split(b"end_header\n")
+    faces, vertex = b"element face 1000000000000\nproperty uchar n\n", header.index(b"element vertex")
+    header = header[:vertex] + faces + header[vertex:] if before else header + faces
+    for points in (b"element vertex 120", b"element vertex 0"):
+        lie = header.replace(b"element vertex 120", points) + b"end_header\n" + body
+        (tmp_path / name).write_bytes(lie)
+        with pytest.raises(InputError, match=r"1,000,000,000,000 other elements .* truncated"):
+            next(open_recording(tmp_path).scans())
+
+
+def test_an_empty_scan_is_none_of_them(tmp_path):
+    (tmp_path / "a.ply").write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n\n"
+    )
+    assert len(next(open_recording(tmp_path).scans())) == 0

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.scan import Scan
 from lidarslam.datasets.faults import Faults
-from lidarslam.datasets.intake import look_at
+from lidarslam.datasets.intake import look_at, take_in
 
 
 def seen(points, **fields):
@@ -45,3 +45,23 @@ def test_millimetres_are_told(rng):
 
 def test_all_points_at_one_place_are_told():
     assert seen(np.full((1000, 3), 2.5))[1].warnings()[0].startswith("1 scan has all its points at one place")
+
+
+class Recorded:
+    """Scans with these stamps."""
+
+    def __init__(self, stamps):
+        self.stamps = stamps
+
+    def scans(self, start, stop, step, _):
+        return (Scan(np.ones((3, 3)), stamp) for stamp in self.stamps[start:stop:step])
+
+
+@pytest.mark.parametrize(("period_s", "told"), [(1e-6, True), (0.9e-3, True), (1e-3, False), (0.1, False)])
+def test_stamps_that_no_lidar_has_are_told_once(period_s, told):
+    faults = Faults()
+    scans = list(take_in(Recorded([1000.0 + period_s * number for number in range(8)]), range(8), faults))
+    assert len(scans) == 8
+    assert len(faults.warnings()) == told
+    if told:
+        assert faults.warnings()[0].startswith("7 scans are stamped within a millisecond of the one before")

@@ -319,6 +319,17 @@ def test_declared_files_are_the_written_ones(name, tmp_path, sweeps, rig):
     assert all(any((tmp_path / "room").glob(pattern)) for pattern in patterns)
 
 
+def test_a_flipped_bit_of_an_mcap_is_found(tmp_path, sweeps, rig):
+    """By the checksum of its chunk: it lies among the points, where any value is a number."""
+    write("mcap", tmp_path / "drive", sweeps, rig)
+    path = tmp_path / "drive" / "drive.mcap"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="checksum"):
+        list(open_recording(tmp_path / "drive").scans())
+
+
 def test_unknown_names_are_told_the_choice():
     with pytest.raises(InputError, match=r"'pcap'.*kitti, ply, rosbag1, rosbag2, mcap"):
         find_format("pcap")

@@ -1,11 +1,10 @@
 """Text that `lidarslam evaluate` prints."""
 
-import shlex
 from collections.abc import Iterator, Mapping
 
 from lidarslam.compare.assessment.evaluate import Evaluation
 from lidarslam.compare.assessment.map_evaluation import MapEvaluation
-from lidarslam.core.text.plain_text import as_typed
+from lidarslam.core.text.plain_text import as_typed, command_line, joined
 from lidarslam.evaluation.map.entropy import MapEntropy
 from lidarslam.evaluation.trajectory.drift import Drift
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics
@@ -22,7 +21,7 @@ _MAP_ALIGNED = {
 
 def format_evaluation(evaluation: Evaluation) -> str:
     """The figures as aligned lines of text: trajectory, drift, map, notes."""
-    return "\n".join(_lines(evaluation))
+    return joined(_lines(evaluation))
 
 
 def _lines(evaluation: Evaluation) -> Iterator[str]:
@@ -39,7 +38,7 @@ def _lines(evaluation: Evaluation) -> Iterator[str]:
     if evaluation.written:
         yield from ("", f"written to {', '.join(map(str, evaluation.written))}")
     if evaluation.estimate.run is not None:
-        yield f"next: {shlex.join([as_typed('lidarslam'), 'view', str(evaluation.estimate.run)])}"
+        yield f"next: {command_line(as_typed('lidarslam'), 'view', str(evaluation.estimate.run))}"
 
 
 def _row(label: str, text: str) -> str:

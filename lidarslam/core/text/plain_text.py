@@ -1,8 +1,11 @@
 """Text for a terminal: names of unknown origin made safe, numbers with nouns, programs as the shell finds them."""
 
+import os
 import re
+import shlex
 import shutil
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 # Control characters steer terminals, bidirectional marks reorder what is read, lone surrogates cannot be encoded.
@@ -29,6 +32,16 @@ def one_line(text: str, longest: int = _LONGEST) -> str:
 def printable(text: str) -> str:
     """Likewise for a text of several lines, at full length."""
     return _STEERING_BUT_LINES.sub(_spelt, text)
+
+
+def joined(lines: Iterable[str]) -> str:
+    """Lines under one another; a line break within one of them is escaped."""
+    return "\n".join(_STEERING.sub(_spelt, line) for line in lines)
+
+
+def command_line(*words: str) -> str:
+    """A command to be typed; words with control characters are quoted as in `$'two\\nlines'`, which stays one line."""
+    return " ".join(_ansi_quoted(word) if _STEERING.search(word) else shlex.quote(word) for word in words)
 
 
 def count(number: int, noun: str) -> str:
@@ -59,6 +72,15 @@ def small_length(metres: float) -> str:
         if round(factor * metres, 6) >= 1.0:
             return f"{factor * metres:.3g} {unit}"
     return f"{1000.0 * metres:.2g} mm"
+
+
+def _ansi_quoted(word: str) -> str:
+    spelt = re.sub(r"[\\']", r"\\\g<0>", word)
+    return f"$'{_STEERING.sub(_as_bytes, spelt)}'"
+
+
+def _as_bytes(match: re.Match[str]) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(match.group()))
 
 
 def _spelt(match: re.Match[str]) -> str:

@@ -35,12 +35,17 @@ def read_ply(path: Path) -> NDArray[np.void]:
     data = read_bytes(path)
     try:
         lines, length = _split_header(data)
-        encoding, rows, dtype, skipped = _parse_header(lines)
+        encoding, rows, dtype, skipped, further = _parse_header(lines)
         if dtype.itemsize > _WIDEST_POINT:
             raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
-        if encoding == "ascii":
-            return read_ascii_table(data[length:].split(b"\n", skipped[0])[-1], dtype, rows)
-        return read_binary_table(data[length + skipped[1] :], dtype, rows)
+        if max(skipped[0], further) > len(data):
+            raise ValueError(
+                f"expected {max(skipped[0], further):,} other elements in {len(data):,} bytes: it is truncated"
+            )
+        body = data[length:].split(b"\n", skipped[0])[-1] if encoding == "ascii" else data[length + skipped[1] :]
+        if not rows and further:
+            return np.empty(0, dtype)
+        return (read_ascii_table if encoding == "ascii" else read_binary_table)(body, dtype, rows)
     except ValueError as error:
         raise InputError(f"{path}: not a readable PLY file: {error}; copy it again or remove it") from None
 
@@ -58,8 +63,8 @@ def _split_header(data: bytes) -> tuple[list[list[str]], int]:
     return lines, at
 
 
-def _parse_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], tuple[int, int]]:
-    """Encoding, number of vertices, their type, and the (lines, bytes) of the elements before them."""
+def _parse_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], tuple[int, int], int]:
+    """Encoding, number of vertices, their type, (lines, bytes) of the elements before, and number of those behind."""
     encoding = next((words[1] for words in lines if len(words) > 1 and words[0] == "format"), "")
     if encoding not in _BYTE_ORDER:
         raise ValueError(f"expected the format {', '.join(_BYTE_ORDER)}, got {encoding!r}")
@@ -72,10 +77,11 @@ def _parse_header(lines: list[list[str]]) -> tuple[str, int, np.dtype[np.void], 
         elif words[:1] == ["property"] and elements:
             elements[-1][2].append(words[1:])
     skipped_lines = skipped_bytes = 0
-    for name, rows, properties in elements:
+    for place, (name, rows, properties) in enumerate(elements):
         dtype = _row_type(properties, _BYTE_ORDER[encoding])
         if name == "vertex":
-            return encoding, rows, dtype, (skipped_lines, skipped_bytes)
+            further = sum(rows for _, rows, _ in elements[place + 1 :])
+            return encoding, rows, dtype, (skipped_lines, skipped_bytes), further
         skipped_lines += rows
         skipped_bytes += rows * dtype.itemsize
     raise ValueError("expected an element `vertex`, found none")

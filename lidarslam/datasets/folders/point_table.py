@@ -13,6 +13,7 @@ _WIDEST_POINT = 1 << 16
 
 def read_ascii_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
     """The first `rows` lines of blank-separated numbers; ValueError where there are fewer."""
+    _require_points(body, rows)
     # A line takes a digit and a blank at least; NumPy makes room for all lines that it is told to expect.
     possible = dtype.itemsize <= _WIDEST_POINT and rows <= (len(body) + 1) // 2 and body.strip()
     table = np.loadtxt(BytesIO(body), dtype=dtype, max_rows=rows, ndmin=1, comments=None) if possible else np.empty(0)
@@ -23,9 +24,15 @@ def read_ascii_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArra
 
 def read_binary_table(body: bytes, dtype: np.dtype[np.void], rows: int) -> NDArray[np.void]:
     """The first `rows` rows of packed numbers; ValueError where there are fewer."""
+    _require_points(body, rows)
     if len(body) < rows * dtype.itemsize:
         raise ValueError(f"expected {rows} points of {dtype.itemsize} bytes, got {len(body)} bytes: it is truncated")
     return np.frombuffer(body, dtype, count=rows)
+
+
+def _require_points(body: bytes, rows: int) -> None:
+    if not rows and body.strip(b"\0\t\n\r "):
+        raise ValueError(f"its header promises no points, and {len(body):,} bytes follow")
 
 
 def scalar_fields(table: NDArray[np.void]) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
 from lidarslam.datasets.recording import Recording
-from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, mend_stamps, read_stamps
+from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
 
 
 def open_recording(source: Path, config: ReaderConfig) -> Recording:
@@ -70,8 +70,11 @@ class KittiOdometryRecording(FileRecording):
         self._times = self._read_times()
         last = int(self._numbers[-1])
         self._lines = 0 if self._times is None else len(self._times)  # of times.txt
-        if self._times is not None and last >= self._lines:
-            self._times = self._continued(self._times, last + 1)
+        if self._times is not None and last >= self._lines < 2:
+            raise InputError(
+                f"{folder / 'times.txt'}: expected {last + 1} stamps, one for every scan up to {files[-1].name}, got"
+                f" {self._lines}; complete it, or remove it to use the rate"
+            )
         self.stamps = self._stamps_of(self._numbers)
 
     def _read_times(self) -> FloatArray | None:
@@ -87,19 +90,13 @@ class KittiOdometryRecording(FileRecording):
             )
         return times
 
-    def _continued(self, times: FloatArray, length: int) -> FloatArray:
-        """The stamps (length,), the missing ones at the rate of the others."""
-        longer = np.append(times, np.full(length - len(times), np.nan))
-        try:
-            return mend_stamps(longer, np.arange(length, dtype=np.float64))[0]
-        except ValueError:
-            raise InputError(
-                f"{self._folder / 'times.txt'}: expected {length} stamps, one for every scan up to"
-                f" {self._files[-1].name}, got {len(times)}; complete it, or remove it to use the rate"
-            ) from None
-
     def _stamps_of(self, numbers: NDArray[np.intp]) -> FloatArray:
-        return numbers / self._config.rate_hz if self._times is None else self._times[numbers]
+        """The stamps (N,) of scans by their numbers; those beyond the last line continue at the median rate."""
+        if self._times is None:
+            return numbers / self._config.rate_hz
+        beyond = np.maximum(numbers - (self._lines - 1), 0)
+        period_s = float(np.median(np.diff(self._times))) if beyond.any() else 0.0
+        return np.asarray(self._times[np.minimum(numbers, self._lines - 1)] + period_s * beyond, dtype=np.float64)
 
     @property
     def name(self) -> str:
@@ -120,7 +117,7 @@ class KittiOdometryRecording(FileRecording):
             return None
         T_cam0_cam = read_kitti_poses(path)
         if self._times is not None:
-            T_cam0_cam = T_cam0_cam[: len(self._times)]
+            T_cam0_cam = T_cam0_cam[: max(self._lines, int(self._numbers[-1]) + 1)]
         # The world is where the LiDAR was when the camera was at cam0, the frame of the pose file.
         T_world_lidar = inverse(T_cam_lidar) @ T_cam0_cam @ T_cam_lidar
         return Trajectory(self._stamps_of(np.arange(len(T_cam0_cam))), T_world_lidar)

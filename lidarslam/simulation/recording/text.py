@@ -1,9 +1,8 @@
 """The README of a simulated recording, and the summary that `lidarslam simulate` prints."""
 
-import shlex
 from importlib.metadata import version
 
-from lidarslam.core.text.plain_text import as_typed, count, small_length
+from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, small_length
 from lidarslam.simulation.recording.folder import GROUND_TRUTH, MADE_BY, README, REFERENCE_MAP
 from lidarslam.simulation.recording.request import RecordingSummary, RecordRequest
 from lidarslam.simulation.writers.registry import find_format
@@ -65,7 +64,7 @@ def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
         ground_truth=GROUND_TRUTH,
         reference_map=REFERENCE_MAP,
         spacing=small_length(summary.map_spacing_m),
-        info=shlex.join(["lidarslam", "info", str(summary.source)]),
+        info=command_line("lidarslam", "info", str(summary.source)),
         run=_run_command(summary),
     )
 
@@ -73,13 +72,14 @@ def format_readme(request: RecordRequest, summary: RecordingSummary) -> str:
 def format_summary(request: RecordRequest, summary: RecordingSummary) -> str:
     """The last lines of `lidarslam simulate`."""
     how = f"{request.mount}, {request.moved}"
-    return (
-        f"{count(summary.scans, 'scan')} of a {request.sensor} ({how}) in {request.world}, seed {request.seed}\n"
+    lines = (
+        f"{count(summary.scans, 'scan')} of a {request.sensor} ({how}) in {request.world}, seed {request.seed}",
         f"{summary.length_m:.1f} m in {summary.duration_s:.1f} s, {summary.points_per_scan:,} points a scan,"
-        f" reference map of {summary.map_points:,} points\n"
-        f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what\n"
-        f"next: {_run_command(summary, as_typed('lidarslam'))}"
+        f" reference map of {summary.map_points:,} points",
+        f"written to {request.out} ({request.format}, {summary.size_mb:.0f} MB); {README} there says what is what",
+        f"next: {_run_command(summary, as_typed('lidarslam'))}",
     )
+    return joined(lines)
 
 
 def _imu(request: RecordRequest) -> str:
@@ -94,8 +94,8 @@ def _simulate_command(request: RecordRequest, summary: RecordingSummary) -> str:
     words += ["--speed", f"{request.speed_mps:g}"] if request.speed_mps is not None else []
     words += ["--mount", request.mount, "--scans", str(summary.scans), "--seed", str(request.seed)]
     words += ["--imu"] if request.imu else []
-    return shlex.join([*words, "--format", request.format])
+    return command_line(*words, "--format", request.format)
 
 
 def _run_command(summary: RecordingSummary, program: str = "lidarslam") -> str:
-    return shlex.join([program, "run", str(summary.source)])
+    return command_line(program, "run", str(summary.source))

@@ -15,7 +15,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from lidarslam.core.errors import OutputError
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_DEFINITION, TRANSFORMS_TYPE
 from lidarslam.datasets.ros.livox import CUSTOM_MESSAGE_DEFINITION, CUSTOM_POINT_DEFINITION
-from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE, header, point_cloud, transforms
+from lidarslam.datasets.ros.made_messages import (
+    POINT_CLOUD2_TYPE,
+    header,
+    point_cloud,
+    transforms,
+    write_chunk_checksums,
+)
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.driver_clouds import DriverCloud, Records, find_driver
 from lidarslam.simulation.writers.imu_messages import IMU_TYPE, imu_messages
@@ -45,6 +51,7 @@ def write_rosbag2(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> Non
 def write_mcap(folder: Path, scans: Iterable[SimulatedScan], rig: Rig) -> None:
     """Write a rosbag2 folder with an MCAP file; implements `Writer`."""
     _write(Rosbag2Writer(folder, version=_ROSBAG2_VERSION, storage_plugin=StoragePlugin.MCAP), scans, rig)
+    write_chunk_checksums(folder / f"{folder.name}.mcap")
 
 
 def _write(bag: Rosbag1Writer | Rosbag2Writer, scans: Iterable[SimulatedScan], rig: Rig) -> None:

@@ -1,9 +1,8 @@
 """The report that `lidarslam localise` prints at the end."""
 
-import shlex
 from collections.abc import Iterator
 
-from lidarslam.core.text.plain_text import as_typed, count, scan_span
+from lidarslam.core.text.plain_text import as_typed, command_line, count, joined, scan_span
 from lidarslam.run.modes.localise.localise import LocaliseOutcome
 from lidarslam.run.modes.localise.request import LocaliseRequest
 from lidarslam.storage.directory import REPORT, SCANS_CSV, SUMMARY
@@ -14,7 +13,7 @@ _LISTED = 3
 
 def format_localisation(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
     """A localisation in a few lines: where it was found, what was tracked, what was lost, and where the files are."""
-    return "\n".join(_lines(request, outcome))
+    return joined(_lines(request, outcome))
 
 
 def format_not_found(request: LocaliseRequest, outcome: LocaliseOutcome) -> str:
@@ -41,4 +40,4 @@ def _lines(request: LocaliseRequest, outcome: LocaliseOutcome) -> Iterator[str]:
     if len(summary.lost) > _LISTED:
         yield f"LOST on {len(summary.lost) - _LISTED} more; {SUMMARY} and {SCANS_CSV} list them"
     yield f"written to {out}{f'; {REPORT} shows it' if (out / REPORT).is_file() else ''}"
-    yield f"next: {shlex.join([as_typed('lidarslam'), 'view', str(request.map), str(out)])}"
+    yield f"next: {command_line(as_typed('lidarslam'), 'view', str(request.map), str(out))}"

@@ -184,7 +184,7 @@ def _write(
         peak_rss_mb=peak_rss_mb(),
         graph=None if common is None else GraphSummary.of(common),
         map=written,
-        warnings=(*_warnings(recordings, runs), *_missing(parts)),
+        warnings=(*_warnings(recordings, runs), *_missing(parts), *filter(None, [drawn.warning])),
     )
     directory.write_json(files.SUMMARY, summary.to_json())
     stopped = [

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lidarslam.core.text.plain_text import count
+from lidarslam.core.text.plain_text import count, joined
 from lidarslam.run.modes.merge.merge import MergeOutcome
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.results import RunOutcome
@@ -17,7 +17,7 @@ def format_merge(out: Path, outcome: MergeOutcome) -> str:
     if summary.lost_scans:
         lost = count(summary.lost_scans, "scan")
         lines.append(f"tracking was lost on {lost}; the summaries of the recordings say where")
-    return "\n".join([*lines, f"written to {out}"])
+    return joined([*lines, f"written to {out}"])
 
 
 def _recording(recording: MergedRecording, run: RunOutcome | None) -> str:

@@ -1,0 +1,310 @@
+"""Files damaged at random: every command ends with a status and at most one line of error, and writes nothing else."""
+
+import contextlib
+import os
+import re
+import resource
+import shutil
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidarslam.cli import main
+from lidarslam.config.settings import Config, dump_yaml
+from lidarslam.core.imu import ImuSamples
+from lidarslam.core.text.trajectory_io import write_tum
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.global_map import PointCloud
+from lidarslam.mapping.global_map.map_io import write_cloud
+from lidarslam.simulation.recorder import SimulatedScan
+from lidarslam.simulation.writers.interface import Rig
+from lidarslam.simulation.writers.kitti import write_kitti
+from lidarslam.simulation.writers.ply import write_ply_scans
+from lidarslam.simulation.writers.rosbag import write_mcap, write_rosbag1, write_rosbag2
+
+pytestmark = pytest.mark.slow
+
+EXAMPLES = int(os.environ.get("LIDARSLAM_FUZZ_EXAMPLES", "40"))
+# Examples follow from the test's name alone, so that a failure is found again.
+fuzzed = settings(
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+FAST = ("--odometry", "constant-velocity", "--no-report")
+# More than all commands here take on the undamaged files, beyond what is loaded already.
+MOST_MEMORY_KB = 1 << 20
+NUMBERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**64 - 1)
+TEXTS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999999999999", b"1e-320", b"x", b"", b"0x10", b"1 2")
+
+# How a file is changed, where (more often near its beginning), and with what.
+changes = st.lists(
+    st.tuples(
+        st.sampled_from(["flip", "cut", "number", "u4", "u8", "f4", "insert", "repeat", "zero"]),
+        st.floats(0.0, 1.0, exclude_max=True),
+        st.one_of(st.sampled_from(NUMBERS), st.integers(0, 2**64 - 1)),
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+def changed(content: bytes, changes: list[tuple[str, float, int]]) -> bytes:
+    for how, share, value in changes:
+        at = int(share * share * len(content))
+        if how == "cut":
+            content = content[:at]
+        elif how == "number":
+            content = _with_number(content, share, value)
+        elif how == "insert":
+            content = content[:at] + value.to_bytes(8, "little") + content[at:]
+        elif how == "repeat":
+            content = content[: at + 1 + value % 4096] + content[at:]
+        else:
+            new = _new_bytes(how, value, content[at : at + 1])
+            content = content[:at] + new + content[at + len(new) :]
+    return content
+
+
+def _new_bytes(how: str, value: int, old: bytes) -> bytes:
+    if how == "flip":
+        return bytes(byte ^ (1 + value % 255) for byte in old)
+    if how == "f4":
+        return struct.pack("<f", (np.nan, np.inf, -1e38, 1e7, 1e-40)[value % 5])
+    if how == "zero":
+        return bytes(value % 512)
+    return struct.pack("<Q", value)[: int(how[1])]
+
+
+def _with_number(content: bytes, share: float, value: int) -> bytes:
+    """With another number in place of one of those that are written as text."""
+    found = list(re.finditer(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?", content[:8192]))
+    if not found:
+        return content
+    begin, end = found[int(share * len(found))].span()
+    return content[:begin] + (*TEXTS, str(value).encode())[value % (len(TEXTS) + 1)] + content[end:]
+
+
+@pytest.fixture(scope="session")
+def simulated(room, drive) -> list[SimulatedScan]:
+    """Four sweeps of 1 125 points, stamped at their start."""
+    scans = []
+    for stamp in (0.1, 0.2, 0.3, 0.4):
+        scan = room.sweep(drive, stamp, stamp_at=0.0)
+        scan = scan.select(np.arange(0, len(scan), 8))
+        scans.append(SimulatedScan(scan, np.full(len(scan), 7.0, dtype=np.float32)))
+    return scans
+
+
+def write_pcap(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    """A third of a second of a VLP-16 that sees 5 m everywhere."""
+    folder.mkdir()
+    with (folder / "drive.pcap").open("wb") as file:
+        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1))
+        for number in range(260):
+            second = number * 24 * 55.296e-6
+            blocks = [
+                struct.pack("<HH", 0xEEFF, round(36000 * (10 * second + block * 0.0011)) % 36000)
+                + struct.pack("<HB", 2500 + 40 * block, 9) * 32
+                for block in range(12)
+            ]
+            payload = b"".join(blocks) + struct.pack("<IBB", round(1e6 * (123.25 + second)), 0x37, 0x22)
+            udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
+            ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0, b"\xc0\xa8\1\xc9", b"\xff" * 4)
+            frame = b"\xff" * 6 + b"\1" * 6 + b"\x08\x00" + ip + udp
+            stamp = divmod(round(1e6 * (1_700_000_123.25 + second)), 10**6)
+            file.write(struct.pack("<IIII", *stamp, len(frame), len(frame)) + frame)
+
+
+def write_npy(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    folder.mkdir()
+    for number, simulated in enumerate(scans):
+        table = np.zeros(len(simulated.scan), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2"), ("time", "f8")])
+        table["x"], table["y"], table["z"] = simulated.scan.points.T
+        table["time"] = simulated.scan.time_offsets
+        np.save(folder / f"{number}.npy", table)
+    (folder / "times.txt").write_text("".join(f"{scan.scan.stamp}\n" for scan in scans))
+    stamps = np.array([scan.scan.stamp for scan in scans])
+    write_tum(folder / "ground_truth.tum", Trajectory(stamps, rig.T_world_lidar_at(stamps)))
+
+
+def write_pcd(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    """The first two in text, the others in binary."""
+    folder.mkdir()
+    for number, simulated in enumerate(scans):
+        points, path = simulated.scan.points.astype("f4"), folder / f"{number}.pcd"
+        if number > 1:
+            write_cloud(path, PointCloud(points.astype(np.float64), np.tile([0.0, 0.0, 1.0], (len(points), 1))))
+            continue
+        header = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+        rows = "\n".join(" ".join(f"{value:.4f}" for value in point) for point in points)
+        path.write_text(f"{header}VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n{rows}\n")
+
+
+def write_raw(folder: Path, scans: list[SimulatedScan], rig: Rig) -> None:
+    """A drive of KITTI raw."""
+    drive = folder / "2011_09_26" / "drive_sync"
+    (drive / "velodyne_points" / "data").mkdir(parents=True)
+    (drive / "oxts" / "data").mkdir(parents=True)
+    lines = [f"2011-09-26 13:02:2{number}.950000000\n" for number in range(len(scans))]
+    for number, simulated in enumerate(scans):
+        points = np.column_stack([simulated.scan.points, simulated.intensities]).astype("<f4")
+        (drive / "velodyne_points" / "data" / f"{number:010d}.bin").write_bytes(points.tobytes())
+        numbers = [49.0 + 1e-6 * number, 8.4, 110.0, 0.01, 0.02, 0.1 * number, *[0.1] * 24]
+        (drive / "oxts" / "data" / f"{number:010d}.txt").write_text(" ".join(map(str, numbers)) + "\n")
+    for name in ("velodyne_points/timestamps.txt", "oxts/timestamps.txt"):
+        (drive / name).write_text("".join(lines))
+    extrinsic = "R: 1 0 0 0 1 0 0 0 1\nT: 0.8 -0.3 0.8\n"
+    (folder / "2011_09_26" / "calib_imu_to_velo.txt").write_text(extrinsic)
+    (folder / "2011_09_26" / "calib_velo_to_cam.txt").write_text(extrinsic)
+
+
+# The writer, the source within its folder, and the files of it that are damaged.
+RECORDINGS: dict[str, tuple[Callable[..., None], str, tuple[str, ...]]] = {
+    "kitti": (write_kitti, ".", ("**/000001.bin", "**/times.txt", "**/calib.txt", "poses/*.txt")),
+    "raw": (write_raw, "2011_09_26/drive_sync", ("**/*1.bin", "**/*.txt")),
+    "ply": (write_ply_scans, ".", ("*1.ply", "timestamps.txt", "imu.csv")),
+    "pcd": (write_pcd, ".", ("1.pcd", "2.pcd")),
+    "npy": (write_npy, ".", ("1.npy", "times.txt", "ground_truth.tum")),
+    "rosbag1": (write_rosbag1, ".", ("*.bag",)),
+    "rosbag2": (write_rosbag2, ".", ("*.db3", "metadata.yaml")),
+    "mcap": (write_mcap, ".", ("*.mcap", "metadata.yaml")),
+    "pcap": (write_pcap, "drive.pcap", ("drive.pcap",)),
+}
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory, simulated, drive) -> Path:
+    """A folder with a folder of each kind."""
+    root = tmp_path_factory.mktemp("whole")
+    times = np.arange(0.0, 0.6, 0.01)
+    imu = ImuSamples(times, np.tile([0.0, 0.0, 0.3], (len(times), 1)), np.tile([0.0, 0.0, 9.81], (len(times), 1)))
+    for name, (write, _, _) in RECORDINGS.items():
+        write(root / name, simulated, Rig("velodyne", 0.1, drive, imu))
+    return root
+
+
+def listing(folder: Path) -> dict[str, bytes | None]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+        if not path.is_relative_to(folder / "out")
+    }
+
+
+@contextlib.contextmanager
+def nothing_else_changes(root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Whatever is called changes nothing in a folder but its `out`, and takes little memory."""
+    (root / "here").mkdir(exist_ok=True)
+    monkeypatch.chdir(root / "here")
+    before, memory_kb = listing(root), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert listing(root) == before
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory_kb < MOST_MEMORY_KB
+    monkeypatch.undo()
+
+
+def ends_well(*arguments: object) -> int:
+    """The exit status of a command, which ends as promised."""
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exit_code in (0, 1, 2, 3)
+    said = result.stderr.splitlines()
+    if result.exit_code == 1:
+        assert len(said) == 1, said
+        assert said[0].startswith("lidarslam: ")
+        assert len(said[0]) < 3000
+    assert "Traceback" not in result.output
+    return result.exit_code
+
+
+def damage(folder: Path, patterns: tuple[str, ...], which: float, made: list[tuple[str, float, int]]) -> None:
+    pattern = patterns[int(which * len(patterns))]
+    files = sorted(path for path in folder.glob(pattern) if path.is_file())
+    path = files[int(which * len(patterns) % 1.0 * len(files))]
+    path.write_bytes(changed(path.read_bytes(), made))
+
+
+@pytest.mark.parametrize("kind", RECORDINGS)
+def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    if kind == "pcap":
+        pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
+    _, source, patterns = RECORDINGS[kind]
+
+    @fuzzed
+    @given(st.floats(0.0, 1.0, exclude_max=True), changes)
+    def check(which: float, made: list[tuple[str, float, int]]) -> None:
+        folder = tmp_path / kind
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(recordings / kind, folder)
+        damage(folder, patterns, which, made)
+        with nothing_else_changes(tmp_path, monkeypatch):
+            ends_well("info", folder / source)
+            ends_well("run", folder / source, "--out", tmp_path / "out", "--overwrite", *FAST)
+
+    check()
+
+
+RUN_FILES = (
+    "run/summary.json",
+    "run/trajectory.tum",
+    "run/map.ply",
+    "run/config.yaml",
+    "run/scans.csv",
+    "run/metrics.json",
+)
+
+
+@fuzzed
+@given(st.sampled_from(RUN_FILES), changes)
+def test_a_damaged_run(
+    tmp_path: Path, small_recording: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch, name: str, made: list
+) -> None:
+    shutil.rmtree(tmp_path / "run", ignore_errors=True)
+    shutil.copytree(whole_run, tmp_path / "run")
+    path = tmp_path / name
+    path.write_bytes(changed(path.read_bytes(), made))
+    with nothing_else_changes(tmp_path, monkeypatch):
+        ends_well("info", tmp_path / "run")
+        ends_well("view", tmp_path / "run", "--picture", tmp_path / "out" / "picture.png")
+        ends_well("evaluate", tmp_path / "run/trajectory.tum", "--reference", small_recording / "ground_truth.tum")
+        ends_well("run", small_recording, "--out", tmp_path / "out", "--overwrite", "--config", path, *FAST)
+    ends_well("evaluate", tmp_path / "run", "--reference-map", whole_run / "map.ply")
+    assert {path.name for path in tmp_path.iterdir()} <= {"run", "out", "here"}
+
+
+def keys(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
+    for name, value in settings.items():
+        yield f"{prefix}{name}"
+        if isinstance(value, dict):
+            yield from keys(value, f"{prefix}{name}.")
+
+
+values = st.one_of(
+    st.sampled_from(
+        [*NUMBERS, "null", "true", "off", "[]", "{}", "[1, 2, 3]", "1e-9", "1e9", ".inf", "-0.0", "''", "~"]
+    ),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=20),
+)
+
+
+@fuzzed
+@given(st.lists(st.tuples(st.sampled_from(list(keys(Config().model_dump()))), values), min_size=1, max_size=4))
+def test_settings_of_any_value(chosen: list[tuple[str, object]]) -> None:
+    ends_well("config", *(word for key, value in chosen for word in ("--set", f"{key}={value}")))
+
+
+@fuzzed
+@given(changes)
+def test_a_damaged_configuration(tmp_path: Path, made: list[tuple[str, float, int]]) -> None:
+    (tmp_path / "config.yaml").write_bytes(changed(dump_yaml(Config()).encode(), made))
+    ends_well("config", "--config", tmp_path / "config.yaml")
