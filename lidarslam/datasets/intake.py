@@ -89,7 +89,7 @@ def _implausible_ranges(points: FloatArray) -> str | None:
     near, half, far = (float(value) for value in np.quantile(ranges, (_SHARE, 0.5, 1.0 - _SHARE)))
     if near < _NEAR_M or far < _FAR_M:
         return None
-    directions = points / ranges[:, None]
+    directions = points / np.maximum(ranges, _NEAR_M)[:, None]
     if not (np.linalg.norm(directions.mean(axis=0)) < _ALL_ROUND or (half > _HALF_M and far > _SPREAD * near)):
         return None
     return f"nearly all points are between {near:.0f} and {far:.0f} away, half of them beyond {half:.0f},"
