@@ -29,7 +29,7 @@ _SWEEP_S, _SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 0.1, 0.005, 1.0
 _SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
 _PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
 # A span so near to the time between scans, in another unit than expected, leaves no doubt about the unit.
-_WHOLE_PERIOD = (0.8, 1.1)
+_WHOLE_SWEEP = (0.8, 1.1)
 _IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
 # Times coarser than this part of the sweep do not separate its points.
 _COARSEST_OF_SWEEP = 0.1
@@ -96,8 +96,8 @@ def infer_point_time(
     Values that read the same as the stamp in some unit are absolute in that unit. Otherwise the unit is the one in
     which they span a sweep (about `period_s`, where known), and they are relative if none exceeds a second, else
     readings of a clock of their own. Values that were divided or multiplied by a thousand once too often, so that
-    they span the whole period in another unit alone, are corrected with a warning. A given unit or reference is not
-    questioned; `defined_unit`, by the definition of a message, holds until the values contradict it.
+    they span the whole period (0.1 s where it is unknown) in another unit alone, are corrected with a warning. A given
+    unit or reference is not questioned; `defined_unit`, by the definition of a message, gives way to such a correction.
 
     Returns:
         No model when the values are no per-point time: `reference` is "none" or "azimuth", all values are equal, too
@@ -114,11 +114,12 @@ def infer_point_time(
     units = tuple(UNITS_PER_SECOND) if given is None else (given,)
     by_clock = None if reference == "relative" else _unit_by_clock(spread, stamp, units)
     found = by_clock or given or _unit_by_span(spread, period_s)
-    mistaken = _unit_by_whole_period(spread, found, period_s) if unit == "auto" else None
+    sweep_s = period_s if period_s is not None and _is_plausible(period_s) else _SWEEP_S
+    mistaken = _unit_by_whole_sweep(spread, found, sweep_s) if unit == "auto" else None
     if mistaken is not None:
         return LearnedTime(
             PointTimeModel(field, mistaken, _reference(spread, mistaken, reference)),
-            f"The time field {field!r} spans {spread.span:.3g}, a sweep of {period_s or _SWEEP_S:.3g} s in units of"
+            f"The time field {field!r} spans {spread.span:.3g}, a sweep of {sweep_s:.3g} s in units of"
             f" {_IN_WORDS.get(mistaken, mistaken)}{'' if found is None else f' instead of {found}'}, and is read so;"
             " --set reader.time_unit gives another.",
         )
@@ -175,6 +176,10 @@ def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
     return ValueSpread(float(base + first), float(base + middle), float(base + last), float(last - first), resolution)
 
 
+def _is_plausible(period_s: float) -> bool:
+    return _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]
+
+
 def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str]) -> str | None:
     """The unit in which the values read the same as the stamp."""
     if stamp is None or abs(stamp) <= 2 * CLOCK_LIMIT_S:  # ambiguous: relative times read about the same
@@ -189,7 +194,7 @@ def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str
 def _unit_by_span(spread: ValueSpread, period_s: float | None) -> str | None:
     """The unit in which the values span a sweep."""
     spans = {unit: spread.span / per_second for unit, per_second in UNITS_PER_SECOND.items()}
-    if period_s is not None and _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]:
+    if period_s is not None and _is_plausible(period_s):
         for unit, span in spans.items():
             if _SHORTEST_OF_PERIOD * period_s <= span <= _LONGEST_OF_PERIOD * period_s:
                 return unit
@@ -197,16 +202,12 @@ def _unit_by_span(spread: ValueSpread, period_s: float | None) -> str | None:
     return min(fitting, key=lambda unit: abs(np.log(spans[unit] / _SWEEP_S)), default=None)
 
 
-def _unit_by_whole_period(spread: ValueSpread, expected: str | None, period_s: float | None) -> str | None:
-    """The only unit in which the values span the whole period, where they span no part of it in the expected one."""
-    if period_s is None or not _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]:
-        if expected is not None:
-            return None
-        period_s = _SWEEP_S
+def _unit_by_whole_sweep(spread: ValueSpread, expected: str | None, sweep_s: float) -> str | None:
+    """The unit in which the values span a whole sweep, where they span no part of it in the expected one."""
     parts = {
-        unit: spread.span / per_second / period_s
+        unit: spread.span / per_second / sweep_s
         for unit, per_second in (UNITS_PER_SECOND | MISTAKEN_UNITS_PER_SECOND).items()
     }
     if expected is not None and _SHORTEST_OF_PERIOD <= parts[expected] <= _LONGEST_OF_PERIOD:
         return None
-    return next((unit for unit, part in parts.items() if _WHOLE_PERIOD[0] <= part <= _WHOLE_PERIOD[1]), None)
+    return next((unit for unit, part in parts.items() if _WHOLE_SWEEP[0] <= part <= _WHOLE_SWEEP[1]), None)
