@@ -62,6 +62,7 @@ class Scan:
     dropped: int = 0  # how many points of the raw sweep were left out as invalid
     intensities: NDArray[np.float32] | None = None  # (N,) as recorded, on whatever scale; None when unknown
     colours: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue; None when unknown
+    untimed: int = 0  # how many points had no time of their own and got one between those of their neighbours
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -109,9 +110,9 @@ class Scan:
         """Make a scan of a driver's raw points, leaving out invalid ones with all that belongs to them.
 
         Organised clouds (..., 3) are flattened. Left out are points with a coordinate that is not finite, points at
-        the origin (a driver's mark for "no return"), points beyond 10 km and points whose time is not finite; where
-        that is more than half of the others, the times are worth nothing and are left out instead. So are rings when
-        one of them is no number of a laser.
+        the origin (a driver's mark for "no return") and points beyond 10 km. A time that is not finite is
+        interpolated between the nearest ones in the stored order; where that is more than half of the points, the
+        times are worth nothing and are left out. So are rings when one of them is no number of a laser.
         """
         raw = np.asarray(points, dtype=np.float64)
         if raw.size and raw.shape[-1] != 3:
@@ -126,12 +127,14 @@ class Scan:
         size = np.abs(xyz)
         largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])  # ten times as fast as max(axis=1)
         valid = (largest > 0.0) & (largest < _MAX_RANGE_M)
+        untimed = 0
         if offsets is not None:
             timed = valid & np.isfinite(offsets)
-            if 2 * np.count_nonzero(timed) < np.count_nonzero(valid):
-                offsets = None
-            else:
-                valid = timed
+            untimed = int(np.count_nonzero(valid) - np.count_nonzero(timed))
+            if untimed > np.count_nonzero(timed):
+                offsets, untimed = None, 0
+            elif untimed:
+                offsets = _interpolated(offsets, timed, valid & ~timed)
         dropped = int(len(xyz) - np.count_nonzero(valid))
         if dropped:
             kept = np.flatnonzero(valid)
@@ -144,7 +147,7 @@ class Scan:
         if lasers is not None and not ((lasers >= 0) & (lasers < _MOST_RINGS)).all():
             lasers = None
         lasers = None if lasers is None else lasers.astype(np.int32)
-        return cls(xyz, float(stamp), offsets, lasers, dropped, brightness, rgb)
+        return cls(xyz, float(stamp), offsets, lasers, dropped, brightness, rgb, untimed)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Scan":
         """The scan with only the chosen points (a mask or indices), and what belongs to them."""
@@ -154,8 +157,25 @@ class Scan:
             self.points.take(chosen, axis=0),  # four times as fast as indexing
             self.stamp,
             dropped=self.dropped,
+            untimed=self.untimed,
             **{name: None if values is None else values.take(chosen, axis=0) for name, values in columns.items()},
         )
+
+
+def _interpolated(offsets: FloatArray, timed: NDArray[np.bool_], untimed: NDArray[np.bool_]) -> FloatArray:
+    """Times (N,) of which those that are missing lie between their neighbours in the stored order.
+
+    Where these are more than half a sweep apart, as from one ring to the next, it is the middle of the sweep.
+    """
+    known, missing = np.flatnonzero(timed), np.flatnonzero(untimed)
+    times = offsets[known]
+    after = np.searchsorted(known, missing)
+    earlier, later = times[np.maximum(after - 1, 0)], times[np.minimum(after, len(known) - 1)]
+    first, last = times.min(), times.max()
+    filled = offsets.copy()
+    is_near = np.abs(later - earlier) <= 0.5 * (last - first)
+    filled[missing] = np.where(is_near, np.interp(missing, known, times), 0.5 * (first + last))
+    return filled
 
 
 def _column(name: str, values: ArrayLike | None, count: int, dtype: DTypeLike | None) -> NDArray[Any] | None:

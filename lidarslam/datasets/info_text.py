@@ -12,6 +12,8 @@ import numpy as np
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.plain_text import count, one_line
 from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.intake import look_at
 from lidarslam.datasets.recording import ImuSummary, RecordingInfo, SeveralTopicsError, Topic
 from lidarslam.datasets.registry import choose_reader, open_recording
 
@@ -88,7 +90,7 @@ def _known(info: RecordingInfo) -> dict[str, Any]:
         "ground_truth": None if info.ground_truth is None else str(info.ground_truth),
         "fields": [{"name": field.name, "type": field.type_name} for field in info.fields],
         "imu": None if info.imu is None else _known_imu(info.imu),
-        "notes": [*info.notes, *(info.imu.notes if info.imu else ())],
+        "notes": list(_notes(info)),
         "topics": _topics(info.topics),
     }
 
@@ -140,8 +142,14 @@ def _rows(source: Path, info: RecordingInfo) -> Iterator[tuple[str, str]]:
     yield "ground truth", str(info.ground_truth) if info.ground_truth else "none"
     if info.imu is not None:
         yield "imu", _imu(info.imu)
-    for note in (*info.notes, *(info.imu.notes if info.imu else ())):
+    for note in _notes(info):
         yield "note", note
+
+
+def _notes(info: RecordingInfo) -> Iterator[str]:
+    faults = Faults()
+    look_at(info.first, faults)
+    yield from (*info.notes, *faults.warnings(), *(info.imu.notes if info.imu else ()))
 
 
 def _instant(stamp: float) -> str:

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
+from lidarslam.core.text.plain_text import count
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.recording import Recording
@@ -15,18 +17,31 @@ from lidarslam.datasets.times.stamp_order import in_stamp_order
 # No LiDAR measures more points in a sweep; the cells are finer than any method's.
 _MOST_POINTS = 1 << 20
 _CELL_M = 0.02
-# Half of a sweep's points lie nearer than this, out of doors too; in millimetres a small room's lie farther.
-_FAR_M = 400.0
+# Of ranges: this share is nearer than the near one, and farther than the far one.
+_SHARE = 0.01
+# Something is always nearer to a sensor on the ground; sensors that look all round do not reach so far.
+_NEAR_M, _FAR_M = 20.0, 400.0
+# From an aircraft everything lies on one side and is about as far; this far, with such a spread, nothing does.
+_HALF_M, _SPREAD = 3000.0, 5.0
+# Length of the points' mean direction: near 0 all round, 0.75 in a cone of 60 degrees about its axis.
+_ALL_ROUND = 0.5
+# No sweep is so short; the times of a flash are, and so are those in another unit.
+_SHORTEST_SWEEP_S = 1e-3
 _FEW_POINTS = 50
 _SAMPLE = 4096
 # No LiDAR makes a thousand scans a second.
 _LEAST_INTERVAL_S = 0.999e-3
 
 _THINNED = f"scans of more than {_MOST_POINTS:,} points were thinned to at most so many, one in a cell of 2 cm"
-_MILLIMETRES = "scans look like millimetres, where metres are expected: convert the points"
 _TOO_FAST = (
     "scans are stamped within a millisecond of the one before, which no LiDAR does: check the unit of the stamps"
 )
+_NOT_METRES = "scans look like centimetres or millimetres, where metres are expected: convert the points"
+_AT_ONCE = (
+    "scans have times of their points that span less than a millisecond: motion during a sweep is not compensated; if"
+    " the sensor turns, the times are wrong or in another unit (reader.time_unit, reader.time_reference=azimuth)"
+)
+_UNTIMED = "scans have points without a time, which were given one between those of their neighbours"
 _ONE_PLACE = "scans have all their points at one place and carry no geometry"
 
 
@@ -68,10 +83,28 @@ def look_at(scan: Scan, faults: Faults) -> Scan:
         faults.note(_THINNED, f"{len(scan):,} points at {scan.stamp:.9f}")
         scan = scan.select(one_per_cell(scan.points, _CELL_M))
     if len(scan) > _FEW_POINTS:
-        sample = scan.points[:: max(1, len(scan) // _SAMPLE)]
-        median_m = float(np.median(np.linalg.norm(sample, axis=1)))
-        if median_m > _FAR_M:
-            faults.note(_MILLIMETRES, f"half of the points are farther away than {median_m:.0f} at {scan.stamp:.9f}")
+        if (reach := _implausible_ranges(scan.points[:: max(1, len(scan) // _SAMPLE)])) is not None:
+            faults.note(_NOT_METRES, f"{reach} at {scan.stamp:.9f}")
         elif not np.ptp(scan.points, axis=0).any():
             faults.note(_ONE_PLACE, f"{len(scan)} points at {scan.stamp:.9f}")
+        _look_at_times(scan, faults)
     return scan
+
+
+def _look_at_times(scan: Scan, faults: Faults) -> None:
+    if scan.untimed:
+        faults.note(_UNTIMED, f"{count(scan.untimed, 'point')} at {scan.stamp:.9f}")
+    if scan.time_offsets is not None and (span_s := float(np.ptp(scan.time_offsets))) < _SHORTEST_SWEEP_S:
+        faults.note(_AT_ONCE, f"{span_s:.3g} s at {scan.stamp:.9f}")
+
+
+def _implausible_ranges(points: FloatArray) -> str | None:
+    """The ranges, where points (N, 3) in metres would have nothing near but things all round, far away."""
+    ranges = np.linalg.norm(points, axis=1)
+    near, half, far = (float(value) for value in np.quantile(ranges, (_SHARE, 0.5, 1.0 - _SHARE)))
+    if near < _NEAR_M or far < _FAR_M:
+        return None
+    directions = points / np.maximum(ranges, _NEAR_M)[:, None]
+    if not (np.linalg.norm(directions.mean(axis=0)) < _ALL_ROUND or (half > _HALF_M and far > _SPREAD * near)):
+        return None
+    return f"nearly all points are between {near:.0f} and {far:.0f} away, half of them beyond {half:.0f},"

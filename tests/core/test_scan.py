@@ -26,10 +26,23 @@ def test_invalid_points_are_dropped_with_their_times_and_rings(invalid, dtype):
     assert (len(scan), scan.dropped, scan.stamp) == (3, 1, 5.0)
 
 
-def test_points_without_a_finite_time_are_dropped():
-    scan = Scan.from_raw(np.ones((4, 3)), 0.0, time_offsets=[0.0, np.nan, np.inf, 0.1], rings=[4, 5, 6, 7])
-    assert scan.rings.tolist() == [4, 7]
-    assert scan.dropped == 2
+def test_points_without_a_time_get_one_between_their_neighbours():
+    points = np.ones((7, 3))
+    points[5] = np.nan
+    times = [np.nan, 0.0, np.nan, np.inf, 0.03, np.nan, 0.1]
+    scan = Scan.from_raw(points, 0.0, times, rings=np.arange(7))
+    assert scan.rings.tolist() == [0, 1, 2, 3, 4, 6]
+    np.testing.assert_allclose(scan.time_offsets, [0.0, 0.0, 0.01, 0.02, 0.03, 0.1])
+    assert (scan.dropped, scan.untimed) == (1, 3)
+
+
+def test_a_ring_without_times_gets_the_middle_of_the_sweep():
+    times = np.tile(np.linspace(0.0, 0.1, 50), (4, 1))
+    times[1] = np.nan
+    scan = Scan.from_raw(np.ones((4, 50, 3)), 0.0, times)
+    np.testing.assert_allclose(scan.time_offsets[50:100], 0.05)
+    assert scan.untimed == 50
+    assert scan.select(np.arange(3)).untimed == 50
 
 
 def test_times_of_which_most_are_worth_nothing_are_left_out_instead_of_the_points():

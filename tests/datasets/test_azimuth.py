@@ -1,5 +1,6 @@
 """Times of points from the azimuth: of a spinning sensor that drives through a room, in closed form."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.registry import open_recording
-from lidarslam.datasets.times.azimuth import offsets_from_order
+from lidarslam.datasets.times.azimuth import are_as_measured, offsets_from_order, sweep_order
 
 PERIOD_S, COLUMNS = 0.1, 900
 ELEVATIONS = np.radians(np.arange(-15.0, 16.0, 2.0))
@@ -137,6 +138,62 @@ def test_times_that_cannot_be_had_are_a_warning(tmp_path):
     assert any("not in the order" in said for said in shuffled.warnings)
     every_fifth = open_recording(record(tmp_path / "fifth", every=5), asked)
     assert any("farther apart" in said for said in every_fifth.warnings)
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
+@pytest.mark.parametrize("order", ["firing", "rings"])
+def test_formats_with_rings_alone(tmp_path, suffix, order):
+    folder = record(tmp_path / "raw", order=order)
+    for path in folder.glob("*.npy"):
+        _write(path.with_suffix(suffix), np.load(path))
+        path.unlink()
+    recording = open_recording(folder)
+    _, times, _ = sweep(0.0, order=order)
+    np.testing.assert_allclose(next(recording.scans()).time_offsets, times - times.min(), atol=2 * PERIOD_S / COLUMNS)
+    assert recording.warnings == ()
+
+
+def _write(path, table):
+    kinds = "\n".join(f"property {'ushort' if name == 'ring' else 'float'} {name}" for name in table.dtype.names)
+    header = {
+        ".pcd": "VERSION .7\nFIELDS x y z ring\nSIZE 4 4 4 2\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+        f"WIDTH {len(table)}\nHEIGHT 1\nPOINTS {len(table)}\nDATA binary\n",
+        ".ply": f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{kinds}\nend_header\n",
+    }
+    path.write_bytes(header[path.suffix].encode() + table.tobytes())
+
+
+def test_ranges_that_contradict_one_another_are_not_taken_for_compensation():
+    # As where little but other cars moves: as many ranges speak for it as against it.
+    measured = [sweep_order(points, rings) for points, _, rings in (sweep(number * PERIOD_S) for number in range(30))]
+    compensated = [
+        sweep_order(points, rings)
+        for points, _, rings in (sweep(n * PERIOD_S, compensated=True, speed=10.0, turn_rate=0.0) for n in range(4))
+    ]
+    pairs = [*pairwise(measured)]
+    assert are_as_measured(pairs) is True
+    assert are_as_measured(pairwise(compensated)) is False
+    assert are_as_measured([*pairs[:16], *pairwise(compensated)]) is None
+
+
+def test_times_that_are_all_alike_are_told_and_made_from_the_azimuth(tmp_path):
+    folder = record(tmp_path / "raw")
+    for path in folder.glob("*.npy"):
+        table = np.load(path)
+        timed = np.zeros(len(table), [*table.dtype.descr, ("time", "f4")])
+        for name in table.dtype.names:
+            timed[name] = table[name]
+        np.save(path, timed)
+    recording = open_recording(folder)
+    assert next(recording.scans()).time_offsets.max() == pytest.approx(PERIOD_S, abs=1e-3)
+    assert recording.warnings == (
+        "The time field 'time' holds one value alone (0); the times follow from the azimuth instead.",
+    )
+
+
+def test_points_in_no_order_are_noted(tmp_path):
+    info = open_recording(record(tmp_path / "none", order="none")).describe()
+    assert "not in the order of one turn" in info.notes[0]
 
 
 def test_none_is_none(tmp_path):

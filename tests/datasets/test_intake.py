@@ -36,11 +36,53 @@ def test_a_scan_of_ten_million_points_is_thinned_and_said(rng):
     assert "10,000,000 points at 1.0" in faults.warnings()[0]
 
 
-def test_millimetres_are_told(rng):
+@pytest.mark.parametrize("scale", [100.0, 1000.0])
+def test_centimetres_and_millimetres_are_told(rng, scale):
     room = rng.uniform(-6.0, 6.0, (1000, 3))
-    scan, faults = seen(1000.0 * room)
-    assert len(scan) == 1000
-    assert faults.warnings()[0].startswith("1 scan looks like millimetres, where metres are expected")
+    room = room[np.linalg.norm(room, axis=1) > 1.0]
+    scan, faults = seen(scale * room)
+    assert len(scan) == len(room)
+    assert faults.warnings()[0].startswith("1 scan looks like centimetres or millimetres, where metres are expected")
+
+
+def test_millimetres_of_a_sensor_with_a_narrow_view_are_told(rng):
+    directions = rng.normal(size=(1000, 3)) * [0.2, 0.4, 0.2] + [1.0, 0.0, 0.0]
+    hall = _at(directions, rng.uniform(0.8, 9.0, 1000))
+    assert len(seen(hall)[1].warnings()) == 0
+    assert len(seen(1000.0 * hall)[1].warnings()) == 1
+
+
+def test_an_aircraft_and_a_ship_see_far(rng):
+    down = rng.normal(size=(1000, 3)) * [0.4, 0.4, 0.0] - [0.0, 0.0, 1.0]
+    for height in (50.0, 500.0, 3000.0):
+        assert seen(down * height * rng.uniform(0.8, 1.0, (1000, 1)))[1].warnings() == ()
+    forward = rng.normal(size=(1000, 3)) * [0.1, 0.4, 0.2] + [1.0, 0.0, 0.0]
+    assert seen(_at(forward, rng.uniform(300.0, 2000.0, 1000)))[1].warnings() == ()
+    around = rng.normal(size=(1000, 3)) * [1.0, 1.0, 0.1]
+    assert seen(_at(around, rng.uniform(30.0, 390.0, 1000)))[1].warnings() == ()
+
+
+def _at(directions, ranges):
+    return directions * (ranges / np.linalg.norm(directions, axis=1))[:, None]
+
+
+@pytest.mark.parametrize("span_s", [0.0, 1e-4])
+def test_times_of_no_sweep_are_told(rng, span_s):
+    points = rng.uniform(-8.0, 8.0, (1000, 3))
+    _, faults = seen(points, time_offsets=np.linspace(0.0, span_s, 1000))
+    assert "span less than a millisecond" in faults.warnings()[0]
+    assert seen(points, time_offsets=np.linspace(0.0, 0.02, 1000))[1].warnings() == ()
+
+
+def test_points_without_a_time_are_counted(rng):
+    points, times = rng.uniform(-8.0, 8.0, (1000, 3)), np.linspace(0.0, 0.1, 1000)
+    times[::4] = np.nan
+    faults = Faults()
+    look_at(Scan.from_raw(points, 1.0, times), faults)
+    assert faults.warnings() == (
+        "1 scan has points without a time, which were given one between those of their neighbours; the first: 250"
+        " points at 1.000000000",
+    )
 
 
 def test_all_points_at_one_place_are_told():

@@ -24,7 +24,7 @@ def test_layout_of_every_driver(driver, make_sweep, ros2_kit):
     assert cloud.points.dtype == np.float64
     assert cloud.times.dtype == sweep.times.dtype
     assert [field.name for field in cloud.fields] == list(sweep.records.dtype.names)
-    model = infer_point_time(cloud.time_field, cloud.times, STAMP)
+    model = infer_point_time(cloud.time_field, cloud.times, STAMP).model
     assert model == PointTimeModel(sweep.time_field, sweep.unit, sweep.reference)
     np.testing.assert_allclose(model.offsets(cloud.times, STAMP), sweep.offsets, rtol=0.0, atol=1e-9)
 

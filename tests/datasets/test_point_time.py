@@ -17,12 +17,22 @@ from lidarslam.datasets.times.point_time import (
     find_ring_field,
     find_time_field,
 )
-from lidarslam.datasets.times.point_time_inference import infer_point_time, value_spread
+from lidarslam.datasets.times.point_time_inference import (
+    LearnedTime,
+    TimedCloud,
+    infer_point_time,
+    learn_point_time,
+    value_spread,
+)
 
 STAMP = 1_700_000_000.25  # representable exactly
 STAMP_NS = 1_700_000_000_250_000_000
 SWEEP = np.linspace(0.0, 0.1, 1001)
 SWEEP_NS = np.round(SWEEP * 1e9).astype(np.int64)
+
+
+def inferred(*args, **kwargs):
+    return infer_point_time(*args, **kwargs).model
 
 
 def exact_offsets(values, unit, stamp):
@@ -49,7 +59,7 @@ def exact_offsets(values, unit, stamp):
     ],
 )
 def test_habits_of_drivers(values, unit, reference, offsets, tolerance):
-    model = infer_point_time("t", values, STAMP)
+    model = inferred("t", values, STAMP)
     assert model == PointTimeModel("t", unit, reference)
     np.testing.assert_allclose(model.offsets(values, STAMP), offsets, rtol=0.0, atol=tolerance)
 
@@ -68,7 +78,7 @@ def test_any_sweep_in_any_unit_is_recovered(unit, reference, sweep_s, where, sta
     offsets = (np.linspace(0.0, 1.0, 500) + where) * sweep_s
     readings = offsets + (stamp if reference == "absolute" else 0.0)
     values = readings * UNITS_PER_SECOND[unit]
-    model = infer_point_time("t", values, stamp, period_s=sweep_s if know_period else None)
+    model = inferred("t", values, stamp, period_s=sweep_s if know_period else None)
     assert model == PointTimeModel("t", unit, reference)
     np.testing.assert_allclose(model.offsets(values, stamp), offsets, rtol=0.0, atol=1e-6)
 
@@ -103,16 +113,69 @@ def test_offsets_of_epoch_seconds_are_exact():
     ],
 )
 def test_no_per_point_time(values):
-    assert infer_point_time("t", values, STAMP) is None
+    assert inferred("t", values, STAMP) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "reference"),
+    [
+        pytest.param(SWEEP * 1e-3, "ks", "relative", id="a-thousandth"),
+        pytest.param((SWEEP - 0.05) * 1e-6, "Ms", "relative", id="a-millionth"),
+        pytest.param(SWEEP_NS * 1000, "ps", "relative", id="a-thousand-times-nanoseconds"),
+        pytest.param(STAMP_NS + SWEEP_NS // 1000, "us", "absolute", id="microseconds-added-to-nanoseconds"),
+    ],
+)
+def test_times_off_by_a_power_of_a_thousand_are_corrected(values, unit, reference):
+    learned = infer_point_time("t", values, STAMP, period_s=0.1)
+    assert learned.model == PointTimeModel("t", unit, reference)
+    assert "reader.time_unit" in learned.warning
+    offsets = learned.model.offsets(values, STAMP)
+    np.testing.assert_allclose(offsets - offsets.min(), SWEEP, rtol=0.0, atol=2e-6)
+
+
+@pytest.mark.parametrize("part", [0.06, 0.3, 0.99, 1.4])
+@pytest.mark.parametrize("scale", [1, 10**3, 10**6, 10**9])
+def test_any_part_of_a_period_in_a_usual_unit_is_no_mistake(scale, part):
+    learned = infer_point_time("t", part * scale * SWEEP, STAMP, period_s=0.1)
+    assert (learned.warning, learned.model.units_per_second) == (None, scale)
+
+
+@pytest.mark.parametrize("scale", [2e-3, 5e-4, 4e-5, 1.3e-3])
+def test_a_scale_in_doubt_is_not_corrected(scale):
+    learned = infer_point_time("t", scale * SWEEP, STAMP, period_s=0.1)
+    assert learned.model is None
+    assert "spans a sweep in no unit" in learned.warning
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (np.zeros(100), "one value alone (0)"),
+        (np.full(100, STAMP), "one value alone (1.7e+09)"),
+        (np.full(100, np.nan), "no number"),
+        ((STAMP + SWEEP * 2000).astype("f4"), "too coarse"),
+    ],
+)
+def test_what_is_no_time_is_said(values, said):
+    clouds = [TimedCloud("stamps", values, STAMP + 0.1 * number) for number in range(5)]
+    learned = learn_point_time(clouds)
+    assert learned.model is None
+    assert learned.warning.startswith("The time field 'stamps'")
+    assert said in learned.warning
+
+
+def test_a_first_cloud_without_times_is_no_fault_of_the_recording():
+    clouds = [TimedCloud("t", values, STAMP) for values in (np.zeros(1001), SWEEP)]
+    assert learn_point_time(clouds) == LearnedTime(PointTimeModel("t", "s", "relative"))
 
 
 def test_reference_none_ignores_the_field():
-    assert infer_point_time("t", SWEEP, STAMP, reference="none") is None
+    assert inferred("t", SWEEP, STAMP, reference="none") is None
 
 
 def test_nan_values_do_not_disturb():
     values = np.r_[np.nan, SWEEP, np.nan]
-    model = infer_point_time("time", values, STAMP)
+    model = inferred("time", values, STAMP)
     assert model == PointTimeModel("time", "s", "relative")
     offsets = model.offsets(values, STAMP)
     assert np.isnan(offsets[[0, -1]]).all()
@@ -121,7 +184,7 @@ def test_nan_values_do_not_disturb():
 
 def test_missing_returns_of_a_clock_read_zero():
     values = np.r_[np.zeros(1500, dtype="i8"), STAMP_NS + SWEEP_NS]
-    model = infer_point_time("timestamp", values, STAMP)
+    model = inferred("timestamp", values, STAMP)
     assert model == PointTimeModel("timestamp", "ns", "absolute")
     offsets = model.offsets(values, STAMP)
     assert np.isnan(offsets[:1500]).all()
@@ -132,10 +195,10 @@ def test_stray_times_do_not_disturb():
     # As on destaggered clouds, where some columns hold leftovers.
     values = SWEEP_NS.astype("u4")
     values[[3, 700]] = 4_000_000_000
-    model = infer_point_time("t", values, STAMP)
+    model = inferred("t", values, STAMP)
     assert model == PointTimeModel("t", "ns", "relative")
     scan = Scan.from_raw(np.ones((len(values), 3)), STAMP, model.offsets(values, STAMP))
-    assert scan.dropped == 2
+    assert (scan.dropped, scan.untimed) == (0, 2)
     assert scan.time_offsets.max() == pytest.approx(0.1)
 
 
@@ -149,36 +212,36 @@ def test_nonsense_never_crashes(seed):
         np.where(rng.random(1000) < 0.5, np.inf, rng.random(1000)),
         rng.integers(0, 256, 1000, dtype="u1"),
     ):
-        model = infer_point_time("t", values, STAMP) or PointTimeModel("t", "ns", "absolute")
+        model = inferred("t", values, STAMP) or PointTimeModel("t", "ns", "absolute")
         assert model.offsets(values, STAMP).shape == (1000,)
 
 
 def test_unit_follows_the_period_where_the_sweep_is_unusual():
     packet = np.linspace(0.0, 1.3, 200)  # a cloud a packet: 1.3 ms, written in ms
-    assert infer_point_time("t", packet, STAMP) is None
-    assert infer_point_time("t", packet, STAMP, period_s=0.00133).unit == "ms"
+    assert inferred("t", packet, STAMP) is None
+    assert inferred("t", packet, STAMP, period_s=0.00133).unit == "ms"
 
 
 def test_an_incredible_period_is_no_evidence():
-    assert infer_point_time("t", SWEEP, STAMP, period_s=100.0).unit == "s"
-    assert infer_point_time("t", SWEEP, STAMP, period_s=0.0).unit == "s"
+    assert inferred("t", SWEEP, STAMP, period_s=100.0).unit == "s"
+    assert inferred("t", SWEEP, STAMP, period_s=0.0).unit == "s"
 
 
 def test_given_unit_and_reference_are_obeyed():
-    assert infer_point_time("t", SWEEP, STAMP, unit="ms") == PointTimeModel("t", "ms", "relative")
-    assert infer_point_time("t", SWEEP_NS, STAMP, unit="us") == PointTimeModel("t", "us", "absolute")
-    assert infer_point_time("t", SWEEP + 0.5, 0.6, reference="absolute") == PointTimeModel("t", "s", "absolute")
-    assert infer_point_time("t", STAMP + SWEEP, STAMP, reference="relative") == PointTimeModel("t", "s", "relative")
+    assert inferred("t", SWEEP, STAMP, unit="ms") == PointTimeModel("t", "ms", "relative")
+    assert inferred("t", SWEEP_NS, STAMP, unit="us") == PointTimeModel("t", "us", "absolute")
+    assert inferred("t", SWEEP + 0.5, 0.6, reference="absolute") == PointTimeModel("t", "s", "absolute")
+    assert inferred("t", STAMP + SWEEP, STAMP, reference="relative") == PointTimeModel("t", "s", "relative")
 
 
 def test_without_a_stamp_the_span_decides():
-    assert infer_point_time("t", STAMP_NS + SWEEP_NS, None) == PointTimeModel("t", "ns", "absolute")
-    assert infer_point_time("t", SWEEP_NS, None) == PointTimeModel("t", "ns", "relative")
+    assert inferred("t", STAMP_NS + SWEEP_NS, None) == PointTimeModel("t", "ns", "absolute")
+    assert inferred("t", SWEEP_NS, None) == PointTimeModel("t", "ns", "relative")
 
 
 def test_another_clock_is_reported(caplog):
     with caplog.at_level(logging.WARNING):
-        model = infer_point_time("timestamp", STAMP + 37.0 + SWEEP, STAMP)  # TAI against UTC
+        model = inferred("timestamp", STAMP + 37.0 + SWEEP, STAMP)  # TAI against UTC
     assert "another clock" in caplog.text
     assert not model.shares_clock(STAMP + 37.0 + SWEEP, STAMP)
     assert model.shares_clock(STAMP + SWEEP, STAMP)

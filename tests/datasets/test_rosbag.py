@@ -94,6 +94,23 @@ def test_livox_custom_message(bag_kit, rng, package, clock_ns):
     assert any("another clock" in note for note in info.notes) == (abs(clock_ns) > 10**9)
 
 
+@pytest.mark.parametrize("clock_ns", [0, -STAMP_NS])
+def test_livox_times_in_microseconds(bag_kit, rng, clock_ns):
+    points, offset_us = rng.uniform(1, 9, (200, 3)).astype("f4"), np.linspace(0, 99_000, 200).astype("i8")
+    messages = [
+        (ns, bag_kit.livox(points, offset_us, np.zeros(200), ns, ns + clock_ns, "livox_ros_driver2"))
+        for ns in stamps_ns(3)
+    ]
+    path = bag_kit.write({"/livox/lidar": messages})
+    recording = open_recording(path)
+    for scan in recording.scans():
+        np.testing.assert_allclose(scan.time_offsets, offset_us * 1e-6, rtol=0.0, atol=1e-9)
+    assert any("in units of us instead of ns" in warning for warning in recording.warnings)
+    asked = open_recording(path, ReaderConfig(time_unit="ns"))
+    assert next(asked.scans()).time_offsets.max() == pytest.approx(99e-6)
+    assert asked.warnings == ()
+
+
 def test_single_files_of_a_rosbag2_folder(make_bag_kit, make_sweep):
     for kind in ("db3", "mcap"):
         kit = make_bag_kit(kind)
@@ -378,7 +395,10 @@ def test_a_field_without_time_is_noted(ros2_kit, make_sweep):
     assert next(recording.scans()).time_offsets is None
     info = recording.describe()
     assert info.point_time is None
-    assert info.notes == ("The point field t holds no usable time.",)
+    assert len(info.notes) == 1
+    assert info.notes[0].startswith("The time field 't' holds one value alone (0); the scans are taken as")
+    assert "--set reader.time_field" in info.notes[0]
+    assert recording.warnings == info.notes
 
 
 def test_empty_clouds_are_scans_without_points(ros2_kit, make_sweep):

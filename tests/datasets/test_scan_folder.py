@@ -260,7 +260,7 @@ def test_absolute_times_give_the_stamps_where_there_are_none(tmp_path, rng):
     recording = open_recording(tmp_path)
     scans = list(recording.scans())
     np.testing.assert_allclose([s.stamp for s in scans], EPOCH + 0.05 * np.arange(3), rtol=0.0, atol=1e-6)
-    assert [len(scan) for scan in scans] == [99, 99, 99]
+    assert [(len(scan), scan.untimed) for scan in scans] == [(100, 1)] * 3
     assert scans[2].time_offsets.min() == pytest.approx(0.0, abs=1e-6)
     assert scans[2].time_offsets.max() == pytest.approx(0.0625, abs=1e-6)
     info = recording.describe()

@@ -305,7 +305,7 @@ def test_no_fault_no_warning(tmp_path, tables):
 def test_millimetres_are_told(tmp_path, tables):
     folder = write_folder(tmp_path / "drive", [spoil(table, "millimetres") for table in tables])
     _, summary, _ = run(folder)
-    assert any(w.startswith("8 scans look like millimetres, where metres are expected") for w in summary["warnings"])
+    assert any(w.startswith("8 scans look like centimetres or millimetres") for w in summary["warnings"])
 
 
 def test_scans_that_vanish_while_it_runs_are_counted(tmp_path, tables, monkeypatch):

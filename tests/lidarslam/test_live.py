@@ -163,7 +163,7 @@ def test_interrupted_it_writes_what_came(
     np.testing.assert_allclose([position.x, position.y, position.z], expected, atol=1e-8)
 
 
-def message_at(stamp_s: float, frame_id: str = "lidar") -> bytes:
+def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8) -> bytes:
     """A serialised cloud of 200 points, with times from 0 to 0.1 s in nanoseconds."""
     types = STORE.types
     fields = [
@@ -172,7 +172,7 @@ def message_at(stamp_s: float, frame_id: str = "lidar") -> bytes:
     ]
     table = np.zeros(200, np.dtype([("xyz", "<f4", 3), ("t", "<u4")]))
     table["xyz"] = np.random.default_rng(0).uniform(1.0, 5.0, (200, 3))
-    table["t"] = np.linspace(0.0, 1e8, 200)
+    table["t"] = np.linspace(0.0, last_time, 200)
     stamp_ns = round(1e9 * stamp_s)
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     cloud = types["sensor_msgs/msg/PointCloud2"](
@@ -194,6 +194,16 @@ def test_point_times_are_inferred_from_the_first_cloud() -> None:
     assert live is not None
     assert (live.stamp_ns, live.frame_id, live.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
     np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
+
+
+def test_a_time_field_without_times_is_a_warning() -> None:
+    faults = Faults()
+    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
+    for number in range(12):
+        live = decoder.scan(message_at(1000.0 + 0.1 * number, last_time=0.0), 0)
+        assert live is not None
+        assert live.scan.time_offsets is None
+    assert [warning for warning in faults.warnings() if "holds one value alone (0)" in warning]
 
 
 def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() -> None:

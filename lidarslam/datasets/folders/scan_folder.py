@@ -24,16 +24,21 @@ from lidarslam.datasets.folders.point_attributes import read_colours, read_inten
 from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
 from lidarslam.datasets.recording import PointField, Recording
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
-from lidarslam.datasets.times.azimuth_inference import AzimuthTiming, Sweep, infer_azimuth_timing, pair_starts
+from lidarslam.datasets.times.azimuth_inference import (
+    AzimuthTiming,
+    Sweep,
+    infer_azimuth_timing,
+    pair_starts,
+    time_warnings,
+)
 from lidarslam.datasets.times.point_time import (
     CLOCK_LIMIT_S,
-    UNITS_PER_SECOND,
     PointTimeModel,
     find_ring_field,
     find_time_field,
     is_return,
 )
-from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.times.point_time_inference import LearnedTime, TimedCloud, learn_point_time
 from lidarslam.datasets.times.stamps import assumed_rate, scan_rate
 
 
@@ -72,10 +77,10 @@ class ScanFolderRecording(FileRecording):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """An assumed rate, how the stamps were mended, and times of points that could follow from their azimuth."""
+        """An assumed rate, how the stamps were mended, and what is wrong with the times of the points."""
         assumed = assumed_rate("The scans have no stamps", self._config) if self._rate_is_assumed else None
-        further = (assumed, self._azimuth.warning)
-        return (*self._layout.warnings, *(warning for warning in further if warning is not None))
+        assumed_warnings = () if assumed is None else (assumed,)
+        return (*self._layout.warnings, *assumed_warnings, *time_warnings(self._learned, self._azimuth))
 
     def _table(self, index: int) -> tuple[NDArray[np.void], FloatArray]:
         path = self._files[index]
@@ -106,19 +111,23 @@ class ScanFolderRecording(FileRecording):
         values = table[model.field]
         if model.reference == "absolute" and not self._layout.from_clock:
             # The points' clock is better than an assumed rate: the sweep's first point gives the stamp.
-            seconds = values[is_return(points)].astype(np.float64) / UNITS_PER_SECOND[model.unit]
+            seconds = values[is_return(points)].astype(np.float64) / model.units_per_second
             seconds = seconds[np.isfinite(seconds)]
             if not len(seconds):
                 return stamp, None
             stamp = float(seconds[np.abs(seconds - np.median(seconds)) <= CLOCK_LIMIT_S].min())
         return stamp, model.offsets(values, stamp)
 
-    @cached_property
+    @property
     def _point_time(self) -> PointTimeModel | None:
+        return self._learned.model
+
+    @cached_property
+    def _learned(self) -> LearnedTime:
         """Inferred once, so that all scans are read alike."""
         config = self._config
         if config.time_reference == "none":
-            return None
+            return LearnedTime()
         rate = scan_rate(self.stamps) if self._layout.from_clock else None
         period_s = None if rate is None else 1.0 / rate
         return learn_point_time(self._timed_clouds(), config.time_unit, config.time_reference, period_s)

@@ -14,9 +14,9 @@ from lidarslam.datasets.ros.bag_message import VELODYNE_SCAN_TYPE, BagMessage, S
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 from lidarslam.datasets.ros.timed_scan import field_offsets
 from lidarslam.datasets.times.azimuth import AZIMUTH_TIME
-from lidarslam.datasets.times.azimuth_inference import AzimuthTiming, Sweep, infer_azimuth_timing
+from lidarslam.datasets.times.azimuth_inference import AzimuthTiming, Sweep, infer_azimuth_timing, time_warnings
 from lidarslam.datasets.times.point_time import PointTimeModel, is_return
-from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_point_time
+from lidarslam.datasets.times.point_time_inference import LearnedTime, TimedCloud, learn_point_time
 
 # So many pairs of messages, spread over the first so many, are compared at their seams.
 _PAIRS, _LOOKED_AT = 40, 600
@@ -51,24 +51,30 @@ class BagPointTime:
             yield self.azimuth.note
         if cloud.time_field is None or cloud.times is None:
             return
-        if self._field is None:
-            if self._config.time_reference not in ("none", "azimuth"):
-                yield f"The point field {cloud.time_field} holds no usable time."
-        elif not self._field.shares_clock(cloud.times, stamp):
+        if self._field is not None and not self._field.shares_clock(cloud.times, stamp):
             yield (
                 f"The point field {cloud.time_field} reads another clock than the stamps,"
                 " so the earliest point of each scan gets the scan's stamp."
             )
 
-    @cached_property
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with the times, and times that could follow from the azimuth."""
+        return time_warnings(self._learned, self.azimuth)
+
+    @property
     def _field(self) -> PointTimeModel | None:
+        return self._learned.model
+
+    @cached_property
+    def _learned(self) -> LearnedTime:
         unit, reference = self._config.time_unit, self._config.time_reference
         if reference == "none":
-            return None
-        if self._topic.message_type in livox.CUSTOM_MESSAGE_TYPES:
-            unit, reference = livox.TIME_UNIT, "absolute"  # as the message type defines
-        elif self._topic.message_type == VELODYNE_SCAN_TYPE:
+            return LearnedTime()
+        if self._topic.message_type == VELODYNE_SCAN_TYPE:
             unit, reference = "ns", "absolute"  # as they are decoded
+        elif self._topic.message_type in livox.CUSTOM_MESSAGE_TYPES:
+            return learn_point_time(self._timed_clouds(), unit, "absolute", self._period_s, livox.TIME_UNIT)
         return learn_point_time(self._timed_clouds(), unit, reference, self._period_s)
 
     @cached_property

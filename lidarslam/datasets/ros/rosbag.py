@@ -106,9 +106,9 @@ class BagRecording:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A lost index, headers without stamps, and times of points that could follow from their azimuth."""
+        """A lost index, headers without stamps, and what is wrong with the times of the points."""
         unset = None if self._stamps.from_header else _NO_HEADER_STAMPS
-        found = (self._bag.damage, unset, one_part(self._source), self._point_time.azimuth.warning)
+        found = (self._bag.damage, unset, one_part(self._source), *self._point_time.warnings)
         return tuple(warning for warning in found if warning is not None)
 
     def scans(

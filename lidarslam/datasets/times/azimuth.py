@@ -143,7 +143,7 @@ def are_as_measured(pairs: Iterable[Sequence[SweepOrder]]) -> bool | None:
     between, it is the other way round.
 
     Returns:
-        None where too few ranges differ, as at rest, or the ranges contradict one another.
+        None where too few ranges differ, as at rest, or the ranges contradict one another, as near things that move.
     """
     between, within = [np.empty(0)], [np.empty(0)]
     for sweep, following in pairs:
@@ -155,7 +155,7 @@ def are_as_measured(pairs: Iterable[Sequence[SweepOrder]]) -> bool | None:
     if len(gain) < _FEWEST_COMPARED:
         return None
     share = float(np.mean(gain > 0.0))
-    return True if share > _CLEAR else False if share < 0.5 else None
+    return True if share > _CLEAR else False if share < 1.0 - _CLEAR else None
 
 
 def _across_seam(sweep: SweepOrder, following: SweepOrder) -> tuple[FloatArray, FloatArray]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.datasets.config import TimeReference
 from lidarslam.datasets.times.azimuth import SweepOrder, are_as_measured, offsets_from_order, sweep_order
+from lidarslam.datasets.times.point_time_inference import LearnedTime
 
 # No sensor turns more slowly; scans farther apart leave sweeps out between them.
 _LONGEST_SWEEP_S = 0.25
@@ -26,8 +27,16 @@ _OFFERED = (
     "The points have no times but are in the order of one turn; whether the sweeps are as measured or motion"
     " compensated does not show. If they are as measured, --set reader.time_reference=azimuth gives the points times."
 )
+_UNORDERED = "The points have no times, and are not in the order of one turn, from which times could follow."
 _NO_ORDER = "Times were to follow from the azimuth, but the points are not in the order of one turn."
 _TOO_SLOW = "Times were to follow from the azimuth, but the scans lie farther apart than a sweep lasts."
+
+
+_NO_TIMES = (
+    "; the scans are taken as measured at one instant, or motion compensated. If they are neither, name another field"
+    " with --set reader.time_field=NAME, or give its unit with reader.time_unit; --set reader.time_reference=none"
+    " accepts it."
+)
 
 
 class Sweep(NamedTuple):
@@ -50,6 +59,15 @@ class AzimuthTiming:
         return None if self.period_s is None else offsets_from_order(sweep.points, sweep.rings, self.period_s)
 
 
+def time_warnings(learned: LearnedTime, azimuth: AzimuthTiming) -> tuple[str, ...]:
+    """A line on the time field that was not as it should be, with what became of the times, and one on the azimuth."""
+    fault = learned.warning
+    if fault is not None and learned.model is None:
+        without = "." if azimuth.warning is not None else _NO_TIMES
+        fault += without if azimuth.period_s is None else "; the times follow from the azimuth instead."
+    return tuple(warning for warning in (fault, azimuth.warning) if warning is not None)
+
+
 def pair_starts(scans: int) -> list[int]:
     """Indices, spread over a recording of so many scans, of the first scan of each pair that is compared."""
     return sorted({int(index) for index in np.linspace(0, max(0, scans - 2), _PAIRS)})
@@ -70,9 +88,10 @@ def infer_azimuth_timing(
     orders = ([sweep_order(*sweep) for sweep in run] for run in runs)
     if reference == "azimuth":
         return _as_asked(orders, period_s)
-    pairs = list(_ordered_pairs(orders)) if period_s < _LONGEST_SWEEP_S else []
-    if not pairs:
+    if period_s >= _LONGEST_SWEEP_S:
         return AzimuthTiming()
+    if not (pairs := list(_ordered_pairs(orders))):
+        return AzimuthTiming(note=_UNORDERED)
     decision = are_as_measured(pairs)
     if decision is None:
         return AzimuthTiming(warning=_OFFERED)

@@ -24,6 +24,8 @@ TIME_FIELD_NAMES: tuple[str, ...] = (
 RING_FIELD_NAMES: tuple[str, ...] = ("ring", "channel", "line", "laser_id", "laser", "ring_id", "beam_id", "beam")
 
 UNITS_PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+# What times come in that were divided or multiplied once too often; not among the settings.
+MISTAKEN_UNITS_PER_SECOND = {"ks": 1e-3, "Ms": 1e-6, "ps": 10**12}
 
 # A sweep and its stamp are closer than this; a time farther away is on another clock, or is no time at all.
 CLOCK_LIMIT_S = 1.0
@@ -63,15 +65,20 @@ class PointTimeModel:
     """Conversion of a time field's raw values to seconds from the scan's stamp."""
 
     field: str  # name of the field
-    unit: str  # "s", "ms", "us" or "ns"
+    unit: str  # "s", "ms", "us" or "ns"; of mistaken values "ks", "Ms" or "ps"
     reference: str  # "relative" (the values count from the stamp) or "absolute" (they read a clock)
+
+    @property
+    def units_per_second(self) -> float:
+        """How many units a second has."""
+        return UNITS_PER_SECOND.get(self.unit) or MISTAKEN_UNITS_PER_SECOND[self.unit]
 
     def offsets(self, values: NDArray[np.generic], stamp: float) -> FloatArray:
         """Seconds from the stamp, float64, of the shape of the values (N,).
 
         Exact to a nanosecond for integers, and to the resolution of the values for floats. Times more than a second
         from the stamp are of another clock: they are shifted so that the earliest point has offset zero. Single
-        times more than a second from the median are NaN, as `Scan.from_raw` expects of bad points.
+        times more than a second from the median are NaN, as `Scan.from_raw` expects of points without a time.
         """
         middle = self._middle(values)
         if middle is None:
@@ -79,7 +86,7 @@ class PointTimeModel:
         same_clock = self._is_near(middle, self._zero(stamp))
         zero = self._zero(stamp) if same_clock else middle
         offsets = self._seconds_since(zero, values)
-        astray = ~(np.abs(offsets - float((middle - zero) / UNITS_PER_SECOND[self.unit])) <= CLOCK_LIMIT_S)
+        astray = ~(np.abs(offsets - float((middle - zero) / self.units_per_second)) <= CLOCK_LIMIT_S)
         if astray.any():
             offsets[astray] = np.nan
         return offsets if same_clock else offsets - np.nanmin(offsets)
@@ -91,10 +98,10 @@ class PointTimeModel:
 
     def _zero(self, stamp: float) -> Fraction:
         """The field's reading at the stamp."""
-        return Fraction(stamp) * UNITS_PER_SECOND[self.unit] if self.reference == "absolute" else Fraction(0)
+        return Fraction(stamp) * Fraction(self.units_per_second) if self.reference == "absolute" else Fraction(0)
 
     def _is_near(self, reading: Fraction, other: Fraction) -> bool:
-        return abs(reading - other) <= CLOCK_LIMIT_S * UNITS_PER_SECOND[self.unit]
+        return abs(reading - other) <= CLOCK_LIMIT_S * self.units_per_second
 
     def _middle(self, values: NDArray[np.generic]) -> Fraction | None:
         """About the median, one of the values; from a sample, because every scan needs it."""
@@ -107,7 +114,7 @@ class PointTimeModel:
     def _seconds_since(self, zero: Fraction, values: NDArray[np.generic]) -> FloatArray:
         # Differences to the nearest reading are exact in the values' own type and unit, and so is the rest of that
         # reading; converted to seconds first, an epoch would have lost its nanoseconds.
-        per_second = UNITS_PER_SECOND[self.unit]
+        per_second = self.units_per_second
         if values.dtype.kind in "iu":
             nearest = round(zero)
             wrapped = np.array(nearest % 2**64, dtype=np.uint64)  # modulo 2^64 any integers may be subtracted

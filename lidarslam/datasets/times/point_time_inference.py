@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.datasets.config import TimeReference, TimeUnit
-from lidarslam.datasets.times.point_time import CLOCK_LIMIT_S, UNITS_PER_SECOND, PointTimeModel
+from lidarslam.datasets.times.point_time import (
+    CLOCK_LIMIT_S,
+    MISTAKEN_UNITS_PER_SECOND,
+    UNITS_PER_SECOND,
+    PointTimeModel,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -23,6 +28,9 @@ _SWEEP_S, _SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 0.1, 0.005, 1.0
 # The same relative to the time between scans, where that is known and itself plausible.
 _SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
 _PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
+# A span so near to the time between scans, in another unit than expected, leaves no doubt about the unit.
+_WHOLE_SWEEP = (0.8, 1.1)
+_IN_WORDS = {"ks": "1000 s", "Ms": "1,000,000 s"}
 # Times coarser than this part of the sweep do not separate its points.
 _COARSEST_OF_SWEEP = 0.1
 # Instead of the extremes, so that a few stray values do not matter.
@@ -37,33 +45,41 @@ class TimedCloud(NamedTuple):
     stamp: float | None
 
 
+class LearnedTime(NamedTuple):
+    """What is known of a time field."""
+
+    model: PointTimeModel | None = None  # None: it gives the points no times
+    warning: str | None = None  # a correction; without a model, what is wrong, to be continued with a semicolon
+
+
 def learn_point_time(
     clouds: Iterable[TimedCloud],
     unit: TimeUnit = "auto",
     reference: TimeReference = "auto",
     period_s: float | None = None,
-) -> PointTimeModel | None:
-    """The model of the first cloud whose times are unambiguous, else of the last with any; None without.
+    defined_unit: TimeUnit | None = None,
+) -> LearnedTime:
+    """By the first cloud whose times are unambiguous, else by the last with any; see `infer_point_time`.
 
     Stamps close to zero are ambiguous: times from 0 to 0.1 s are then relative as well as absolute.
     """
-    model, failures = None, 0
+    learned, failures = LearnedTime(), 0
     for cloud in islice(clouds, _CLOUDS_LOOKED_AT):
         if cloud.values is not None and len(cloud.values) < 2:
             continue  # an empty scan shows nothing of the field
-        found = None
+        found = LearnedTime()
         if cloud.field is not None and cloud.values is not None:
-            found = infer_point_time(cloud.field, cloud.values, cloud.stamp, unit, reference, period_s)
-        model = found or model
-        failures += found is None
+            found = infer_point_time(cloud.field, cloud.values, cloud.stamp, unit, reference, period_s, defined_unit)
+        learned = found if found.model is not None or learned == LearnedTime() else learned
+        failures += found.model is None
         is_clear = cloud.stamp is None or abs(cloud.stamp) > 2 * CLOCK_LIMIT_S
-        if (found is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
+        if (found.model is not None and is_clear) or failures == _CLOUDS_WITHOUT_TIME:
             break
-    if model is None:
+    if (model := learned.model) is None:
         logger.info("time of a point: none is known; scans are taken as measured at one instant, or compensated")
     else:
         logger.info("time of a point: field %r in %s, %s", model.field, model.unit, model.reference)
-    return model
+    return learned
 
 
 def infer_point_time(
@@ -73,39 +89,60 @@ def infer_point_time(
     unit: TimeUnit = "auto",
     reference: TimeReference = "auto",
     period_s: float | None = None,
-) -> PointTimeModel | None:
+    defined_unit: TimeUnit | None = None,
+) -> LearnedTime:
     """Infer unit and reference of a time field from the raw values (N,) of one scan with a stamp in seconds.
 
     Values that read the same as the stamp in some unit are absolute in that unit. Otherwise the unit is the one in
     which they span a sweep (about `period_s`, where known), and they are relative if none exceeds a second, else
-    readings of a clock of their own. A given unit or reference is not questioned.
+    readings of a clock of their own. Values that were divided or multiplied by a thousand once too often, so that
+    they span the whole period (0.1 s where it is unknown) in another unit alone, are corrected with a warning. A given
+    unit or reference is not questioned; `defined_unit`, by the definition of a message, gives way to such a correction.
 
     Returns:
-        None when the values are no per-point time: `reference` is "none" or "azimuth", all values are equal, too
-        coarse (an epoch in float32), or span a sweep in no unit; the last two are logged as a warning.
+        No model when the values are no per-point time: `reference` is "none" or "azimuth", all values are equal, too
+        coarse (an epoch in float32), or span a sweep in no unit; but for the first, the warning says so.
     """
-    spread = None if reference in ("none", "azimuth") else value_spread(values)
+    if reference in ("none", "azimuth") or not len(values):
+        return LearnedTime()
+    spread = value_spread(values)
     if spread is None:
-        return None
+        return LearnedTime(None, f"The time field {field!r} holds {_without_spread(values)}")
     if spread.resolution > _COARSEST_OF_SWEEP * spread.span:
-        logger.warning("time field %r is too coarse (steps of %g): ignored", field, spread.resolution)
-        return None
-    units = tuple(UNITS_PER_SECOND) if unit == "auto" else (unit,)
-    if reference != "relative" and (by_clock := _unit_by_clock(spread, stamp, units)) is not None:
-        return PointTimeModel(field, by_clock, "absolute")
-    by_span = _unit_by_span(spread, period_s) if unit == "auto" else unit
-    if by_span is None:
-        said = "time field %r (%.9g to %.9g) spans a sweep in no unit: ignored; set time_unit if it is a time"
-        logger.warning(said, field, spread.first, spread.last)
-        return None
-    if reference == "auto":
-        largest_s = max(abs(spread.first), abs(spread.last)) / UNITS_PER_SECOND[by_span]
-        reference = "relative" if largest_s <= CLOCK_LIMIT_S else "absolute"
-    model = PointTimeModel(field, by_span, reference)
-    if reference == "absolute" and stamp is not None and not model.shares_clock(values, stamp):
+        return LearnedTime(None, f"The time field {field!r} is too coarse, with steps of {spread.resolution:g}")
+    given = defined_unit if unit == "auto" else unit
+    units = tuple(UNITS_PER_SECOND) if given is None else (given,)
+    by_clock = None if reference == "relative" else _unit_by_clock(spread, stamp, units)
+    found = by_clock or given or _unit_by_span(spread, period_s)
+    sweep_s = period_s if period_s is not None and _is_plausible(period_s) else _SWEEP_S
+    mistaken = _unit_by_whole_sweep(spread, found, sweep_s) if unit == "auto" else None
+    if mistaken is not None:
+        return LearnedTime(
+            PointTimeModel(field, mistaken, _reference(spread, mistaken, reference)),
+            f"The time field {field!r} spans {spread.span:.3g}, a sweep of {sweep_s:.3g} s in units of"
+            f" {_IN_WORDS.get(mistaken, mistaken)}{'' if found is None else f' instead of {found}'}, and is read so;"
+            " --set reader.time_unit gives another.",
+        )
+    if found is None:
+        span = f"({spread.first:.9g} to {spread.last:.9g})"
+        return LearnedTime(None, f"The time field {field!r} {span} spans a sweep in no unit")
+    model = PointTimeModel(field, found, "absolute" if by_clock else _reference(spread, found, reference))
+    if model.reference == "absolute" and stamp is not None and not model.shares_clock(values, stamp):
         said = "time field %r reads another clock than the scans' stamps: the earliest point of a scan gets its stamp"
         logger.warning(said, field)
-    return model
+    return LearnedTime(model)
+
+
+def _without_spread(values: NDArray[np.generic]) -> str:
+    known = values[np.isfinite(values)]
+    return "no number" if not len(known) else f"one value alone ({float(np.median(known)):.9g})"
+
+
+def _reference(spread: "ValueSpread", unit: str, reference: TimeReference) -> str:
+    if reference != "auto":
+        return reference
+    largest_s = max(abs(spread.first), abs(spread.last)) / PointTimeModel("", unit, "").units_per_second
+    return "relative" if largest_s <= CLOCK_LIMIT_S else "absolute"
 
 
 class ValueSpread(NamedTuple):
@@ -139,6 +176,10 @@ def value_spread(values: NDArray[np.generic]) -> ValueSpread | None:
     return ValueSpread(float(base + first), float(base + middle), float(base + last), float(last - first), resolution)
 
 
+def _is_plausible(period_s: float) -> bool:
+    return _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]
+
+
 def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str]) -> str | None:
     """The unit in which the values read the same as the stamp."""
     if stamp is None or abs(stamp) <= 2 * CLOCK_LIMIT_S:  # ambiguous: relative times read about the same
@@ -153,9 +194,20 @@ def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str
 def _unit_by_span(spread: ValueSpread, period_s: float | None) -> str | None:
     """The unit in which the values span a sweep."""
     spans = {unit: spread.span / per_second for unit, per_second in UNITS_PER_SECOND.items()}
-    if period_s is not None and _PLAUSIBLE_PERIOD_S[0] <= period_s <= _PLAUSIBLE_PERIOD_S[1]:
+    if period_s is not None and _is_plausible(period_s):
         for unit, span in spans.items():
             if _SHORTEST_OF_PERIOD * period_s <= span <= _LONGEST_OF_PERIOD * period_s:
                 return unit
     fitting = [unit for unit, span in spans.items() if _SHORTEST_SWEEP_S <= span <= _LONGEST_SWEEP_S]
     return min(fitting, key=lambda unit: abs(np.log(spans[unit] / _SWEEP_S)), default=None)
+
+
+def _unit_by_whole_sweep(spread: ValueSpread, expected: str | None, sweep_s: float) -> str | None:
+    """The unit in which the values span a whole sweep, where they span no part of it in the expected one."""
+    parts = {
+        unit: spread.span / per_second / sweep_s
+        for unit, per_second in (UNITS_PER_SECOND | MISTAKEN_UNITS_PER_SECOND).items()
+    }
+    if expected is not None and _SHORTEST_OF_PERIOD <= parts[expected] <= _LONGEST_OF_PERIOD:
+        return None
+    return next((unit for unit, part in parts.items() if _WHOLE_SWEEP[0] <= part <= _WHOLE_SWEEP[1]), None)

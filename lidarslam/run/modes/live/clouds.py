@@ -20,6 +20,8 @@ _MOST_LOOKED_AT = 10
 _NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
 _OTHER_SENSOR = "scans were left out: they come from another sensor; name one with --set reader.frame_id=NAME"
 
+_TIME_FIELD = "time field of the points has a fault"
+
 
 @dataclass(frozen=True, eq=False)
 class LiveScan:
@@ -100,13 +102,18 @@ class CloudDecoder:
         """Infer unit and reference of the time field, until they are clear."""
         if self._is_settled:
             return
-        unit, reference = self._config.time_unit, self._config.time_reference
+        unit, reference, defined_unit = self._config.time_unit, self._config.time_reference, None
         if self._type in livox.CUSTOM_MESSAGE_TYPES:
-            unit, reference = livox.TIME_UNIT, "absolute"  # as the message type defines
+            reference, defined_unit = "absolute", livox.TIME_UNIT
         times = None if cloud.times is None else cloud.times[is_return(cloud.points)]
         self._clouds.append(TimedCloud(cloud.time_field, times, stamp))
-        self._point_time = learn_point_time(self._clouds, unit, reference)
+        stamps = [cloud.stamp for cloud in self._clouds if cloud.stamp is not None]
+        period_s = (stamps[-1] - stamps[0]) / (len(stamps) - 1) if len(stamps) > 1 else None
+        learned = learn_point_time(self._clouds, unit, reference, period_s, defined_unit)
+        self._point_time = learned.model
         is_clear = self._point_time is not None and stamp > 2 * CLOCK_LIMIT_S
         self._is_settled = is_clear or len(self._clouds) == _MOST_LOOKED_AT
         if self._is_settled:
             self._clouds.clear()
+            if learned.warning is not None:
+                self._faults.note(_TIME_FIELD, learned.warning)
