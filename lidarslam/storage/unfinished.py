@@ -7,9 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ConfigDict, NonNegativeInt, TypeAdapter, with_config
+from typing_extensions import TypedDict
+
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
 from lidarslam.core.state.stateful import Saved
+from lidarslam.core.text.json_text import read_json
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
 
@@ -18,6 +22,24 @@ _SUBMAPS, _TILES = "submaps.bin", "tiles.bin"
 _LISTED = 3
 
 Standing = Literal["at work", "stopped"]
+
+
+@with_config(ConfigDict(extra="allow"))
+class _Description(TypedDict, total=False):
+    source: str
+    reader: dict[str, Any]
+    merge: Literal["all", "part"]
+    sources: list[str]
+    parts: list[str]
+
+
+class _About(TypedDict):
+    description: _Description
+    standing: Standing
+    resumed_after: list[NonNegativeInt]
+
+
+_SHAPE = TypeAdapter(_About)
 
 
 @dataclass(frozen=True)
@@ -37,12 +59,11 @@ class About:
         """
         path = run / ABOUT
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            standing: Standing = "stopped" if values["standing"] == "stopped" else "at work"
-            return cls(dict(values["description"]), standing, tuple(map(int, values["resumed_after"])))
+            values = read_json(path, _SHAPE)
+            return cls({**values["description"]}, values["standing"], tuple(values["resumed_after"]))
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(f"{path}: is damaged ({error}); begin again with --overwrite") from error
 
     def write(self, run: Path) -> None:
@@ -65,7 +86,7 @@ class About:
                 f"this run did not finish; resume it with lidarslam run {source} --out {run} --resume"
                 " and the options it was begun with"
             )
-        sources = " ".join(map(str, self.description.get("sources", ["SOURCE..."])))
+        sources = " ".join(self.description.get("sources", ["SOURCE..."]))
         out = run if self.description["merge"] == "all" else run.parent
         return (
             f"this merge did not finish; make it again with lidarslam merge {sources} --out {out} --overwrite"

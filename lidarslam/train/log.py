@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from lidarslam.core.errors import InputError
 from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
 
@@ -54,8 +55,11 @@ def _cut(path: Path, step: int) -> None:
     """Keep the lines up to a step."""
     if not path.exists():
         return
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: is damaged ({error!r}); remove it, or begin again with --overwrite") from error
     path.unlink()
     for row in rows:
         _append(path, row)
