@@ -11,7 +11,7 @@ from pydantic import ConfigDict, NonNegativeInt, TypeAdapter, with_config
 from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
+from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
 from lidarslam.core.state.stateful import Saved
 from lidarslam.core.text.json_text import read_json
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
@@ -148,6 +148,8 @@ class Unfinished:
             OutputError: the folder cannot be written.
         """
         run = directory.path
+        if resume and (run / UNFINISHED).is_symlink():
+            raise InputError(f"{run / UNFINISHED}: is a link to another place; begin again with --overwrite")
         about = About.read(run) if resume else None
         if resume and about is None:
             raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
@@ -155,7 +157,7 @@ class Unfinished:
             _require_same(run, about.description, description)
         unfinished = cls(run, about or About(description), resume)
         try:
-            unfinished._folder.mkdir(exist_ok=True)
+            make_own_folder(unfinished._folder)
         except OSError as error:
             raise cannot_write(unfinished._folder, error) from error
         for folder in (run, unfinished._folder):
@@ -186,6 +188,9 @@ class Unfinished:
             self._remove()
 
     def _remove(self) -> None:
+        if self._folder.is_symlink():  # what it leads to is not ours
+            self._folder.unlink()
+            return
         (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are nothing
         self._remove_files()
         with contextlib.suppress(OSError):  # another file lies there

@@ -2,11 +2,13 @@
 
 import csv
 from collections.abc import Mapping
+from io import SEEK_END, TextIOWrapper
 from pathlib import Path
 
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import make_own_folder, open_own
 from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
 
@@ -18,6 +20,7 @@ class TrainingLog:
         self._out = out
         for name in (files.LOSSES, files.VALIDATION):
             _cut(out / name, step)
+        make_own_folder(out / files.CURVES)
         self._curves = SummaryWriter(str(out / files.CURVES), purge_step=step + 1 if step else None)
 
     def losses(self, step: int, row: Mapping[str, float]) -> None:
@@ -43,10 +46,9 @@ class TrainingLog:
 
 
 def _append(path: Path, row: Mapping[str, object]) -> None:
-    is_new = not path.exists()
-    with path.open("a", encoding="utf-8", newline="") as file:
+    with TextIOWrapper(open_own(path), encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(row))
-        if is_new:
+        if file.seek(0, SEEK_END) == 0:
             writer.writeheader()
         writer.writerow(row)
 

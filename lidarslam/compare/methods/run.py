@@ -84,6 +84,9 @@ def run_method(
 
 def clear(folder: Path) -> None:
     """Make a method's directory, or remove what a run of an earlier comparison left there."""
+    for one in (folder.parent, folder):
+        if one.is_symlink():  # what it leads to is not of this comparison
+            one.unlink()
     if (folder / LOG).is_file():
         files.remove_files(folder)
         (folder / PROCESS).unlink(missing_ok=True)

@@ -32,7 +32,8 @@ def require_name(name: str, what: str, reserved: Collection[str] = ()) -> str:
 def safe_name(text: str, default: str = "recording") -> str:
     """A safe component of a path for something that has a name already, such as a topic or a sequence."""
     name = one_line(_SEPARATORS.sub("_", text)).replace("\\", "_").lstrip(".")
-    return name.encode()[:_LONGEST].decode(errors="ignore") or default
+    name = name.encode()[:_LONGEST].decode(errors="ignore")
+    return name if name.strip() else default
 
 
 def _fault(name: str, reserved: Collection[str]) -> str | None:

@@ -39,10 +39,18 @@ def read_ply(path: Path) -> NDArray[np.void]:
         if dtype.itemsize > _WIDEST_POINT:
             raise ValueError(f"expected points of at most {_WIDEST_POINT} bytes, got {dtype.itemsize}")
         if encoding == "ascii":
-            return read_ascii_table(data[length:].split(b"\n", skipped[0])[-1], dtype, rows)
+            return read_ascii_table(_after_lines(data[length:], skipped[0]), dtype, rows)
         return read_binary_table(data[length + skipped[1] :], dtype, rows)
     except ValueError as error:
         raise InputError(f"{path}: not a readable PLY file: {error}; copy it again or remove it") from None
+
+
+def _after_lines(body: bytes, lines: int) -> bytes:
+    """What follows so many lines."""
+    parts = body.split(b"\n", lines) if lines <= len(body) else []
+    if len(parts) <= lines:
+        raise ValueError(f"expected {lines} lines before the vertices, found fewer: it is truncated")
+    return parts[-1]
 
 
 def _split_header(data: bytes) -> tuple[list[list[str]], int]:

@@ -96,6 +96,8 @@ def earlier_parts(out: Path) -> set[str]:
 
 def remove_part(path: Path) -> None:
     """Remove the run of a recording that is no longer merged, however far it came."""
+    if path.is_symlink():  # what it leads to is not of this merge
+        return
     if (path / files.ABOUT).exists():
         remove_unfinished(path)
         return
