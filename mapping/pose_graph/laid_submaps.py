@@ -6,12 +6,13 @@ latest keyframe, so that the surfaces of both visits coincide.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Stateful
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxel_rows import POSITION, VIEW, Rows
 from lidarslam.mapping.loops.closure import RelativePose
@@ -35,7 +36,7 @@ class LaidSubmaps(Stateful):
         radius_m: of the local map.
     """
 
-    _poses: list[FloatArray]  # T_odom_keyframe
+    _poses: list[Annotated[FloatArray, TRANSFORM]]  # T_odom_keyframe
     _held: list[int]  # keyframes whose submaps it holds
     _redraws: list[int]  # numbers of keyframes when it was drawn anew
 
@@ -44,8 +45,11 @@ class LaidSubmaps(Stateful):
         self._poses, self._held, self._redraws = [], [], []
 
     def _after_restore(self) -> None:
-        if not all(0 <= key < len(self._poses) for key in self._held):
+        if not all(key < len(self._poses) for key in self._held) or self._held != sorted({*self._held}):
             raise ValueError(f"{len(self._held)} of {len(self._poses)} submaps are held, {self._held[:3]} among them")
+
+    def __len__(self) -> int:
+        return len(self._poses)
 
     def follow(self, T_odom_keyframe: FloatArray) -> None:
         """The next keyframe begins; what is beyond the radius is forgotten."""

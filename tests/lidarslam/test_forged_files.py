@@ -140,6 +140,23 @@ def test_a_name_in_a_benchmark_stays_in_the_folder(
     assert {path.name for path in tmp_path.iterdir()} == {"forged.yaml"}
 
 
+def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
+    rerun_output = pytest.importorskip("lidarslam.viewer.rerun_output")
+    file = finished_run / "recording.rrd"
+    assert lidarslam("view", finished_run, "--save", file).exit_code == 0
+    whole = file.read_bytes()
+    forged = {b"": "not a Rerun recording", whole[:-1]: "is cut off", whole[: len(whole) // 2]: "is cut off",
+              whole + b"more": "is cut off", b"RRF1" + whole[4:]: "not a Rerun recording"}  # fmt: skip
+    for content, message in forged.items():
+        file.write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            rerun_output.show_file_in_window(file)
+        refused(lidarslam("view", file), message)
+    with pytest.raises(InputError, match="no such file"):
+        rerun_output.show_file_in_window(tmp_path)
+    assert lidarslam("view", finished_run, "--save", tmp_path / "view.rrd").exit_code == 0
+
+
 def test_two_methods_of_one_name(tmp_path: Path) -> None:
     (tmp_path / "forged.yaml").write_text(
         "title: t\nmethods: [kiss-icp, kiss-icp]\nrecordings: [{name: a, source: a}]\n"

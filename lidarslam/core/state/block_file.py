@@ -11,6 +11,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import open_own
 from lidarslam.core.state.stateful import Saved, State, Stateful
+from lidarslam.core.state.tree import checked
 
 
 class BlockFile(Stateful):
@@ -50,8 +51,13 @@ class BlockFile(Stateful):
         self._opened()
         is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
         for index, checksum in enumerate(self._checksums):
-            if is_short or zlib.crc32(self.read(index)) != checksum:
+            block = b"" if is_short else self.read(index)
+            if is_short or zlib.crc32(block) != checksum:
                 raise InputError(f"{self._path}: is damaged (block {index}); begin again with --overwrite")
+            checked(saved, lambda index=index, block=block: self._require(index, block))
+
+    def _require(self, index: int, block: bytes) -> None:
+        """Check the content of a block that is restored; a ValueError refuses it."""
 
     def _after_restore(self) -> None:
         count = len(self._checksums)
