@@ -80,7 +80,7 @@ class GlobalMap(Stateful):
         self.voxel_size_m, self.most_points = voxel_size_m, most_points
         self._store = None if most_points is None else TileStore() if store is None else store
         self._merged, self._pending = Voxels.join([]), []
-        self._begin()
+        self._after_restore()
 
     def _after_restore(self) -> None:
         if not self.voxel_size_m > 0.0:
@@ -90,9 +90,6 @@ class GlobalMap(Stateful):
             part.require_sums()
         if self._store is not None:
             self._store.require_tiling(self.tiling)
-        self._begin()
-
-    def _begin(self) -> None:
         self._pending_size = sum(len(part.keys) for part in self._pending)
         self._lock = threading.Lock()  # a viewer may look while a scan is added
 

@@ -82,12 +82,13 @@ class TileStore(BlockFile):
         super().__init__(directory, file)
         self._parts, self.brightest = [], 0.0
         self._blocks: dict[Tile, list[int]] = {}
+        self._first_keys: list[NDArray[np.int64]] = []  # of the blocks that were restored
 
     def _after_restore(self) -> None:
         super()._after_restore()
         if len(self._parts) != len(self):
             raise ValueError(f"{len(self)} blocks are of {len(self._parts)} tiles")
-        self._blocks, self._first_keys = {}, list[NDArray[np.int64]]()
+        self._blocks, self._first_keys = {}, []
         for index, part in enumerate(self._parts):
             self._blocks.setdefault((part.x, part.y), []).append(index)
 
@@ -100,7 +101,7 @@ class TileStore(BlockFile):
 
     def require_tiling(self, tiling: Tiling) -> None:
         """Refuse restored blocks that are not of their tiles, with a ValueError."""
-        if any(tiling.tiles(key) != [(one.x, one.y)] for key, one in zip(self._first_keys, self._parts, strict=True)):
+        if any(tiling.tiles(key) != [(one.x, one.y)] for key, one in zip(self._first_keys, self._parts, strict=False)):
             raise ValueError("a block of voxels is of another tile")
 
     @property
