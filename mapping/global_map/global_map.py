@@ -121,9 +121,8 @@ class GlobalMap(Stateful):
         world = transform_points(T_world_map, means_points(means))
         sums = means.rows.copy()
         keys = point_keys(world, self.voxel_size_m)
-        sums[:, POSITION] = (
-            world - key_cells(keys) * self.voxel_size_m
-        )  # within the voxel, where float32 is exact enough
+        # Within the voxel float32 is exact enough.
+        sums[:, POSITION] = world - key_cells(keys) * self.voxel_size_m
         sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
         sums[:, :COUNT] *= means.rows[:, COUNT, None]
         self._wait(Voxels(keys, sums, means.layout))
