@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, make_transform
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, Shape, State
+from lidarslam.core.state.stateful import TRANSFORM, Saved, Shape, State
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class Motion:
     """The motion since the previous scan."""
 
     # (4, 4), from this scan's LiDAR frame to the previous one's, each at its stamp; identity for the first scan
-    T_prev_curr: Annotated[FloatArray, Shape(4, 4)]
+    T_prev_curr: Annotated[FloatArray, TRANSFORM]
     points_used: int  # how many points of the scan the estimate rests on; 0 for a prediction
     failure: str | None = None  # why the motion is only a prediction, None when it was measured
     # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None where the method has none

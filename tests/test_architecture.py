@@ -40,7 +40,11 @@ MAY_NOT_IMPORT = {
 ENTRY_POINTS = ("lidarslam", "lidarslam.cli", "lidarslam.__main__")
 CORE_MAY_IMPORT = {"numpy", "scipy", "typing_extensions", *sys.stdlib_module_names}
 # What odometry and mapping both need of a foreign library, and share through the core.
-CORE_EXCEPTIONS = {"lidarslam.core.compiled": {"numba"}, "lidarslam.core.tasks.on_ray": {"ray"}}
+CORE_EXCEPTIONS = {
+    "lidarslam.core.compiled": {"numba"},
+    "lidarslam.core.tasks.on_ray": {"ray"},
+    "lidarslam.core.text.json_text": {"pydantic"},
+}
 # A foreign library -> the modules that may know it; a trailing * stands for any ending.
 CONFINED = {
     "kiss_icp": ("lidarslam.odometry.methods.kiss*",),

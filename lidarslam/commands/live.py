@@ -81,7 +81,7 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
 
             options |= {"reader": None, "sequence": None, "topic": topic}  # those of recordings
             config, map_formats = take_config(options), take_map_formats(options)
-            out = out or default_out("runs", (topic or "live").strip("/").replace("/", "_"))
+            out = out or default_out("runs", (topic or "live").strip("/"))
             request = LiveRequest(out, config, topic, map_formats=map_formats, **options)
             page = serve.enter_context(serving()) if request.rerun == "web" else None
             try:

@@ -9,7 +9,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from typing_extensions import Self
 
 from lidarslam.compare.methods.names import Method, parse_method
-from lidarslam.compare.plan import RECORDINGS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError
@@ -22,6 +21,7 @@ from lidarslam.evaluation.comparison.table import TableCell, TableRow
 from lidarslam.simulation.recording.folder import README, REFERENCE_MAP
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.storage.comparison_folder import RECORDINGS
 
 
 class _Model(BaseModel):
@@ -96,6 +96,9 @@ class Benchmark(_Model):
         names = [recording.name for recording in self.recordings]
         if None in names or len({*names}) < len(names):
             raise ValueError("a recording has no name, or two have the same name")
+        methods = [method if isinstance(method, str) else method.name for method in self.methods]
+        if len({*methods}) < len(methods):
+            raise ValueError("two methods have the same name")
         for recording in self.recordings:
             if (recording.source is None) == (recording.simulate is None):
                 raise ValueError(f"recording {recording.name}: give either source or simulate")

@@ -8,7 +8,7 @@ from pathlib import Path
 from lidarslam.compare.methods.process import MethodRun
 from lidarslam.compare.methods.run import COMMAND, finished_before, obstacle, run_method
 from lidarslam.compare.metrics import measure
-from lidarslam.compare.plan import REPORT_HTML, REPORT_MD, PlannedRecording, make_plan
+from lidarslam.compare.plan import PlannedRecording, make_plan
 from lidarslam.compare.request import CompareRequest
 from lidarslam.compare.side_by_side import run_side_by_side
 from lidarslam.compare.text import format_result
@@ -18,7 +18,7 @@ from lidarslam.core.text.plain_text import count
 from lidarslam.evaluation.comparison.comparison import Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.mean_table import mean_table
 from lidarslam.run.summary.machine import machine, versions
-from lidarslam.storage.comparison_folder import COMPARISON
+from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
 from lidarslam.storage.directory import RunDirectory
 
 _INTERRUPTED = "the comparison was interrupted before its turn"

@@ -12,7 +12,6 @@ from pathlib import Path
 from lidarslam.compare.assessment.inputs import truth_of_run
 from lidarslam.compare.comparison import CompareOutcome, Narrator, compare
 from lidarslam.compare.methods.names import parse_methods
-from lidarslam.compare.plan import REPORT_HTML
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.compare.text import format_comparison
 from lidarslam.config.settings import ViewerConfig
@@ -20,6 +19,7 @@ from lidarslam.core.text.plain_text import as_typed, command_line
 from lidarslam.run.progress import show_count
 from lidarslam.simulation.recording.record import record
 from lidarslam.simulation.recording.request import RecordRequest
+from lidarslam.storage.comparison_folder import REPORT_HTML
 from lidarslam.storage.finished_run import load_run
 from lidarslam.viewer.drawn_runs import load_drawn_runs
 from lidarslam.viewer.picture import draw_runs, save_picture

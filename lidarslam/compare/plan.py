@@ -8,17 +8,13 @@ from lidarslam.compare.methods.run import PROCESS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.comparison.comparison import MissingRecording
 from lidarslam.run.request import RunRequest
 from lidarslam.storage import directory as files
-from lidarslam.storage.comparison_folder import COMPARISON
-
-# In the comparison's folder; each recording's folder holds its own comparison.json.
-REPORT_HTML, REPORT_MD = "report.html", "report.md"
-# Beside the recordings' folders: recordings that a benchmark has made.
-RECORDINGS = "recordings"
+from lidarslam.storage.comparison_folder import COMPARISON, RESERVED
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +58,9 @@ def _plan_recording(request: CompareRequest, entry: RecordingEntry, source: Path
     if not len(recording):
         raise InputError(f"{source}: holds no scan")
     _check_entry(request, entry)
-    name = (entry.name or recording.name).replace("/", "-").lstrip(".") or "recording"
+    name = entry.name or safe_name(recording.name)
     candidates = [name, *(f"{name}-{number}" for number in range(2, len(taken) + 3))]
-    name = next(candidate for candidate in candidates if candidate not in taken | {RECORDINGS})
+    name = next(candidate for candidate in candidates if candidate not in taken | RESERVED)
     runs = []
     for method in request.methods:
         config = load_config(request.config_file, [*settings, *method.settings])

@@ -9,7 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from lidarslam.compare.methods.names import Method
 from lidarslam.compare.supervised import Limits
 from lidarslam.core.tasks.tasks import SERIAL, Where
+from lidarslam.core.text.names import require_name
 from lidarslam.evaluation.comparison.mean_table import TablePlan
+from lidarslam.storage.comparison_folder import RESERVED
 
 
 class Simulated(BaseModel):
@@ -44,6 +46,10 @@ class RecordingEntry:
     reference: str | None = None  # a method's name or a TUM file; None: the ground truth
     reference_map: Path | None = None  # a point cloud; None: the map that a simulated recording came with
     simulate: Simulated | None = None  # how it is made when it is not there
+
+    def __post_init__(self) -> None:
+        if self.name is not None:
+            require_name(self.name, "recording", RESERVED)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from typing import Literal
 
 import psutil
 
+from lidarslam.core.files import open_own
+
 # Between two looks at the memory; a look costs a millisecond or two of a core.
 _PERIOD_S = 0.2
 # For an interrupted command to write its results.
@@ -57,7 +59,7 @@ def supervise(
     """
     started = time.monotonic()
     with (
-        log.open("wb") as stderr,
+        open_own(log, anew=True) as stderr,
         subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,

@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from lidarslam.compare.plan import REPORT_HTML, REPORT_MD
 from lidarslam.core.text.plain_text import as_typed, command_line, joined
 from lidarslam.evaluation.comparison.comparison import WHOLE, Comparison, MethodResult, SequenceComparison
 from lidarslam.evaluation.comparison.quantities import QUANTITIES
 from lidarslam.evaluation.comparison.table import Table, TableCell, TableColumn, TableRow, number_text
 from lidarslam.evaluation.trajectory.drift import SHORT_LENGTHS_M
-from lidarslam.storage.comparison_folder import COMPARISON
+from lidarslam.storage.comparison_folder import COMPARISON, REPORT_HTML, REPORT_MD
 
 _BEST = "*"
 # Columns without a value are left out.

@@ -33,7 +33,12 @@ class YamlError(ConfigError):
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one."""
+    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one, and texts with NUL."""
+
+    def construct_scalar(self, node: Any) -> Any:
+        if "\0" in node.value:
+            raise yaml.constructor.ConstructorError(None, None, "a text has a NUL character", node.start_mark)
+        return super().construct_scalar(node)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         seen: set[Hashable] = set()

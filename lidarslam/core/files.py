@@ -4,9 +4,11 @@ import contextlib
 import errno
 import fcntl
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from lidarslam.core.errors import OutputError
 
@@ -66,6 +68,48 @@ def make_directory(path: Path) -> None:
         raise OutputError(f"{path}: a file is in the way; name another directory") from error
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def open_own(path: Path, anew: bool = False) -> BinaryIO:
+    """Open a file of this program for reading and writing, or make it; what a link leads to is never written.
+
+    Args:
+        path: the file, in a folder of this program.
+        anew: whether whatever lies there is replaced by an empty file.
+
+    Raises:
+        OutputError: it is a link, has a second name elsewhere (a hard link), or is no ordinary file.
+        OSError: it cannot be made.
+    """
+    if anew:
+        path.unlink(missing_ok=True)
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | (os.O_EXCL if anew else 0)
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise _linked(path) from None
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(descriptor)
+        raise _linked(path)
+    return os.fdopen(descriptor, "r+b")
+
+
+def make_own_folder(path: Path) -> None:
+    """Make a folder in a directory of results, unless it exists; a link there is replaced, not followed.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    if path.is_symlink():
+        path.unlink()
+    path.mkdir(exist_ok=True)
+
+
+def _linked(path: Path) -> OutputError:
+    return OutputError(f"{path}: is a link to a file elsewhere, or no ordinary file; remove it, or begin again")
 
 
 @contextlib.contextmanager

@@ -2,13 +2,14 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from typing_extensions import Self
 
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.state.values import ANY_NUMBER, Shape, Within
 from lidarslam.core.trajectory import Trajectory
 
 # No LiDAR reaches farther; what lies beyond is a driver's marker or a damaged file.
@@ -53,15 +54,17 @@ class PointAttributes:
 class Scan:
     """One sweep, in the LiDAR frame (x forward, z up)."""
 
-    points: FloatArray  # (N, 3) float64, metres, finite, none at the origin
+    points: Annotated[FloatArray, Shape(None, 3)]  # (N, 3) float64, metres, finite, none at the origin
     stamp: float  # seconds; the instant the scan's pose belongs to
     # (N,) float64, seconds from the stamp at which each point was measured; None when unknown or when the points are
     # already motion compensated to the stamp
-    time_offsets: FloatArray | None = None
-    rings: NDArray[np.int32] | None = None  # (N,) int32, the laser each point came from; None when unknown
+    time_offsets: Annotated[FloatArray, Shape(None)] | None = None
+    # (N,) int32, the laser each point came from; None when unknown
+    rings: Annotated[NDArray[np.int32], Shape(None), Within(0, _MOST_RINGS - 1)] | None = None
     dropped: int = 0  # how many points of the raw sweep were left out as invalid
-    intensities: NDArray[np.float32] | None = None  # (N,) as recorded, on whatever scale; None when unknown
-    colours: NDArray[np.uint8] | None = None  # (N, 3) red, green, blue; None when unknown
+    # (N,) as recorded, on whatever scale; None when unknown
+    intensities: Annotated[NDArray[np.float32], Shape(None), ANY_NUMBER] | None = None
+    colours: Annotated[NDArray[np.uint8], Shape(None, 3)] | None = None  # (N, 3) red, green, blue; None when unknown
     untimed: int = 0  # how many points had no time of their own and got one between those of their neighbours
 
     def __post_init__(self) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.exports.grid_files import write_grid
 from lidarslam.mapping.global_map.products.occupancy_grid import FREE, OCCUPIED, GridOptions, occupancy_grid
-from lidarslam.storage.finished_run import load_map, read_summary, read_trajectory
+from lidarslam.storage.finished_run import load_map, read_trajectory
+from lidarslam.storage.summary_file import read_summary
 
 _FINEST_M = 0.05
 
@@ -30,7 +31,7 @@ def export_grid(run: Path, out: Path, resolution_m: float | None, options: dict[
     if not len(cloud):
         raise InputError(f"{run}: has no map")
     voxel = read_summary(run).get("map_voxel_size_m")
-    chosen = resolution_m or max(_FINEST_M, round(voxel, 2) if isinstance(voxel, int | float) else 0.0)
+    chosen = resolution_m or max(_FINEST_M, round(voxel or 0.0, 2))
     try:
         grid = occupancy_grid(
             cloud.points, cloud.normals, trajectory.positions, GridOptions(resolution_m=chosen, **options)

@@ -9,7 +9,8 @@ from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import cannot_write, make_directory, replacing
 from lidarslam.exports.glb import write_glb
 from lidarslam.mapping.global_map.products.mesh import Mesh, reconstruct
-from lidarslam.storage.finished_run import load_map, read_summary
+from lidarslam.storage.finished_run import load_map
+from lidarslam.storage.summary_file import read_summary
 
 SUFFIXES = (".ply", ".obj", ".glb")
 _DEFAULT_CELL_M = 0.1
@@ -31,7 +32,7 @@ def export_mesh(run: Path, out: Path, cell_m: float | None) -> Iterator[str]:
     if not len(cloud):
         raise InputError(f"{run}: has no map")
     voxel = read_summary(run).get("map_voxel_size_m")
-    mesh = reconstruct(cloud, cell_m or (2.0 * voxel if isinstance(voxel, int | float) else _DEFAULT_CELL_M))
+    mesh = reconstruct(cloud, cell_m or (2.0 * voxel if voxel else _DEFAULT_CELL_M))
     if not len(mesh.triangles):
         raise InputError(f"{run}: no surface comes of the {len(cloud):,} points of its map")
     _write(out, mesh)

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
-from lidarslam.core.errors import InputError
+from lidarslam.config.yaml_text import read_yaml
+from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.storage import directory as files
 
@@ -32,14 +31,14 @@ def read_source(run: Path, purpose: str) -> RunSource:
     """
     file = run / files.CONFIG
     try:
-        content: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content = read_yaml(file)
         about, reader = content[files.RUN_SECTION], content.get("reader") or {}
         path, stop = Path(about["source"]), about.get("stop")
         start, step = int(about.get("start", 0)), int(about.get("step", 1))
         # Of another version's settings, those that are known here.
         known = {key: value for key, value in reader.items() if key in ReaderConfig.model_fields}
         source = RunSource(path, ReaderConfig(**known), start, None if stop is None else int(stop), step)
-    except (OSError, yaml.YAMLError, ValidationError, AttributeError, KeyError, TypeError, ValueError):
+    except (ConfigError, ValidationError, AttributeError, KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f"{file}: does not name the recording of the run, which {purpose}") from None
     if not path.exists():
         raise InputError(f"{path}: is not there any more; the run's recording {purpose}")

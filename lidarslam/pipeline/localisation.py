@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Saved, Shape, State, Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.prediction import Prior
@@ -54,7 +54,7 @@ class OdometryAlone(Stateful):
     """Chains the odometry, and checks that each scan fits the previous one."""
 
     _check: ConsistencyCheck
-    _T_odom_lidar: Annotated[FloatArray, Shape(4, 4)]
+    _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
 
     surfel_mapper: ClassVar[None] = None
 
@@ -96,8 +96,8 @@ class ScanToMap(Stateful):
 
     _mapper: Mapper
     _inertial: Inertial | None
-    _T_odom_lidar: Annotated[FloatArray, Shape(4, 4)]
-    _T_world_last: Annotated[FloatArray, Shape(4, 4)]
+    _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
+    _T_world_last: Annotated[FloatArray, TRANSFORM]
 
     def __init__(self, mapper: Mapper, inertial: Inertial | None = None) -> None:
         self._mapper = mapper

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import PointAttributes, Scan
-from lidarslam.core.state.stateful import Saved, Shape, Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Saved, Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, voxel_size_for
@@ -28,7 +28,7 @@ class PendingScan:
     thinned: Scan  # its points within the map's range, one a voxel, as read
     motion: SweepMotion  # the motion it was deskewed with
     points: Annotated[FloatArray, Shape(None, 3)]  # of those, deskewed, in the LiDAR frame at the stamp
-    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]
 
     def __post_init__(self) -> None:
         if len(self.points) != len(self.thinned):
@@ -69,6 +69,21 @@ class MapBuilder(Stateful):
         """
         self.global_map = self._new_map(1.0) if saved.has("global_map") else None
         super().restore(saved)
+
+    def _after_restore(self) -> None:
+        pending = -1 if self._pending is None else self._pending.number
+        numbers = [*self.views.numbers, *self.slides.numbers, pending]
+        if max(numbers) >= self._scans:
+            raise ValueError(f"scan {max(numbers)} is kept of {self._scans} scans")
+        sizes = {self.voxel_size_m, self._config.voxel_size_m or self.voxel_size_m}
+        drawn, most = self.global_map, self._config.most_points
+        if drawn is not None and ({*sizes, drawn.voxel_size_m} != {drawn.voxel_size_m} or drawn.most_points != most):
+            raise ValueError(f"a map of other voxels, of {drawn.voxel_size_m:g} m")
+
+    @property
+    def scans(self) -> int:
+        """How many came."""
+        return self._scans
 
     def _new_map(self, voxel_size_m: float) -> GlobalMap:
         return GlobalMap(voxel_size_m, self._config.most_points, self._store)

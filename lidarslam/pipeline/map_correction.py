@@ -38,6 +38,10 @@ class MapCorrection(Stateful):
         self._waiting = []
         self._drawing: deque[tuple[int, Future[SurfelMap | None]]] = deque()
 
+    def _after_restore(self) -> None:
+        if self._registered != self._followed or any(drawn.scan > self._followed for drawn in self._waiting):
+            raise ValueError(f"{self._registered} scans were registered, the graph has {self._followed}")
+
     def state(self) -> State:
         """With the maps that wait; the graph must be at rest."""
         self._collect(self._followed)

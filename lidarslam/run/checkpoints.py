@@ -97,6 +97,9 @@ class Checkpoints:
             pipeline.restore(saved.part("pipeline"))
             if pipeline.held is None:
                 raise saved.refuse("no scan is held")
+            graph = len(self._log) if self._graph is None else len(self._graph.scan_poses)
+            if not len(self._log) == pipeline.map.scans == graph:
+                raise saved.refuse(f"{len(self._log)} scans in the log, {pipeline.map.scans} in the map, {graph} poses")
             scans = scans_left(scans, pipeline.held.scan, self._odometry, saved)
         self._unfinished.begin(len(self._log))
         self._warn_of_resuming(saved is None, is_recorded)

@@ -18,6 +18,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
+from lidarslam.storage.summary_file import read_summary
 from lidarslam.storage.unfinished import About
 
 logger = logging.getLogger(__name__)
@@ -55,9 +56,9 @@ def lost_when_finished(request: RunRequest) -> bool | None:
         tree = read_yaml(out / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         was = Config.model_validate(tree).model_dump(exclude=_WITHOUT_EFFECT)
-        summary = json.loads((out / files.SUMMARY).read_text(encoding="utf-8"))
-        lost = int(summary["lost_scans"]) > 0 or len(summary.get("map_contradictions", [])) > 0
-    except (ConfigError, OSError, KeyError, TypeError, ValueError):
+        summary = read_summary(out)
+        lost = summary["lost_scans"] > 0 or len(summary.get("map_contradictions", [])) > 0
+    except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
     if was_run != describe_run(request) or was != request.config.model_dump(exclude=_WITHOUT_EFFECT):
         raise InputError(f"{out}: holds another finished run; name another directory, or replace it with --overwrite")

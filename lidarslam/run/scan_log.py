@@ -171,6 +171,11 @@ class ScanLog(Stateful):
             raise saved.unfit(f"{len(self.messages)} rows of the log", rows)
         if (rows["status"] >= len(_STATUSES)).any():
             raise saved.refuse("unknown status")
+        finite = all(np.isfinite(rows[name]).all() for name in ("stamp", "T_world_lidar", "T_odom_lidar", "stage_ms"))
+        if not finite or min(rows[name].min(initial=0) for name in ("points", "points_dropped", "points_used")) < 0:
+            raise saved.refuse("poses that are not finite, or fewer than no points")
+        if (np.diff(rows["stamp"]) <= 0.0).any():
+            raise saved.refuse("stamps do not increase")
         self._rows = bytearray(rows.tobytes())
 
     def _table(self) -> NDArray[np.void]:

@@ -1,12 +1,38 @@
-"""The runs in the folder of a comparison."""
+"""The folder of a comparison: its files, the recordings' folders, and in these the runs, one a method."""
 
-import json
 from pathlib import Path
 
-from lidarslam.core.errors import InputError
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
+
+from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.text.json_text import read_json
+from lidarslam.core.text.names import require_name
 from lidarslam.storage.directory import TRAJECTORY_TUM
 
-COMPARISON = "comparison.json"
+# Each recording's folder holds its own comparison.json, where there are several.
+COMPARISON, REPORT_HTML, REPORT_MD = "comparison.json", "report.html", "report.md"
+# Beside the recordings' folders: recordings that a benchmark has made.
+RECORDINGS = "recordings"
+RESERVED = frozenset({COMPARISON, REPORT_HTML, REPORT_MD, RECORDINGS})
+
+
+class _Sequence(TypedDict):
+    sequence: str
+
+
+class _Method(TypedDict):
+    run: str | None
+
+
+class _Comparison(TypedDict, total=False):
+    """What is read back: of one recording, or of several."""
+
+    methods: dict[str, _Method]
+    sequences: list[_Sequence] | None
+
+
+_SHAPE = TypeAdapter(_Comparison)
 
 
 def run_directories(path: Path) -> list[Path]:
@@ -19,15 +45,20 @@ def run_directories(path: Path) -> list[Path]:
     if not file.is_file() or (path / TRAJECTORY_TUM).is_file():
         return [path]
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file, _SHAPE)
         sequences = content.get("sequences")
         if sequences is not None:
             names = ", ".join(str(path / sequence["sequence"]) for sequence in sequences)
             raise InputError(f"{path}: compares several recordings, in worlds of their own; name one of {names}")
-        runs = [Path(method["run"]) for method in content["methods"].values() if method["run"]]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        runs = [_run(method["run"]) for method in content["methods"].values() if method["run"]]
+    except (OSError, ValueError, KeyError, ConfigError) as error:
         raise InputError(f"{file}: not a comparison ({error!r}); make it again") from error
     if not runs:
         raise InputError(f"{path}: none of its methods came to a result")
     # Beside its methods' folders, or, of one of several recordings, in the same folder as these.
     return [path / run if (path / run).is_dir() else path.parent / run for run in runs]
+
+
+def _run(place: str) -> Path:
+    """A recording's name and a method's; a comparison names no runs elsewhere."""
+    return Path(*(require_name(part, "run") for part in place.split("/")))

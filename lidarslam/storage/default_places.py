@@ -6,6 +6,7 @@ from itertools import count
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.published.evalio_names import full_name, is_of_evalio, resolved
 from lidarslam.datasets.registry import takes_sequence
 from lidarslam.storage.directory import TRAJECTORY_TUM
@@ -19,7 +20,7 @@ _TIMED = re.compile(r"_\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d(-\d+)?$")
 
 def new_place(folder: Path, name: str) -> Path:
     """A path that does not exist yet: FOLDER/NAME_TIME, with the local time; a number follows where it is taken."""
-    first = folder / f"{name}_{datetime.now():{_TIME}}"
+    first = folder / f"{safe_name(name)}_{datetime.now():{_TIME}}"
     numbered = (first.with_name(f"{first.name}-{number}") for number in count(2))
     return first if not first.exists() else next(path for path in numbered if not path.exists())
 
@@ -31,10 +32,10 @@ def source_name(source: Path, sequence: str | None = None) -> str:
     """
     source = resolved(source)
     if is_of_evalio(source):
-        return full_name(source).replace("/", "_")
-    name = _TIMED.sub("", source.name if source.is_dir() else source.stem) or "recording"
+        return safe_name(full_name(source))
+    name = _TIMED.sub("", source.name if source.is_dir() else source.stem)
     chooses = sequence not in (None, source.name) and takes_sequence(source)
-    return f"{name}_{sequence}".replace("/", "_") if chooses else name
+    return safe_name(f"{name}_{sequence}" if chooses else name)
 
 
 def latest_run() -> Path | None:

@@ -141,14 +141,14 @@ class RunDirectory:
     def _remove_stale(self) -> None:
         """Remove what is left of the earlier run."""
         for name in self._stale:
-            (self.path / name).unlink(missing_ok=True)
+            _unlink(self.path, name)
         _remove_empty(self.path)
 
     def _discard_unless_run(self) -> None:
         """Remove files that no config.yaml describes: they would be in the way of the next attempt."""
         if not _is_run(self.path):
             for name in self._written:
-                (self.path / name).unlink(missing_ok=True)
+                _unlink(self.path, name)
             _remove_empty(self.path)
 
 
@@ -166,6 +166,12 @@ def tile_names(path: Path) -> list[str]:
         return []
     tiles = sorted(f"{MAP_TILES}/{file.name}" for file in folder.iterdir() if _TILE.fullmatch(file.name))
     return [*([MAP_INDEX] if (path / MAP_INDEX).exists() else []), *tiles]
+
+
+def _unlink(path: Path, name: str) -> None:
+    """Remove a file of a run, or the link in place of its folder."""
+    top = path / Path(name).parts[0]
+    (top if top.is_symlink() else path / name).unlink(missing_ok=True)
 
 
 def _remove_empty(path: Path) -> None:

@@ -1,11 +1,9 @@
 """Runs read back from disk."""
 
 import csv
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +22,7 @@ from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
 from lidarslam.storage.not_a_run import not_a_run
+from lidarslam.storage.summary_file import read_summary
 from lidarslam.storage.unfinished import require_whole
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
@@ -63,8 +62,7 @@ def localised_in(path: Path) -> Path | None:
         InputError: its summary is damaged.
     """
     about = read_summary(path).get("localisation") if path.is_dir() else None
-    place = about.get("map") if isinstance(about, dict) else None
-    return Path(place) if isinstance(place, str) else None
+    return None if about is None else Path(about["map"])
 
 
 def is_run(path: Path) -> bool:
@@ -153,32 +151,11 @@ def _attributes(table: NDArray[np.void]) -> PointAttributes:
     )
 
 
-def read_summary(path: Path) -> dict[str, Any]:
-    """The content of a run's summary.json, empty when there is none.
-
-    Raises:
-        InputError: it is damaged.
-    """
-    file = path / files.SUMMARY
-    if not file.is_file():
-        return {}
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(content, dict):
-            raise ValueError(f"expected keys and values, got a {type(content).__name__}")
-    except (OSError, ValueError, RecursionError) as error:
-        raise _damaged(file, "a run's summary", error) from error
-    return content
-
-
 def _loops(path: Path, scans: int) -> NDArray[np.intp]:
     """The loops that a run closed; none for a run without a graph."""
-    try:
-        loops = (read_summary(path).get("pose_graph") or {"loops": []})["loops"]
-        pairs = [(loop["first_scan"], loop["second_scan"]) for loop in loops if loop["accepted"]]
-        found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise _damaged(path / files.SUMMARY, "a run's summary", error) from error
+    loops = (read_summary(path).get("pose_graph") or {"loops": []})["loops"]
+    pairs = [(loop["first_scan"], loop["second_scan"]) for loop in loops if loop["accepted"]]
+    found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
     return found[((found >= 0) & (found < scans)).all(axis=1)]
 
 

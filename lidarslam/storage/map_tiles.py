@@ -3,7 +3,7 @@
 from typing import Any
 
 from lidarslam.core.errors import OutputError
-from lidarslam.core.files import cannot_write
+from lidarslam.core.files import cannot_write, make_own_folder
 from lidarslam.mapping.global_map.drawing import TiledMap
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
@@ -55,10 +55,8 @@ class TileWriter:
     def _begin(self) -> None:
         folder = self._directory.path / MAP_TILES
         try:
-            if folder.is_symlink():
-                folder.unlink()
+            make_own_folder(folder)
             (self._directory.path / MAP_INDEX).unlink(missing_ok=True)  # first: tiles of an earlier run are replaced
-            folder.mkdir(exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
             raise OutputError(f"{folder}: a file is in the way; name another directory") from error
         except OSError as error:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.text.json_text import ANY_OBJECT, parse_json
 
 # An .npz file holds a checksum of each of its members, and is refused without its end.
 _TREE, _ARRAY = "tree", "array"
 _DAMAGE = (
-    OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error,
-    MemoryError, OverflowError,  # a damaged shape
+    OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, NotImplementedError, RuntimeError,
+    zipfile.BadZipFile, zlib.error, MemoryError, OverflowError,  # a damaged shape
 )  # fmt: skip
 
 
@@ -46,7 +47,7 @@ def read_state(path: Path) -> Saved:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            values = _decoded(json.loads(bytes(file[_TREE])), file)
+            values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT), file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except _DAMAGE as error:

@@ -7,9 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ConfigDict, NonNegativeInt, TypeAdapter, with_config
+from typing_extensions import TypedDict
+
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
+from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files, replacing
 from lidarslam.core.state.stateful import Saved
+from lidarslam.core.text.json_text import read_json
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
 
@@ -18,6 +22,24 @@ _SUBMAPS, _TILES = "submaps.bin", "tiles.bin"
 _LISTED = 3
 
 Standing = Literal["at work", "stopped"]
+
+
+@with_config(ConfigDict(extra="allow"))
+class _Description(TypedDict, total=False):
+    source: str
+    reader: dict[str, Any]
+    merge: Literal["all", "part"]
+    sources: list[str]
+    parts: list[str]
+
+
+class _About(TypedDict):
+    description: _Description
+    standing: Standing
+    resumed_after: list[NonNegativeInt]
+
+
+_SHAPE = TypeAdapter(_About)
 
 
 @dataclass(frozen=True)
@@ -37,12 +59,11 @@ class About:
         """
         path = run / ABOUT
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            standing: Standing = "stopped" if values["standing"] == "stopped" else "at work"
-            return cls(dict(values["description"]), standing, tuple(map(int, values["resumed_after"])))
+            values = read_json(path, _SHAPE)
+            return cls({**values["description"]}, values["standing"], tuple(values["resumed_after"]))
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(f"{path}: is damaged ({error}); begin again with --overwrite") from error
 
     def write(self, run: Path) -> None:
@@ -65,7 +86,7 @@ class About:
                 f"this run did not finish; resume it with lidarslam run {source} --out {run} --resume"
                 " and the options it was begun with"
             )
-        sources = " ".join(map(str, self.description.get("sources", ["SOURCE..."])))
+        sources = " ".join(self.description.get("sources", ["SOURCE..."]))
         out = run if self.description["merge"] == "all" else run.parent
         return (
             f"this merge did not finish; make it again with lidarslam merge {sources} --out {out} --overwrite"
@@ -127,6 +148,8 @@ class Unfinished:
             OutputError: the folder cannot be written.
         """
         run = directory.path
+        if resume and (run / UNFINISHED).is_symlink():
+            raise InputError(f"{run / UNFINISHED}: is a link to another place; begin again with --overwrite")
         about = About.read(run) if resume else None
         if resume and about is None:
             raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
@@ -134,7 +157,7 @@ class Unfinished:
             _require_same(run, about.description, description)
         unfinished = cls(run, about or About(description), resume)
         try:
-            unfinished._folder.mkdir(exist_ok=True)
+            make_own_folder(unfinished._folder)
         except OSError as error:
             raise cannot_write(unfinished._folder, error) from error
         for folder in (run, unfinished._folder):
@@ -165,6 +188,9 @@ class Unfinished:
             self._remove()
 
     def _remove(self) -> None:
+        if self._folder.is_symlink():  # what it leads to is not ours
+            self._folder.unlink()
+            return
         (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are nothing
         self._remove_files()
         with contextlib.suppress(OSError):  # another file lies there

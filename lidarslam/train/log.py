@@ -2,10 +2,13 @@
 
 import csv
 from collections.abc import Mapping
+from io import SEEK_END, TextIOWrapper
 from pathlib import Path
 
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from lidarslam.core.errors import InputError
+from lidarslam.core.files import make_own_folder, open_own
 from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
 
@@ -17,6 +20,7 @@ class TrainingLog:
         self._out = out
         for name in (files.LOSSES, files.VALIDATION):
             _cut(out / name, step)
+        make_own_folder(out / files.CURVES)
         self._curves = SummaryWriter(str(out / files.CURVES), purge_step=step + 1 if step else None)
 
     def losses(self, step: int, row: Mapping[str, float]) -> None:
@@ -42,10 +46,9 @@ class TrainingLog:
 
 
 def _append(path: Path, row: Mapping[str, object]) -> None:
-    is_new = not path.exists()
-    with path.open("a", encoding="utf-8", newline="") as file:
+    with TextIOWrapper(open_own(path), encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(row))
-        if is_new:
+        if file.seek(0, SEEK_END) == 0:
             writer.writeheader()
         writer.writerow(row)
 
@@ -54,8 +57,11 @@ def _cut(path: Path, step: int) -> None:
     """Keep the lines up to a step."""
     if not path.exists():
         return
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: is damaged ({error!r}); remove it, or begin again with --overwrite") from error
     path.unlink()
     for row in rows:
         _append(path, row)

@@ -164,7 +164,7 @@ class TrainingLoop:
                 # Without anything to compare with, the last is as good as any.
                 is_best = not result.pairs or progress.best is None or score(result) < progress.best
                 if is_best:
-                    progress.best = score(result)
+                    progress.best = score(result) if result.pairs else None
                     self._save_weights(files.WEIGHTS, result if result.pairs else None)
                 self._say(format_validation(progress.step, result, is_best))
             else:

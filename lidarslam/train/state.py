@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor, nn
 
 from lidarslam.core.errors import InputError
@@ -22,6 +23,9 @@ class Progress:
     sums: dict[str, float] = field(default_factory=dict)  # of each part of the loss since the last line of the log
     counted: int = 0  # over how many steps
     data: str = ""  # digest of the recordings
+
+
+_SHAPE = TypeAdapter(Progress)
 
 
 def save_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
@@ -43,19 +47,31 @@ def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer)
         InputError: the file is not usable, or belongs to another network.
     """
     tensors, content = read_tensor_file(path, _KIND)
-    weights, moments = {}, dict[int, dict[str, Tensor]]()
-    for name, tensor in tensors.items():
-        if name.startswith(_NETWORK):
-            weights[name.removeprefix(_NETWORK)] = tensor
-        else:
-            number, key = name.removeprefix(_OPTIMIZER).split("/")
-            moments.setdefault(int(number), {})[key] = tensor
     try:
+        weights = _below(tensors, _NETWORK)
+        moments = _moments(_below(tensors, _OPTIMIZER), list(network.parameters()))
+        if damaged := next((name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())), None):
+            raise ValueError(f"{damaged} is not finite")
         network.load_state_dict(weights)
-    except RuntimeError as error:
+        optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+        return _SHAPE.validate_python(content)
+    except (RuntimeError, ValueError, KeyError, IndexError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"{path}: does not belong to this network; go on with the configuration it was begun with ({reason[:200]})"
         ) from error
-    optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-    return Progress(**{name: content[name] for name in vars(Progress()) if name in content})
+
+
+def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def _moments(tensors: dict[str, Tensor], parameters: list[nn.Parameter]) -> dict[int, dict[str, Tensor]]:
+    """The moments of each parameter by its number: of its shape, or a number of steps."""
+    moments = dict[int, dict[str, Tensor]]()
+    for name, tensor in tensors.items():
+        number, _, key = name.partition("/")
+        if not number.isdecimal() or tensor.shape not in (torch.Size(), parameters[int(number)].shape):
+            raise ValueError(f"{name} has the shape {tuple(tensor.shape)}")
+        moments.setdefault(int(number), {})[key] = tensor
+    return moments

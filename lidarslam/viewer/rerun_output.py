@@ -13,7 +13,13 @@ from lidarslam.core.files import cannot_write, replacing
 from lidarslam.core.text.plain_text import one_line
 from lidarslam.viewer import rerun_environment
 from lidarslam.viewer.rerun_program import GRPC_PORT, open_window, require_window
-from lidarslam.viewer.rerun_recording import FLUSH_S, OPEN_FILES, IncompleteRecordingError, rerun_recording
+from lidarslam.viewer.rerun_recording import (
+    FLUSH_S,
+    OPEN_FILES,
+    IncompleteRecordingError,
+    require_complete,
+    rerun_recording,
+)  # fmt: skip
 from lidarslam.viewer.web_page import WebPage
 
 _INSTEAD = "write a file with --save FILE.rrd, or use --web"
@@ -98,8 +104,14 @@ def show_file_on_page(path: Path, page: WebPage) -> None:
 
 
 def _require_recording(path: Path) -> None:
-    if not path.exists():
+    if not path.is_file():
         raise InputError(f"{path}: no such file")
-    with path.open("rb") as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise InputError(f"{path}: not a Rerun recording, or of a version before 0.20; make it again")
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise InputError(f"{path}: not a Rerun recording, or of a version before 0.20; make it again")
+        require_complete(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except IncompleteRecordingError:
+        raise InputError(f"{path}: is cut off, or of an earlier version of Rerun; make it again") from None

@@ -85,6 +85,13 @@ class GlobalMap(Stateful):
         self._after_restore()
 
     def _after_restore(self) -> None:
+        if not self.voxel_size_m > 0.0:
+            raise ValueError(f"voxels of {self.voxel_size_m:g} m")
+        self._merged.require_sorted()
+        for part in self._pending:
+            part.require_sums()
+        if self._store is not None:
+            self._store.require_tiling(self.tiling)
         self._pending_size = sum(len(part.keys) for part in self._pending)
         self._lock = threading.Lock()  # a viewer may look while a scan is added
 
@@ -116,9 +123,8 @@ class GlobalMap(Stateful):
         world = transform_points(T_world_map, means_points(means))
         sums = means.rows.copy()
         keys = point_keys(world, self.voxel_size_m)
-        sums[:, POSITION] = (
-            world - key_cells(keys) * self.voxel_size_m
-        )  # within the voxel, where float32 is exact enough
+        # Within the voxel float32 is exact enough.
+        sums[:, POSITION] = world - key_cells(keys) * self.voxel_size_m
         sums[:, VIEW] = means.rows[:, VIEW].astype(np.float64) @ T_world_map[:3, :3].T
         sums[:, :COUNT] *= means.rows[:, COUNT, None]
         is_beyond = np.abs(world).max(axis=1, initial=0.0) >= reach_m(self.voxel_size_m)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state.stateful import Shape, Stateful, Within
 from lidarslam.mapping.global_map.visibility_kernels import NO_GAPS, TWO_PI, draw, judge
 
 _ROWS, _COLUMNS = 16, 360
@@ -70,20 +70,26 @@ class Views(Stateful):
     _offered: int
     _grid: Annotated[FloatArray, Shape(3)] | None  # of the first scan with points
     _numbers: list[int]
-    _images: list[Annotated[NDArray[np.float16], Shape(_ROWS, _COLUMNS)]]
+    _images: list[Annotated[NDArray[np.float16], Shape(_ROWS, _COLUMNS), Within(low=0.0)]]
 
     def __init__(self, every: int = _EVERY) -> None:
         self._every, self._offered, self._grid = every, 0, None
         self._numbers, self._images = [], []
 
     def _after_restore(self) -> None:
-        if self._every < 1 or len(self._numbers) != len(self._images):
+        is_sorted = self._numbers == sorted({*self._numbers})
+        if self._every < 1 or not is_sorted or len(self._numbers) != len(self._images):
             raise ValueError(
                 f"{len(self._images)} images of every {self._every}th scan have {len(self._numbers)} numbers"
             )
 
     def __len__(self) -> int:
         return len(self._images)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the scans that the images are of."""
+        return tuple(self._numbers)
 
     def add(self, points: FloatArray, number: int) -> None:
         """Offer the next scan that belongs in the map; one in k becomes an image.

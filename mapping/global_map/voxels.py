@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.state.stateful import ANY_NUMBER, Shape
 from lidarslam.mapping.global_map import kernels
-from lidarslam.mapping.global_map.voxel_rows import Layout
+from lidarslam.mapping.global_map.voxel_rows import COUNT, Layout
 from lidarslam.mapping.surfels.cell_kernels import BITS, OFFSET
 
 _MASK = (1 << BITS) - 1
@@ -17,8 +19,8 @@ _MASK = (1 << BITS) - 1
 class Voxels:
     """Sums over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
 
-    keys: NDArray[np.int64]
-    sums: NDArray[np.float32]
+    keys: Annotated[NDArray[np.int64], Shape(None)]
+    sums: Annotated[NDArray[np.float32], Shape(None, None), ANY_NUMBER]  # the earliest point of none is at infinity
     layout: Layout
 
     def __post_init__(self) -> None:
@@ -27,6 +29,18 @@ class Voxels:
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    def require_sums(self) -> None:
+        """Refuse sums that are not finite, or of no point, with a ValueError."""
+        summed = self.sums[:, : self.layout.summed]
+        if not (np.isfinite(summed).all() and (self.sums[:, COUNT] > 0.0).all()):
+            raise ValueError("the sums of a voxel are not finite, or of no point")
+
+    def require_sorted(self) -> None:
+        """Refuse voxels that are not reduced, with a ValueError."""
+        self.require_sums()
+        if (np.diff(self.keys) <= 0).any():
+            raise ValueError("voxels are not in the order of their keys")
 
     @classmethod
     def join(cls, parts: "Sequence[Voxels]") -> "Voxels":

@@ -73,10 +73,12 @@ class FeatureMap(Stateful):
         return self._search
 
     def _after_restore(self) -> None:
+        if not self._spacing_m > 0.0:
+            raise ValueError(f"voxels of {self._spacing_m:g} m")
         self._keys = point_keys(self.points, self._spacing_m)
         self._search = None
-        if not np.isfinite(self.points).all() or (np.diff(self._keys) <= 0).any():
-            raise ValueError("the points are not finite, or not in the order of their voxels")
+        if (np.diff(self._keys) <= 0).any():
+            raise ValueError("the points are not in the order of their voxels")
 
 
 @dataclass(frozen=True, eq=False)

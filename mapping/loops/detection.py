@@ -51,8 +51,11 @@ class LoopDetector(Stateful):
         self._accepted, self._pending = [], []
 
     def rebuild(self, submaps: Iterable[FloatArray]) -> None:
-        """See `KeyframeDatabase.rebuild`."""
+        """See `KeyframeDatabase.rebuild`; a ValueError refuses closures of other keyframes."""
         self._database.rebuild(submaps)
+        for closure in (*self._accepted, *self._pending):
+            if not 0 <= closure.first < closure.second < len(self._database):
+                raise ValueError(f"a closure of the keyframes {closure.first} and {closure.second}")
 
     def cell_m(self, index: int) -> float:
         """The size of detail that suits a keyframe's submap."""

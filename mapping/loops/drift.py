@@ -6,11 +6,13 @@ consistency: Mangelson et al., ICRA 2018).
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
+from lidarslam.core.state.stateful import Shape, Transforms
 from lidarslam.mapping.loops.closure import RelativePose
 
 # However short the way, poses next to each other are no better than this; radians and metres.
@@ -22,9 +24,10 @@ _LEAST_TRANSLATION_M = 0.02
 class Track:
     """The present estimates of all keyframes."""
 
-    T_world_lidar: FloatArray  # (K, 4, 4)
-    way_m: FloatArray  # (K,) path length from the recording's start
-    segment: NDArray[np.int64]  # (K,) stretch of continuous tracking; the drift model holds within one
+    T_world_lidar: Annotated[FloatArray, Transforms(None)]  # (K, 4, 4)
+    way_m: Annotated[FloatArray, Shape(None)]  # (K,) path length from the recording's start
+    # (K,) stretch of continuous tracking; the drift model holds within one
+    segment: Annotated[NDArray[np.int64], Shape(None)]
     # standard deviations of attitude and position for each metre of the way, radians and metres
     drift_rates: tuple[float, float]
 

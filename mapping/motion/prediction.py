@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, skew
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state.stateful import TRANSFORM, Shape
 from lidarslam.mapping.config import MappingConfig
 
 # Least standard deviations of any pose, rotation first.
@@ -69,7 +69,7 @@ class MotionState:
     """Pose and velocity of a scan with 12 degrees of freedom."""
 
     stamp: float  # seconds
-    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]  # (4, 4) at the stamp
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]  # (4, 4) at the stamp
     velocity: Annotated[FloatArray, Shape(6)]  # (6,) during the sweep, in the LiDAR frame, rotation first
     # (12, 12) of the errors of pose and velocity; the pose's is `xi` in `T_true = T_world_lidar @ exp(xi)`
     covariance: Annotated[FloatArray, Shape(12, 12)]

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.state.stateful import Shape
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.keyframes import Keyframe
 
@@ -18,9 +20,13 @@ class Attitude:
     """Where a keyframe's LiDAR frame has the world's vertical; unit vectors."""
 
     key: int
-    lidar: FloatArray  # (3,) in the keyframe
-    world: FloatArray  # (3,) in the world of its recording
+    lidar: Annotated[FloatArray, Shape(3)]  # (3,) in the keyframe
+    world: Annotated[FloatArray, Shape(3)]  # (3,) in the world of its recording
     sigma: float  # radians
+
+    def __post_init__(self) -> None:
+        if not self.sigma > 0.0:
+            raise ValueError(f"an attitude has the standard deviation {self.sigma:g}")
 
 
 def measured_attitude(

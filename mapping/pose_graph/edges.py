@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
+from lidarslam.core.state.stateful import TRANSFORM, Shape
 from lidarslam.mapping.loops.closure import RelativePose
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 
@@ -28,8 +30,8 @@ _ODOMETRY_CAUTION = 10.0
 class MotionSinceKeyframe:
     """The odometry's motion composed since the last keyframe."""
 
-    T_keyframe_lidar: FloatArray | None  # (4, 4); None once a scan had none
-    covariance: FloatArray  # (6, 6) of it, rotation first
+    T_keyframe_lidar: Annotated[FloatArray, TRANSFORM] | None  # (4, 4); None once a scan had none
+    covariance: Annotated[FloatArray, Shape(6, 6)]  # of it, rotation first
     length_m: float = 0.0  # path length
     lost: bool = False  # whether tracking was lost on the way
 

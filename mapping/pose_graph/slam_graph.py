@@ -12,12 +12,13 @@ in one frame.
 import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import PointAttributes
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Stateful
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.global_map.tile_store import TileStore
@@ -33,6 +34,7 @@ from lidarslam.mapping.pose_graph.laid_submaps import LaidSubmaps, connected_wit
 from lidarslam.mapping.pose_graph.neighbourhoods import REACH, Neighbourhoods
 from lidarslam.mapping.pose_graph.optimizer import optimise, relax
 from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
+from lidarslam.mapping.pose_graph.restored import require_edges, require_rows, require_scans, require_submaps
 from lidarslam.mapping.pose_graph.submap_store import SubmapStore
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
@@ -47,7 +49,7 @@ class SlamGraph(Stateful):
         local_radius_m: of the local map that scans were registered to; 0 without one.
     """
 
-    scan_poses: list[FloatArray]  # as registered, each recording's in its own world
+    scan_poses: list[Annotated[FloatArray, TRANSFORM]]  # as registered, each recording's in its own world
     keyframe_ms: list[float]  # wall time of each keyframe
     _selector: KeyframeSelector
     _store: SubmapStore
@@ -55,7 +57,7 @@ class SlamGraph(Stateful):
     _submap: GlobalMap | None  # of the last keyframe, in its frame
     _first_scans: list[int]
     _keyframes: list[Keyframe]
-    _poses: list[FloatArray]  # of keyframes, as estimated now
+    _poses: list[Annotated[FloatArray, TRANSFORM]]  # of keyframes, as estimated now
     _edges: list[RelativePose]
     _attitudes: list[Attitude]  # of the first recording, whose world they are in
     _closures: list[LoopClosure]
@@ -86,8 +88,10 @@ class SlamGraph(Stateful):
         self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
 
     def _after_restore(self) -> None:
-        if len(self._keyframes) != len(self._poses) or len(self._keyframes) - len(self._store) not in (0, 1):
-            raise ValueError(f"{len(self._keyframes)} keyframes have {len(self._store)} submaps")
+        require_submaps(len(self._keyframes), len(self._poses), len(self._laid), len(self._store))
+        require_scans(self._keyframes, self._first_scans, len(self.scan_poses))
+        require_edges((*self._edges, *self._closures, *self._relaxing.waiting), self._attitudes, len(self._poses))
+        require_rows(self._unrefined, len(self._closures))
         self._detector.rebuild(means_points(self._store[key]) for key in range(len(self._store)))
 
     def begin_recording(self) -> None:

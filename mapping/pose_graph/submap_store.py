@@ -23,6 +23,11 @@ class SubmapStore(BlockFile):
         if len(self._layouts) != len(self):
             raise ValueError(f"{len(self)} submaps have {len(self._layouts)} layouts")
 
+    def _require(self, index: int, block: bytes) -> None:
+        rows = np.frombuffer(block, dtype="<f4").reshape(-1, self._layouts[index].width)
+        if not np.isfinite(rows[:, : self._layouts[index].summed]).all():
+            raise ValueError("a submap is not finite")
+
     def append(self, means: VoxelMeans) -> None:
         """Keep one more.
 

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.slides.scan_surfels import BIN_M, Surfels, shift_profile
 
 # A scan is kept after so many metres or scans, whichever comes first, and paired with the last two.
@@ -42,7 +42,7 @@ class _Kept:
     """A scan that later ones are paired with."""
 
     number: int
-    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]
     surfels: Surfels
 
 
@@ -51,7 +51,7 @@ class _Candidate:
     """The latest scan."""
 
     number: int
-    T_world_lidar: Annotated[FloatArray, Shape(4, 4)]
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]
     points: Annotated[FloatArray, Shape(None, 3)]
 
 
@@ -107,7 +107,7 @@ class SlideCheck(Stateful):
     _latest: _Candidate | None
     _since_due: int
     _due: int
-    _T_due: Annotated[FloatArray, Shape(4, 4)] | None
+    _T_due: Annotated[FloatArray, TRANSFORM] | None
     _rows: list[Annotated[FloatArray, Shape(11 + 2 * _NEAR)]]
 
     def __init__(self) -> None:
@@ -117,6 +117,18 @@ class SlideCheck(Stateful):
         self._due = 0
         self._T_due = None
         self._rows = []
+
+    def _after_restore(self) -> None:
+        numbers = self.tests.numbers
+        if not ((numbers == np.rint(numbers)).all() and (numbers[:, 0] >= 0.0).all()):
+            raise ValueError("the numbers of tested scans are none")
+        if not (numbers[:, 0] < numbers[:, 1]).all():
+            raise ValueError("tested scans are not in order")
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the scans that were kept last."""
+        return tuple(one.number for one in (*self._kept, self._latest) if one is not None)
 
     def add(self, points: FloatArray, number: int, T_world_lidar: FloatArray) -> None:
         """Add the next scan of the map; some are kept and paired with the ones before.

@@ -62,6 +62,9 @@ class SurfelMap(Stateful):
     def _after_restore(self) -> None:
         if len(self._grids) != len(LEVELS):
             raise ValueError(f"{len(self._grids)} grids instead of {len(LEVELS)}")
+        sizes = [grid.cell_m / level for grid, level in zip(self._grids, LEVELS, strict=True)]
+        if not (self._radius_m > 0.0 and np.allclose(sizes, self.cell_m, rtol=1e-9, atol=0.0)):
+            raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")
 
     def reaches(self, sensor: FloatArray, range_m: float) -> bool:
         """Whether there are cells for all points within a range of a position (3,)."""

@@ -1,6 +1,8 @@
 """Archived maps: maps that tracking was lost in, searched now and then for the sensor's return."""
 
-from lidarslam.core.state.stateful import Stateful
+from typing import Annotated
+
+from lidarslam.core.state.stateful import ANY_NUMBER, Stateful
 from lidarslam.mapping.motion.prediction import Prediction
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.attempt import Attempt
@@ -18,7 +20,7 @@ class ArchivedMaps(Stateful):
     """Keeps the first and the last of the maps that were given up."""
 
     _maps: list[SurfelMap]
-    _scans_until_search: int
+    _scans_until_search: Annotated[int, ANY_NUMBER]
     _wait: float
 
     def __init__(self) -> None:

@@ -44,6 +44,10 @@ class Insertion:
     elevations: Annotated[FloatArray, Shape(None)]  # their angles above the sensor's equator, radians
     sensor: Annotated[FloatArray, Shape(3)]  # position in the world
 
+    def __post_init__(self) -> None:
+        if len(self.elevations) != len(self.points):
+            raise ValueError(f"{len(self.elevations)} elevations of {len(self.points)} points")
+
 
 class SurfelMapper(Stateful):
     """Holds the local map and the state of the last scan.
@@ -75,6 +79,11 @@ class SurfelMapper(Stateful):
         self._map = None
         self._last = None
         self._first = None  # while it alone is the map, drawn with a guessed motion
+
+    def _after_restore(self) -> None:
+        numbers = [one.number for one in self._recent]
+        if self._map_since > self._scans or numbers != sorted({*numbers}) or max(numbers, default=0) > self._scans:
+            raise ValueError(f"scans {numbers}, and a map since scan {self._map_since}, of {self._scans} scans")
 
     @property
     def local_map(self) -> SurfelMap | None:

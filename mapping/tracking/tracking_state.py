@@ -1,6 +1,8 @@
 """Tracking state: how certain the sensor's pose is, and therefore how widely the next scan is searched."""
 
-from lidarslam.core.state.stateful import Stateful
+from typing import Annotated
+
+from lidarslam.core.state.stateful import ANY_NUMBER, Stateful
 from lidarslam.core.tracking import Status
 
 # After such a gap between scans the pose is uncertain.
@@ -23,7 +25,7 @@ class TrackingState(Stateful):
     is_lost: bool  # whether the pose of the last scan is unknown
     velocity_known: bool  # whether the velocity of the last scan was estimated
     _was_degraded: bool
-    _to_confirm: int
+    _to_confirm: Annotated[int, ANY_NUMBER]
     _relocalised_s: float | None
     _usual_quality: float
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
 from lidarslam.odometry.images.sweep_images import SweepImages
 
 Twist = Annotated[FloatArray, Shape(6)]
@@ -19,6 +19,10 @@ class SweepMotion:
     velocity: Twist  # (6,) mean, rotation first, in radians and metres a second
     velocity_change: Twist  # (6,) velocity in the later middle above the mean, and in the earlier one below
     interval_s: float  # from one middle to the other
+
+    def __post_init__(self) -> None:
+        if not self.interval_s > 0.0:
+            raise ValueError(f"a motion takes {self.interval_s:g} s")
 
     def pose_after(self, seconds: float) -> FloatArray:
         """(4, 4) in the frame of the earlier middle, so long after it."""
@@ -44,7 +48,7 @@ class StampInterpolator(Stateful):
     """
 
     last: SweepMotion | None
-    _T_middle_stamp: Annotated[FloatArray, Shape(4, 4)]  # of the last scan: from its stamp to the middle of its sweep
+    _T_middle_stamp: Annotated[FloatArray, TRANSFORM]  # of the last scan: from its stamp to the middle of its sweep
 
     def __init__(self) -> None:
         self.forget()

@@ -46,6 +46,8 @@ class SweepImages:
             raise ValueError(
                 f"images of one sweep differ: {self.points.shape}, {self.normals.shape}, {self.offsets.shape}"
             )
+        if not self.low < self.high:
+            raise ValueError(f"elevations must ascend, got {self.low:g} to {self.high:g}")
 
     def median_range_m(self) -> float:
         """Of the points of every fourth column, the lower of the two in the middle; 0 when there are none."""
@@ -105,6 +107,12 @@ class Imager(Stateful):
             raise ValueError(f"{self._alignment_rows} rows are no image")
         if not np.allclose(self._R_image_lidar @ self._R_image_lidar.T, np.eye(3)):
             raise ValueError("the images' axes are no rotation")
+
+    def require(self, images: ScanImages) -> None:
+        """Refuse images that are not of this size, with a ValueError."""
+        for shown, rows in ((images.network, self._config.rows), (images.alignment, self._alignment_rows)):
+            if shown.offsets.shape != (rows, self._config.columns):
+                raise ValueError(f"an image is {shown.offsets.shape}, not {rows} x {self._config.columns}")
 
     def images(self, scan: Scan) -> ScanImages:
         """The scan as images, normals included."""

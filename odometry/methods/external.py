@@ -7,7 +7,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state.stateful import TRANSFORM, Stateful
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.odometry.interface import Motion
 
@@ -31,7 +31,7 @@ class ExternalOdometry(Stateful):
         InputError: the trajectory has fewer than two poses.
     """
 
-    _T_odom_prev: Annotated[FloatArray, Shape(4, 4)] | None  # of the last scan that was covered
+    _T_odom_prev: Annotated[FloatArray, TRANSFORM] | None  # of the last scan that was covered
 
     def __init__(
         self, trajectory: Trajectory, tolerance_s: float = 0.1, largest_interval_s: float | None = None

@@ -77,6 +77,7 @@ class LearnedOdometry(Stateful):
 
     def _after_restore(self) -> None:
         if self._last is not None:
+            self._imager.require(self._last.images)
             shown = self._last.images.network
             self._described = self._search.describe(shown.points, shown.normals, self._last.heading)
 

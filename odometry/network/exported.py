@@ -1,6 +1,5 @@
 """An exported network in ONNX Runtime: inference without torch, which starts at once."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import onnxruntime
 from pydantic import ValidationError
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.text.json_text import ANY_OBJECT, read_json
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.candidates import CorrelationParts, CorrelationSearch, Graph, Search, WholePairs
 
@@ -55,11 +55,11 @@ def read_exported(folder: Path) -> Exported:
         InputError: it holds no exported network, or one of another version.
     """
     try:
-        content = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+        content = read_json(folder / DESCRIPTION, ANY_OBJECT)
         if {key: content[key] for key in _HEADER} != _HEADER:
             raise ValueError("it is of another version")
         network, images = read_description(content)
-    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (OSError, KeyError, ValueError) as error:
         raise InputError(
             f"{folder}: {DESCRIPTION} is missing or damaged ({error}); name a file of weights, or make the folder with"
             " `lidarslam export`"

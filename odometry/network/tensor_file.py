@@ -4,16 +4,19 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field, TypeAdapter, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from lidarslam.core.errors import InputError, OutputError
 from lidarslam.core.files import replacing
+from lidarslam.core.text.json_text import ANY_OBJECT, parse_json
 
 _PROGRAM = "lidarslam"
+_VERSION = TypeAdapter(Annotated[int, Field(ge=0, lt=1 << 31)])
 
 
 @dataclass(frozen=True)
@@ -61,10 +64,13 @@ def read_tensor_file(path: Path, kind: Kind) -> tuple[dict[str, Tensor], dict[st
         found = header.get("kind") if header.get("program") == _PROGRAM else "tensors of another program"
         raise InputError(f"{path}: holds {found}, not {kind.name} that {_PROGRAM} wrote; name another file")
     try:
-        version, content = int(header["version"]), json.loads(header["content"])
-    except (KeyError, ValueError, RecursionError) as error:
+        content = parse_json(header["content"], ANY_OBJECT)
+        version = _VERSION.validate_python(header["version"])
+    except ValidationError:
+        raise InputError(f"{path}: its version is no number; make it again") from None
+    except (KeyError, ValueError) as error:
         raise InputError(f"{path}: its description is damaged ({error}); make it again") from error
-    if version > kind.version or not isinstance(content, dict):
+    if version > kind.version:
         raise InputError(
             f"{path}: has {kind.name} of version {version}, this program reads {kind.version} at most;"
             f" use a newer {_PROGRAM}"

@@ -89,7 +89,9 @@ def test_what_was_saved_comes_back(full, tmp_path):
     ("forge", "message"),
     [
         (lambda tree: tree.pop("names"), "names is missing"),
-        (lambda tree: tree["poses"]["number"].__setitem__(0, -1), "the number is negative"),
+        (lambda tree: tree["poses"]["number"].__setitem__(0, -1), "numbers from -1 to 2"),
+        (lambda tree: tree["poses"]["T_world_lidar"].__setitem__((0, 0, 0), np.nan), "numbers from nan"),
+        (lambda tree: tree["grid"].update(cell_m=float("inf")), "expected from -inf to inf, finite"),
         (lambda tree: tree["poses"].update(number=np.arange(3)), "differ in length"),
         (lambda tree: tree["covariances"]["known"].fill(True), "refused"),
         (lambda tree: tree["covariances"].update(values=np.zeros((1, 3, 3))), "expected an array of shape"),

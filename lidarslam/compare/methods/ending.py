@@ -1,14 +1,13 @@
 """Status of a method in the comparison by the end of its process, and the reason."""
 
-import json
 import signal
 from pathlib import Path
-from typing import Any, cast
 
 from lidarslam.compare.methods.process import LOST
 from lidarslam.compare.supervised import Ending, Limits
 from lidarslam.evaluation.comparison.comparison import MethodStatus
 from lidarslam.storage.directory import SUMMARY
+from lidarslam.storage.summary_file import read_summary
 
 _SIGNALS = {int(signal.SIGABRT): "aborted", int(signal.SIGSEGV): "segmentation fault"}
 _MEMORY_ERRORS = ("MemoryError", "bad_alloc", "Cannot allocate memory")
@@ -45,15 +44,6 @@ def _failed(status: int, has_result: bool, said: str) -> tuple[MethodStatus, str
         reason = f"{_SIGNALS.get(-status, 'ended by the system')} (signal {-status})"
         return "failed", f"{reason}: {said}" if said else reason
     return ("stopped" if has_result else "failed"), said or f"ended with status {status} and said nothing"
-
-
-def read_summary(folder: Path) -> dict[str, Any]:
-    """The content of a run's summary.json.
-
-    Raises:
-        OSError, ValueError: it is not there, or damaged.
-    """
-    return cast(dict[str, Any], json.loads((folder / SUMMARY).read_text(encoding="utf-8")))
 
 
 def _where_lost(folder: Path) -> str:

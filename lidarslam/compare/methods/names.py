@@ -6,8 +6,10 @@ from typing import get_args
 
 from lidarslam.compare.peers.registry import PEERS
 from lidarslam.core.errors import ConfigError
+from lidarslam.core.text.names import require_name
 from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import OdometryName
+from lidarslam.storage.comparison_folder import RESERVED
 
 # Name for the user -> name of the odometry in the configuration.
 _BASES = {
@@ -40,9 +42,12 @@ _GRAMMAR = (
 class Method:
     """One method of a comparison."""
 
-    name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`
+    name: str  # as the user named it, such as `kiss-icp@0.5` or `learned+map`, and of its run directory
     settings: tuple[str, ...]  # of the configuration, `key.path=value`
     peer: str | None = None  # the peer that estimates the poses, see `lidarslam.compare.peers`
+
+    def __post_init__(self) -> None:
+        require_name(self.name, "method", RESERVED)
 
     @property
     def needs_prior(self) -> bool:

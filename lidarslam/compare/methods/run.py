@@ -1,10 +1,12 @@
 """One method on one recording: a run in a process of its own, and its result however it ended."""
 
-import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+from pydantic import ConfigDict, TypeAdapter, with_config
+from typing_extensions import TypedDict
 
 from lidarslam.compare.methods.ending import judge
 from lidarslam.compare.methods.process import MethodRun, encode
@@ -15,8 +17,9 @@ from lidarslam.config.settings import Config, dump_yaml
 from lidarslam.config.yaml_text import read_yaml
 from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.files import remove_partial_files
+from lidarslam.core.text.json_text import read_json
 from lidarslam.datasets.recording import Recording
-from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult
+from lidarslam.evaluation.comparison.comparison import WHOLE, MethodResult, MethodStatus
 from lidarslam.run.request import describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import RunDirectory
@@ -24,7 +27,17 @@ from lidarslam.viewer.page.run_result import with_run
 
 # Beside a run's own files: how its process went, and its standard error.
 PROCESS, LOG = "process.json", "process.log"
-_RECORDED = ("status", "message", "wall_s", "peak_rss_mb")
+
+
+@with_config(ConfigDict(extra="forbid"))
+class _Recorded(TypedDict):
+    status: MethodStatus
+    message: str
+    wall_s: float | None
+    peak_rss_mb: float | None
+
+
+_SHAPE = TypeAdapter(_Recorded)
 
 COMMAND = (sys.executable, "-m", "lidarslam.compare.methods.process")
 # The process starts here, so that no package in the user's folder is found first.
@@ -65,12 +78,15 @@ def run_method(
     remove_partial_files(folder)
     status, message = judge(ending, folder, folder / LOG, limits)
     result = MethodResult(folder.name, status, message, wall_s=ending.wall_s, peak_rss_mb=ending.peak_rss_mb)
-    RunDirectory(folder).write_json(PROCESS, {name: getattr(result, name) for name in _RECORDED})
+    RunDirectory(folder).write_json(PROCESS, {name: getattr(result, name) for name in _Recorded.__annotations__})
     return _collect(run, result), ending.cause == "interrupt"
 
 
 def clear(folder: Path) -> None:
     """Make a method's directory, or remove what a run of an earlier comparison left there."""
+    for one in (folder.parent, folder):
+        if one.is_symlink():  # what it leads to is not of this comparison
+            one.unlink()
     if (folder / LOG).is_file():
         files.remove_files(folder)
         (folder / PROCESS).unlink(missing_ok=True)
@@ -85,13 +101,13 @@ def finished_before(run: MethodRun) -> MethodResult | None:
     """
     try:
         folder = run.request.out
-        result = MethodResult(run.name, **json.loads((folder / PROCESS).read_text(encoding="utf-8")))
+        result = MethodResult(run.name, **read_json(folder / PROCESS, _SHAPE))
         tree = read_yaml(folder / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
         is_same = Config.model_validate(tree) == run.request.config
         described = describe_run(run.request) if run.peer is None else describe_peer(run.request, PEERS[run.peer])
         is_same = is_same and all(was_run.get(key) == value for key, value in described.items())
-    except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (ConfigError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
     return _collect(run, result) if is_same and result.status in WHOLE else None
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.files import open_own
 from lidarslam.core.state.stateful import Saved, State, Stateful
+from lidarslam.core.state.tree import checked
 
 
 class BlockFile(Stateful):
@@ -46,9 +48,16 @@ class BlockFile(Stateful):
             InputError: the file is damaged.
         """
         super().restore(saved)
+        self._opened()
+        is_short = self._file.seek(0, os.SEEK_END) < self.size_bytes
         for index, checksum in enumerate(self._checksums):
-            if zlib.crc32(self.read(index)) != checksum:
+            block = b"" if is_short else self.read(index)
+            if is_short or zlib.crc32(block) != checksum:
                 raise InputError(f"{self._path}: is damaged (block {index}); begin again with --overwrite")
+            checked(saved, lambda index=index, block=block: self._require(index, block))
+
+    def _require(self, index: int, block: bytes) -> None:
+        """Check the content of a block that is restored; a ValueError refuses it."""
 
     def _after_restore(self) -> None:
         count = len(self._checksums)
@@ -93,6 +102,6 @@ class BlockFile(Stateful):
             raise ValueError("the file is closed")
         if not self._open:
             # Closed by `close`, at the latest with this object.
-            self._file = tempfile.TemporaryFile(dir=self.directory) if self._path is None else self._path.open("a+b")  # noqa: SIM115
+            self._file = tempfile.TemporaryFile(dir=self.directory) if self._path is None else open_own(self._path)  # noqa: SIM115
             self._open = True
             weakref.finalize(self, self._file.close)

@@ -3,9 +3,10 @@
 import typing
 from typing import Any
 
-from lidarslam.core.state.tree import Saved, Shape, State, checked, decode, encode, hints_of
+from lidarslam.core.state.tree import Saved, State, checked, decode, encode, hints_of
+from lidarslam.core.state.values import ANY_NUMBER, TRANSFORM, Shape, Transforms, Within
 
-__all__ = ["Saved", "Shape", "State", "Stateful", "decode"]
+__all__ = ["ANY_NUMBER", "TRANSFORM", "Saved", "Shape", "State", "Stateful", "Transforms", "Within", "decode"]
 
 
 @typing.runtime_checkable

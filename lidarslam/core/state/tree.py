@@ -3,7 +3,7 @@
 Known are bool, int, float, str, enumerations, `T | None`, `NDArray[dtype]` (with `Annotated[..., Shape(None, 3)]` the
 shape too), `list[T]`, `tuple[T, ...]`, `tuple[A, B]`, `dict[K, V]`, dataclasses and `Stateful` classes, nested at will.
 Lists are stored by columns: a list of a thousand (4, 4) arrays is one array (1000, 4, 4), a list of dataclasses a list
-for each field.
+for each field. What is read back has the types, shapes and bounds of its hints, see `lidarslam.core.state.values`.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.state.values import Shape, Values, values_of
 
 State = dict[str, Any]  # arrays, numbers, texts, None, lists of these, and further trees
 
@@ -60,18 +61,6 @@ class Saved:
         return self.refuse(f"expected {wanted}, got {what}")
 
 
-class Shape:
-    """Expected shape of an array in an `Annotated` hint; None stands for any length."""
-
-    def __init__(self, *lengths: int | None) -> None:
-        self.lengths = lengths
-
-    def fits(self, shape: tuple[int, ...]) -> bool:
-        """Whether an array of that shape is one of these."""
-        same = (wanted in (None, found) for wanted, found in zip(self.lengths, shape, strict=False))
-        return len(shape) == len(self.lengths) and all(same)
-
-
 def encode(kind: Any, value: Any) -> Any:
     """The tree of a value of that type."""
     kind, _ = _bare(kind)
@@ -110,12 +99,12 @@ def decode(kind: Any, tree: Any, saved: Saved) -> Any:
     Raises:
         InputError: the tree is another one.
     """
-    kind, shape = _bare(kind)
+    kind, values = _bare(kind)
     if (inner := _optional(kind)) is not None:
         return None if tree is None else decode(inner, tree, saved)
     origin, items = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin is np.ndarray:
-        return _decode_array(items[1], shape, tree, saved)
+        return _decode_array(items[1], values, tree, saved)
     if origin is dict:
         parts = _tree(tree, saved)
         keys, values = (_decode_list(one, parts.get(name), saved) for one, name in zip(items, _DICT, strict=True))
@@ -126,41 +115,44 @@ def decode(kind: Any, tree: Any, saved: Saved) -> Any:
         if not isinstance(tree, list) or len(tree) != len(items):
             raise saved.unfit(f"{len(items)} values", tree)
         return tuple(decode(item, one, saved) for item, one in zip(items, tree, strict=True))
-    return _decode_plain(origin, tree, saved)
+    return _decode_plain(origin, values, tree, saved)
 
 
-def _decode_plain(kind: Any, tree: Any, saved: Saved) -> Any:
+def _decode_plain(kind: Any, values: Values, tree: Any, saved: Saved) -> Any:
     if hasattr(kind, "restore"):
         made = kind.__new__(kind)
         made.restore(Saved(_tree(tree, saved), saved.place))
         return made
     if _is_dataclass(kind):
         part = Saved(_tree(tree, saved), saved.place)
-        values = {name: decode(hint, part.value(name), part.at(name)) for name, hint in hints_of(kind).items()}
-        return checked(saved, lambda: kind(**values))
+        fields = {name: decode(hint, part.value(name), part.at(name)) for name, hint in hints_of(kind).items()}
+        return checked(saved, lambda: kind(**fields))
     if issubclass(kind, Enum):
         if not isinstance(tree, str) or tree not in kind.__members__:
             raise saved.unfit(f"one of {', '.join(kind.__members__)}", tree)
         return kind[tree]
-    if kind is float and type(tree) is int:
-        return float(tree)
+    tree = float(tree) if kind is float and type(tree) is int else tree
     if type(tree) is not kind:  # a bool is an int otherwise
         raise saved.unfit(kind.__name__, tree)
+    if kind in (int, float):
+        checked(saved, lambda: values.require(np.asarray(tree)))
     return tree
 
 
-def _decode_array(dtype: Any, shape: Shape | None, tree: Any, saved: Saved) -> Any:
+def _decode_array(dtype: Any, values: Values, tree: Any, saved: Saved, of_list: bool = False) -> Any:
+    """An array, or of a list of arrays the one that they are rows of."""
     (wanted,) = typing.get_args(dtype)
     is_array = isinstance(tree, np.ndarray) and tree.dtype.isnative
     if not is_array or not np.issubdtype(tree.dtype, typing.get_origin(wanted) or wanted):
         raise saved.unfit(f"an array of {getattr(wanted, '__name__', wanted)}", tree)
-    if shape is not None and not shape.fits(tree.shape):
-        raise saved.unfit(f"an array of shape {shape.lengths}", tree)
-    return tree if tree.flags.writeable else tree.copy()
+    if values.shape is not None and not values.shape.fits(tree.shape[1:] if of_list else tree.shape):
+        raise saved.unfit(f"an array of shape {values.shape.lengths}", tree)
+    checked(saved, lambda: values.require(tree))
+    return tree if tree.flags.writeable and tree.flags.c_contiguous else tree.copy()
 
 
 _DICT = ("keys", "values")
-_BOOLS = np.ndarray[Any, np.dtype[np.bool_]]
+_BOOLS = typing.Annotated[np.ndarray[Any, np.dtype[np.bool_]], Shape(None)]
 # Plain values of a list become one array of this type.
 _COLUMNS: dict[Any, type] = {float: np.float64, int: np.int64, bool: np.bool_}
 
@@ -182,7 +174,7 @@ def _encode_list(kind: Any, values: list[Any]) -> Any:
 
 
 def _decode_list(kind: Any, tree: Any, saved: Saved) -> Any:
-    bare, _ = _bare(kind)
+    bare, values = _bare(kind)
     if (inner := _optional(bare)) is not None:
         part = Saved(_tree(tree, saved), saved.place)
         known = decode(_BOOLS, part.value("known"), part.at("known"))
@@ -191,13 +183,14 @@ def _decode_list(kind: Any, tree: Any, saved: Saved) -> Any:
     if bare in _COLUMNS:
         if not isinstance(tree, np.ndarray) or tree.ndim != 1 or tree.dtype != _COLUMNS[bare]:
             raise saved.unfit(f"an array of {bare.__name__}", tree)
+        checked(saved, lambda: values.require(tree))
         return tree.tolist()
-    if isinstance(tree, np.ndarray):
-        return [decode(kind, one, saved) for one in tree]
+    if isinstance(tree, np.ndarray) and typing.get_origin(bare) is np.ndarray and tree.ndim:
+        return list(_decode_array(typing.get_args(bare)[1], values, tree, saved, of_list=True))
     if _is_columnar(bare):
         part = Saved(_tree(tree, saved), saved.place)
         columns = [_decode_list(hint, part.value(name), part.at(name)) for name, hint in hints_of(bare).items()]
-        if any(len(column) != part.value("count") for column in columns):
+        if type(part.value("count")) is not int or any(len(column) != part.value("count") for column in columns):
             raise saved.refuse(f"columns of {bare.__name__} differ in length")
         return checked(saved, lambda: [bare(*row) for row in zip(*columns, strict=True)])
     if not isinstance(tree, list):
@@ -221,12 +214,10 @@ def hints_of(kind: Any) -> dict[str, Any]:
     return {name: hint for name, hint in hints.items() if typing.get_origin(hint) is not typing.ClassVar}
 
 
-def _bare(kind: Any) -> tuple[Any, Shape | None]:
-    """A type without its annotations, and the shape among them."""
+def _bare(kind: Any) -> tuple[Any, Values]:
+    """A type without its annotations, and what these say of its values."""
     notes = getattr(kind, "__metadata__", ())
-    return (typing.get_args(kind)[0] if notes else kind), next(
-        (note for note in notes if isinstance(note, Shape)), None
-    )
+    return (typing.get_args(kind)[0] if notes else kind), values_of(notes)
 
 
 def _optional(kind: Any) -> Any:
@@ -245,5 +236,5 @@ def checked(saved: Saved, make: Any) -> Any:
     """The result of a function that may find the values contradictory."""
     try:
         return make()
-    except (ValueError, TypeError, IndexError, RuntimeError, StopIteration) as error:
+    except (ValueError, TypeError, IndexError, RuntimeError, OverflowError, StopIteration) as error:
         raise saved.refuse(str(error) or type(error).__name__) from error

@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.text.names import safe_name
 
 logger = logging.getLogger(__name__)
 
@@ -43,8 +44,8 @@ def fetched(source: str | os.PathLike[str]) -> Path:
         return Path(source)
     scheme, rest = parts[1], parts[2]
     url = f"{scheme}://{'/' if scheme == 'file' else ''}{rest}"
-    name = rest.partition("?")[0].rstrip("/").rpartition("/")[2] or "recording"
-    path = cache_folder() / hashlib.sha256(url.encode()).hexdigest()[:16] / name
+    name = rest.partition("?")[0].rstrip("/").rpartition("/")[2]
+    path = cache_folder() / hashlib.sha256(url.encode()).hexdigest()[:16] / safe_name(name)
     fetch(url, path)
     return path
 

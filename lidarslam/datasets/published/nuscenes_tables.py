@@ -4,27 +4,55 @@ sample_data and ego_pose have millions of records in v1.0-trainval. Their record
 ones are found by their text, and only those are parsed.
 """
 
-import json
 import mmap
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.text.json_text import parse_json, read_json
 from lidarslam.datasets.published.poses import poses_wxyz
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 _LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
 _MICROSECOND = 1e-6
-_SWEEP = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "timestamp", "filename")
-_POSE = ("token", "translation", "rotation")
 _TAIL = 100  # bytes
 
-Record = dict[str, Any]
+T = TypeVar("T")
+
+
+class _Scene(TypedDict):
+    name: str
+    token: str
+
+
+class _Sample(TypedDict):
+    token: str
+    scene_token: str
+
+
+class _Sweep(TypedDict):
+    sample_token: str
+    ego_pose_token: str
+    calibrated_sensor_token: str
+    timestamp: float
+    filename: str
+
+
+class _Pose(TypedDict):
+    token: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+
+
+_SCENES, _SAMPLES, _POSES = (TypeAdapter(list[_Scene]), TypeAdapter(list[_Sample]), TypeAdapter(list[_Pose]))
+_SWEEP, _POSE = TypeAdapter(_Sweep), TypeAdapter(_Pose)
 
 
 class Sweeps(NamedTuple):
@@ -41,7 +69,7 @@ def scenes(version: Path) -> dict[str, str]:
     Raises:
         InputError: the table is missing or damaged.
     """
-    return {record["name"]: record["token"] for record in _table(version / "scene.json", "name", "token")}
+    return {record["name"]: record["token"] for record in _table(version / "scene.json", _SCENES)}
 
 
 def read_sweeps(version: Path, scene: str) -> Sweeps:
@@ -50,23 +78,21 @@ def read_sweeps(version: Path, scene: str) -> Sweeps:
     Raises:
         InputError: a table is missing or damaged, or the scene has no sweep.
     """
-    samples = {
-        one["token"] for one in _table(version / "sample.json", "token", "scene_token") if one["scene_token"] == scene
-    }
-    data = _select(version / "sample_data.json", _LIDAR_FILE, lambda _: True, *_SWEEP)
+    samples = {one["token"] for one in _table(version / "sample.json", _SAMPLES) if one["scene_token"] == scene}
+    data = _select(version / "sample_data.json", _LIDAR_FILE, lambda _: True, _SWEEP)
     sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
     if not sweeps:
         raise InputError(f"{version / 'sample_data.json'}: has no sweep of LIDAR_TOP for the scene; download it again")
     wanted = {one["ego_pose_token"].encode() for one in sweeps}
-    ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, *_POSE)
+    ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, _POSE)
     T_world_ego = _poses(version, list(ego_poses), [one["ego_pose_token"] for one in sweeps])
-    sensors = _table(version / "calibrated_sensor.json", *_POSE)
+    sensors = _table(version / "calibrated_sensor.json", _POSES)
     T_ego_lidar = _poses(version, sensors, [one["calibrated_sensor_token"] for one in sweeps])
     stamps = np.array([one["timestamp"] for one in sweeps]) * _MICROSECOND
     return Sweeps([one["filename"] for one in sweeps], stamps, T_world_ego @ T_ego_lidar)
 
 
-def _poses(version: Path, records: list[Record], tokens: list[str]) -> FloatArray:
+def _poses(version: Path, records: list[_Pose], tokens: list[str]) -> FloatArray:
     """Transforms (N, 4, 4) of N tokens."""
     by_token = {one["token"]: one for one in records}
     if missing := next((token for token in tokens if token not in by_token), None):
@@ -78,16 +104,16 @@ def _poses(version: Path, records: list[Record], tokens: list[str]) -> FloatArra
         raise InputError(f"{version}: a pose is damaged ({error}); download the tables again") from error
 
 
-def _table(path: Path, *keys: str) -> list[Record]:
+def _table(path: Path, shape: TypeAdapter[list[T]]) -> list[T]:
     try:
-        return [_checked(record, keys) for record in json.loads(path.read_text(encoding="utf-8"))]
-    except (OSError, ValueError, TypeError) as error:
+        return read_json(path, shape)
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
 
 
 def _select(
-    path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], *keys: str
-) -> Iterator[Record]:
+    path: Path, pattern: re.Pattern[bytes], wanted: Callable[[re.Match[bytes]], bool], shape: TypeAdapter[T]
+) -> Iterator[T]:
     """The records of a large table in which a pattern is found, as far as the match is wanted."""
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
@@ -96,12 +122,6 @@ def _select(
             for match in pattern.finditer(text):
                 if wanted(match):
                     start, end = text.rfind(b"{", 0, match.start()), text.find(b"}", match.end()) + 1
-                    yield _checked(json.loads(text[start:end]), keys)
+                    yield parse_json(text[start:end], shape)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error
-
-
-def _checked(record: Record, keys: tuple[str, ...]) -> Record:
-    if missing := [key for key in keys if key not in record]:
-        raise ValueError(f"a record has no {missing[0]}")
-    return record

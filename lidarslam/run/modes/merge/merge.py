@@ -90,6 +90,8 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
         unfinished = [_begin(directory, request.describe() | {"merge": "all", "parts": sorted(names)}, stack)]
         parts = []
         for run, recording in runs:
+            if run.out.is_symlink():
+                run.out.unlink()
             own = stack.enter_context(RunDirectory.create(run.out, request.overwrite))
             parts.append(_Part(run, recording, own))
             unfinished.append(_begin(own, request.describe() | {"merge": "part"}, stack))

@@ -1,6 +1,5 @@
 """The recordings of a merge: opened and checked before anything is written, each with a run directory of its own."""
 
-import json
 import re
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
+from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
@@ -19,6 +19,7 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.run import require_apart
 from lidarslam.storage import directory as files
 from lidarslam.storage.directory import remove_run
+from lidarslam.storage.summary_file import read_summary
 from lidarslam.storage.unfinished import About, remove_unfinished
 
 # The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.
@@ -71,8 +72,8 @@ def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:
         recording = open_recording(source, request.config.reader)
         if not len(recording):
             raise InputError(f"{source}: holds no scan; leave it out")
-        name = re.sub(r"[^\w.-]+", "_", recording.name).strip("._")
-        out = request.out / f"{number:02d}_{name or 'recording'}"
+        name = safe_name(re.sub(r"[^\w.-]+", "_", recording.name).strip("._"))
+        out = request.out / f"{number:02d}_{name}"
         require_apart(out, source)
         run = RunRequest(source, out, request.config, map_formats=request.map_formats, overwrite=request.overwrite)
         parts.append((run, recording))
@@ -84,18 +85,19 @@ def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:
 
 def earlier_parts(out: Path) -> set[str]:
     """The directories of the recordings of an earlier merge, finished or not."""
-    names: list[Any] = []
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        entries = json.loads((out / files.SUMMARY).read_text(encoding="utf-8"))["recordings"]
-        names += [entry["directory"] for entry in entries]
-    with suppress(InputError, KeyError, TypeError):
+    names: list[str] = []
+    with suppress(InputError):
+        names += [entry["directory"] or "" for entry in read_summary(out).get("recordings", [])]
+    with suppress(InputError):
         about = About.read(out)
-        names += [] if about is None else about.description["parts"]
-    return {name for name in names if isinstance(name, str) and _PART.fullmatch(name)}
+        names += [] if about is None else about.description.get("parts", [])
+    return {name for name in names if _PART.fullmatch(name)}
 
 
 def remove_part(path: Path) -> None:
     """Remove the run of a recording that is no longer merged, however far it came."""
+    if path.is_symlink():  # what it leads to is not of this merge
+        return
     if (path / files.ABOUT).exists():
         remove_unfinished(path)
         return

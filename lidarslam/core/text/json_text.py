@@ -1,0 +1,86 @@
+"""JSON of unknown origin: bounded in length and depth, finite numbers, texts that names can be made of, a known shape.
+
+The only place where files of JSON are parsed.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from lidarslam.core.text.plain_text import one_line
+
+T = TypeVar("T")
+
+ANY_OBJECT = TypeAdapter(dict[str, Any])
+
+# Of a summary with 100,000 loop closures, or the largest table of nuScenes that is read as a whole.
+_LONGEST_BYTES = 64 << 20
+_DEEPEST = 100
+_LARGEST_INTEGER = 1 << 63
+
+
+def read_json(path: Path, shape: TypeAdapter[T]) -> T:
+    """The content of a file in UTF-8.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is too long, as `parse_json`.
+    """
+    with path.open("rb") as file:
+        content = file.read(_LONGEST_BYTES + 1)
+    if len(content) > _LONGEST_BYTES:
+        raise ValueError(f"longer than {_LONGEST_BYTES >> 20} MB")
+    return parse_json(content, shape)
+
+
+def parse_json(text: str | bytes, shape: TypeAdapter[T]) -> T:
+    """The values of a text.
+
+    Raises:
+        ValueError: it is not JSON, is nested too deeply, has another shape, a number that is not finite, an integer
+            beyond 64 bits, or a text with NUL or half of a surrogate pair; the message is one line.
+    """
+    try:
+        values = json.loads(text if isinstance(text, str) else text.decode("utf-8"))
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    _require_plain(values)
+    try:
+        return shape.validate_python(values)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(map(str, fault["loc"]))
+        raise ValueError(one_line(f"{place}: {fault['msg']}" if place else fault["msg"])) from None
+
+
+def _require_plain(values: Any) -> None:
+    """Go through the values level by level."""
+    level = [values]
+    for _ in range(_DEEPEST):
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+            else:
+                _require_plain_leaf(value)
+        if not inner:
+            return
+        level = inner
+    raise ValueError("nested too deeply")
+
+
+def _require_plain_leaf(value: Any) -> None:
+    if isinstance(value, str):
+        if "\0" in value:
+            raise ValueError("a text has a NUL character")
+        value.encode()  # half of a surrogate pair raises a ValueError
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("a number is not finite")
+    elif isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
+        raise ValueError("an integer has more than 64 bits")

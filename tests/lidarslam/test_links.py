@@ -1,0 +1,113 @@
+"""Links in a run's work folder lead nowhere: what lies behind them is neither written nor removed."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from lidarslam.cli import main
+from lidarslam.compare.methods.run import LOG, clear
+from lidarslam.core.errors import OutputError
+from lidarslam.core.files import make_own_folder, open_own
+from lidarslam.run.modes.merge.parts import remove_part
+from lidarslam.storage.unfinished import Unfinished
+
+FAST = ("--odometry", "constant-velocity", "--no-report", "--pose-graph", "--set", "global_map.most_points=2000")
+
+
+def lidarslam(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture
+def unfinished(tmp_path: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run with its checkpoint, as a kill before its end leaves it."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(Unfinished, "end", lambda *_, **__: None)
+        lidarslam("run", small_recording, "--out", out, *FAST, "--set", "checkpoints.every_scans=2")
+    assert {"run.json", "state.npz", "submaps.bin", "tiles.bin"} <= {
+        path.name for path in (out / "unfinished").iterdir()
+    }
+    return out
+
+
+@pytest.mark.parametrize("name", ["submaps.bin", "tiles.bin"])
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_a_file_that_is_appended_to_is_no_link(
+    unfinished: Path, small_recording: Path, tmp_path: Path, name: str, link: "type[os.symlink]"
+) -> None:
+    outside = tmp_path / "precious"
+    (unfinished / "unfinished" / name).rename(outside)
+    with outside.open("ab") as file:
+        file.write(b"more")
+    before = outside.read_bytes()
+    link(outside, unfinished / "unfinished" / name)
+    result = lidarslam("run", small_recording, "--out", unfinished, *FAST, "--resume")
+    assert result.exit_code == 1
+    assert f"{name}: is a link" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert outside.read_bytes() == before
+
+
+def test_the_work_folder_is_no_link(unfinished: Path, small_recording: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "precious"
+    shutil.move(unfinished / "unfinished", outside)
+    (outside / ".partial-1-state.npz").write_text("precious too")
+    (unfinished / "unfinished").symlink_to(outside)
+    before = content(outside)
+    result = lidarslam("run", small_recording, "--out", unfinished, *FAST, "--resume")
+    assert result.exit_code == 1
+    assert "unfinished: is a link to another place; begin again with --overwrite" in result.stderr
+    assert content(outside) == before
+    assert lidarslam("run", small_recording, "--out", unfinished, *FAST, "--overwrite").exit_code in (0, 3)
+    assert content(outside) == before
+    assert not (unfinished / "unfinished").exists()
+
+
+def test_partial_files_are_no_links(unfinished: Path, small_recording: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "precious"
+    outside.write_text("precious")
+    for name in ("state.npz", "run.json"):
+        (unfinished / "unfinished" / f".partial-{os.getpid()}-{name}").symlink_to(outside)
+        (unfinished / "unfinished" / f"{name}.partial").symlink_to(outside)
+    assert lidarslam("run", small_recording, "--out", unfinished, *FAST, "--resume").exit_code in (0, 3)
+    assert outside.read_text() == "precious"
+
+
+def test_a_file_is_opened_without_following_links(tmp_path: Path) -> None:
+    (tmp_path / "outside").write_text("precious")
+    (tmp_path / "link").symlink_to(tmp_path / "outside")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    os.link(tmp_path / "outside", tmp_path / "second")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("link", "dangling", "second", "pipe"):
+        with pytest.raises(OutputError, match=f"{name}: is a link"):
+            open_own(tmp_path / name)
+        with open_own(tmp_path / name, anew=True) as file:
+            file.write(b"ours")
+    assert (tmp_path / "outside").read_text() == "precious"
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_folders_of_methods_and_of_parts_are_no_links(tmp_path: Path) -> None:
+    outside, out = tmp_path / "outside", tmp_path / "out"
+    outside.mkdir()
+    out.mkdir()
+    for name in (LOG, "map.ply", "config.yaml"):
+        (outside / name).write_text("run:\n")
+    (out / "01_room").symlink_to(outside)
+    remove_part(out / "01_room")
+    clear(out / "01_room")
+    (out / "room").symlink_to(tmp_path)
+    clear(out / "room" / "outside")
+    make_own_folder(out / "room")
+    assert sorted(content(outside)) == sorted((LOG, "map.ply", "config.yaml"))
+    assert not (out / "01_room").is_symlink()
+    assert not (out / "room").is_symlink()
