@@ -37,11 +37,10 @@ class LaidSubmaps(Stateful):
 
     _poses: list[FloatArray]  # T_odom_keyframe
     _held: list[int]  # keyframes whose submaps it holds
-    _redraws: list[int]  # numbers of keyframes when it was drawn anew
 
     def __init__(self, radius_m: float) -> None:
         self._radius_m = radius_m
-        self._poses, self._held, self._redraws = [], [], []
+        self._poses, self._held = [], []
 
     def _after_restore(self) -> None:
         if not all(0 <= key < len(self._poses) for key in self._held):
@@ -70,7 +69,6 @@ class LaidSubmaps(Stateful):
         if not is_missing and not self._is_off(targets, np.flatnonzero(relative < _RIGHT_WITHIN), cell_m):
             return None
         self._poses, self._held = list(targets), np.flatnonzero(relative < 1.0).tolist()
-        self._redraws.append(len(targets))
         held = [submap(key).rows for key in self._held]
         step = 1 + sum(map(len, held)) // _MOST_POINTS
         submaps = ((targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True))
@@ -84,27 +82,20 @@ class LaidSubmaps(Stateful):
         is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cell_m
         return bool((is_far | (rotation_angle(off) > _OFF_RAD)).any())
 
-    def redrawn_between(self, first: int, second: int) -> bool:
-        """Whether the map was drawn anew between two keyframes."""
-        return any(first < count <= second for count in self._redraws)
-
     def _distances(self, poses: FloatArray) -> FloatArray:
         """(K,) of poses (K, 4, 4) from the last keyframe."""
         return np.asarray(np.linalg.norm(poses[:, :3, 3] - self._poses[-1][:3, 3], axis=1), dtype=np.float64)
 
 
-def connected_with_last(
-    keyframes: Sequence[Keyframe], closures: Iterable[RelativePose], first_scan: int
-) -> NDArray[np.bool_]:
-    """(K,) the keyframes of the recording that begins with a scan, as far as their poses follow from the last one's.
+def connected_with_last(keyframes: Sequence[Keyframe], closures: Iterable[RelativePose]) -> NDArray[np.bool_]:
+    """(K,) the keyframes whose poses follow from the last one's.
 
     Those of a segment do; loop closures join segments.
     """
     segments = np.array([keyframe.segment for keyframe in keyframes])
     pairs = [(int(key), int(key) + 1) for key in np.flatnonzero(np.diff(segments) == 0)]
     component = first_connected(len(keyframes), pairs + [(closure.first, closure.second) for closure in closures])
-    is_own = np.array([keyframe.scan >= first_scan for keyframe in keyframes])
-    return np.asarray((component == component[-1]) & is_own)
+    return np.asarray(component == component[-1])
 
 
 def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, radius_m: float) -> SurfelMap:
