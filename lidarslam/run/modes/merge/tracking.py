@@ -10,6 +10,7 @@ from lidarslam.config.settings import Config
 from lidarslam.core.errors import OutputError
 from lidarslam.core.files import only_writer
 from lidarslam.datasets.published.fetched import fetch
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.run.interruption import Interruptions
@@ -64,35 +65,44 @@ def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
         LidarSlamError: the recording, the configuration or the directory is not usable, or the directory of the merge
             is not that of another machine.
     """
-    request, out = task.request, task.request.out
+    out = task.request.out
     with ExitStack() as stack:
         with contextlib.suppress(OSError):  # a machine without that folder has no file there either
             stack.enter_context(contextlib.chdir(task.folder))
         if task.url is not None:
-            fetch(task.url, request.source)
+            fetch(task.url, task.request.source)
         if About.read(out.parent) is None:
             raise OutputError(
                 f"{out.parent}: is not shared by the nodes of the cluster; name a folder that is with --out"
             )
         interruptions = stack.enter_context(Interruptions())
-        recording = open_recording(request.source, request.config.reader)
+        recording = open_recording(task.request.source, task.request.config.reader)
         folder = Unfinished(out, About({})).folder
         folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(only_writer(folder, _PATIENCE_S))
-        description = describe_computed(request, recording) | task.merge
+        description = describe_computed(task.request, recording) | task.merge
         is_begun = About.read(out) is not None
         unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out), description, is_begun))
         if unfinished.tracked.is_file():
             earlier = read_part(read_state(unfinished.tracked))
             if not earlier.interrupted:
                 return PartDone(len(earlier.log))
-        graph = _open_graph(request.config, unfinished)
-        stack.callback(graph.close)
+        with show(task.name) as progress:
+            return _track(task.request, recording, unfinished, progress, interruptions)
+
+
+def _track(
+    request: RunRequest,
+    recording: Recording,
+    unfinished: Unfinished,
+    progress: Progress,
+    interruptions: Interruptions,
+) -> PartDone:
+    """Track a recording, and leave the result."""
+    graph, scans, log = _open_graph(request.config, unfinished), range(len(recording)), ScanLog()
+    with closing(graph), closing(open_odometry(request.config, None)) as odometry:
         try:
-            with show(task.name) as progress, closing(open_odometry(request.config, None)) as odometry:
-                scans = range(len(recording))
-                log, viewer = ScanLog(), Viewer()
-                tracked = track(request, recording, scans, odometry, log, graph, viewer, progress, unfinished)
+            tracked = track(request, recording, scans, odometry, log, graph, Viewer(), progress, unfinished)
         except NoScanError as error:
             unfinished.end(stopped=False)
             return PartDone(0, f"{request.source}: interrupted" if error.interrupted else str(error), error.interrupted)
@@ -100,9 +110,9 @@ def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
         graph.end_recording()
         part = TrackedPart.of(tracked)
         part.write(unfinished, graph)
-        if not part.interrupted:
-            unfinished.remove_checkpoint()
-        return PartDone(len(part.log), interrupted=part.interrupted)
+    if not part.interrupted:
+        unfinished.remove_checkpoint()
+    return PartDone(len(part.log), interrupted=part.interrupted)
 
 
 def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:
