@@ -33,13 +33,13 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.registry import open_recording
 from lidarslam.evaluation.trajectory.metrics import evaluate_trajectory
 from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
+from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import ScanToMap
-from lidarslam.pipeline.map_correction import SCANS_LATER
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import in_order
 

@@ -12,12 +12,12 @@ from lidarslam.core.state.stateful import Saved, Shape, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
-from lidarslam.pipeline.map_correction import SCANS_LATER
 
 
 class Localiser(Protocol):

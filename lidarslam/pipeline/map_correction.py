@@ -8,12 +8,9 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 from lidarslam.core.state.stateful import State, Stateful
+from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
-
-# Scans from the one after which the pose graph draws a map to the one that is registered to it: the graph is given so
-# much time before tracking waits for it. More than the scans that may wait for the global map and the graph.
-SCANS_LATER = 12
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,13 +19,19 @@ _CHI_SQUARED_999 = 22.5
 
 
 def as_registered(
-    closure: LoopClosure, way: FloatArray, first: FloatArray | None, second: FloatArray | None, radius_m: float
+    closure: LoopClosure,
+    T_odom_first: FloatArray,
+    way: FloatArray,
+    first: FloatArray | None,
+    second: FloatArray | None,
+    radius_m: float,
 ) -> LoopClosure:
     """The closure with the motion along the trajectory, where the local map held its place all the way.
 
     Args:
         closure: of two keyframes.
-        way: (N, 4, 4) registered poses of the scans from the one keyframe to the other.
+        T_odom_first: (4, 4) pose of the first one in the local map.
+        way: (N, 4, 4) registered poses of the scans from the one since which it is there to the second keyframe.
         first, second: (6, 6) covariances of the poses of the keyframes, rotation first, in their LiDAR frames; None of
             one that was not registered.
         radius_m: of the local map; 0 without one.
@@ -35,9 +41,9 @@ def as_registered(
     """
     if first is None or second is None or not len(way):
         return closure
-    if np.linalg.norm(way[:, :3, 3] - way[0, :3, 3], axis=1).max() > _PART_OF_RADIUS * radius_m:
+    if np.linalg.norm(way[:, :3, 3] - T_odom_first[:3, 3], axis=1).max() > _PART_OF_RADIUS * radius_m:
         return closure
-    T_first_second = inverse(way[0]) @ way[-1]
+    T_first_second = inverse(T_odom_first) @ way[-1]
     A = adjoint(inverse(T_first_second))
     covariance = second + A @ first @ A.T
     difference = log(inverse(T_first_second) @ closure.T_first_second)

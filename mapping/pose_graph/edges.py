@@ -54,6 +54,7 @@ def trajectory_edges(
     motion: MotionSinceKeyframe,
     before: FloatArray | None,
     now: FloatArray | None,
+    one_map: bool = True,
 ) -> list[RelativePose]:
     """Edges from the previous keyframe: one from the registered trajectory, one from the odometry where it has one.
 
@@ -63,9 +64,10 @@ def trajectory_edges(
         motion: the odometry between them.
         before, now: (6, 6) covariance of either pose, rotation first, in the LiDAR frame; None for a pose that was not
             registered to a map.
+        one_map: whether both were registered to the same map.
     """
     registered = now is not None
-    covariance = drift_covariance(motion.length_m, registered, motion.lost)
+    covariance = drift_covariance(motion.length_m, registered and one_map, motion.lost)
     if now is not None and before is not None and not motion.lost:
         A = adjoint(inverse(T_first_second))
         covariance = covariance + now + A @ before @ A.T

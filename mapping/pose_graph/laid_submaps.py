@@ -6,15 +6,18 @@ latest keyframe, so that the surfaces of both visits coincide.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
-from lidarslam.core.state.stateful import Stateful
+from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.global_map.global_map import VoxelMeans
 from lidarslam.mapping.global_map.voxel_rows import POSITION, VIEW, Rows
-from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
+from lidarslam.mapping.loops.revisits import as_registered
 from lidarslam.mapping.pose_graph.edges import first_connected
 from lidarslam.mapping.pose_graph.keyframes import Keyframe
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
@@ -26,6 +29,24 @@ _OFF_CELLS, _OFF_RAD = 0.5, np.deg2rad(1.0)
 _HELD_WITHIN, _RIGHT_WITHIN = 0.5, 0.25
 # Points of a drawn map, to bound its time; submaps overlap, so that fewer of each are enough.
 _MOST_POINTS = 1_500_000
+# A mean of a submap counts as so many points, so that a cell is full with those of a few submaps that saw it first, as
+# it was when these were mapped; or the scans that follow would shift it to where they are.
+_WEIGHT = 10.0
+# Scans from the one before which a map is drawn to the first one that is registered to it: the graph is given so much
+# time before tracking waits for it. More than the scans that may wait for the global map and the graph.
+SCANS_LATER = 12
+# Drawn maps whose submaps are kept: a map is drawn once a scan at most, and closures are refined a few keyframes later.
+_KEPT = SCANS_LATER + 4
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Submaps as they lie in a local map that was drawn anew."""
+
+    since: int  # the first scan that is registered to it
+    keys: NDArray[np.intp]  # (H,) the keyframes, ascending
+    keyframes: int  # number of them then; later ones were inserted scan by scan
+    T_odom_keyframe: Annotated[FloatArray, Shape(None, 4, 4)]  # (H, 4, 4)
 
 
 class LaidSubmaps(Stateful):
@@ -37,10 +58,11 @@ class LaidSubmaps(Stateful):
 
     _poses: list[FloatArray]  # T_odom_keyframe
     _held: list[int]  # keyframes whose submaps it holds
+    _drawn: list[Drawn]
 
     def __init__(self, radius_m: float) -> None:
         self._radius_m = radius_m
-        self._poses, self._held = [], []
+        self._poses, self._held, self._drawn = [], [], []
 
     def _after_restore(self) -> None:
         if not all(0 <= key < len(self._poses) for key in self._held):
@@ -54,7 +76,12 @@ class LaidSubmaps(Stateful):
         self._held = [key for key, is_near in zip(self._held, near, strict=True) if is_near]
 
     def redrawn(
-        self, targets: FloatArray, members: NDArray[np.bool_], cell_m: float, submap: Callable[[int], VoxelMeans]
+        self,
+        targets: FloatArray,
+        members: NDArray[np.bool_],
+        cell_m: float,
+        submap: Callable[[int], VoxelMeans],
+        scan: int,
     ) -> SurfelMap | None:
         """The map drawn anew; None unless a submap near the sensor is missing, or lies elsewhere than it should.
 
@@ -63,16 +90,19 @@ class LaidSubmaps(Stateful):
             members: (K,) which submaps are connected with the last one.
             cell_m: edge of the finest cells.
             submap: of a keyframe.
+            scan: the latest one, which is not in the map.
         """
         relative = np.where(members, self._distances(targets) / self._radius_m, np.inf)
         is_missing = not np.isin(np.flatnonzero(relative < _HELD_WITHIN), self._held).all()
         if not is_missing and not self._is_off(targets, np.flatnonzero(relative < _RIGHT_WITHIN), cell_m):
             return None
         self._poses, self._held = list(targets), np.flatnonzero(relative < 1.0).tolist()
+        drawn = Drawn(scan + SCANS_LATER, np.array(self._held, dtype=np.intp), len(targets), targets[self._held])
+        self._drawn = [*self._drawn, drawn][-_KEPT:]
         held = [submap(key).rows for key in self._held]
         step = 1 + sum(map(len, held)) // _MOST_POINTS
-        submaps = ((targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True))
-        return draw_local_map(submaps, cell_m, self._radius_m)
+        submaps = [(targets[key], rows[::step]) for key, rows in zip(self._held, held, strict=True)]
+        return draw_local_map(submaps, cell_m, max(self._radius_m, *(_reach_m(rows) for rows in held)))
 
     def _is_off(self, targets: FloatArray, near: NDArray[np.intp], cell_m: float) -> bool:
         """Whether one of the submaps of keyframes (N,) lies elsewhere than it should."""
@@ -81,6 +111,46 @@ class LaidSubmaps(Stateful):
         off = inverse(np.array([self._poses[key] for key in near])) @ targets[near]
         is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _OFF_CELLS * cell_m
         return bool((is_far | (rotation_angle(off) > _OFF_RAD)).any())
+
+    def is_exchanged(self, first: int, second: int) -> bool:
+        """Whether two scans were registered to different maps, one of them drawn anew."""
+        return any(first < drawn.since <= second for drawn in self._drawn)
+
+    def place(self, key: int, scan: int, T_odom_keyframe: FloatArray, at: int) -> tuple[FloatArray, int] | None:
+        """Where a keyframe's submap lies in the map that a later scan was registered to, and since which scan it does.
+
+        Args:
+            key: the keyframe.
+            scan, T_odom_keyframe: its scan, and pose (4, 4) as registered.
+            at: the later scan.
+
+        Returns:
+            None where it was left out of the map.
+        """
+        drawn = next((drawn for drawn in reversed(self._drawn) if drawn.since <= at), None)
+        if drawn is None or key >= drawn.keyframes:
+            return T_odom_keyframe, scan
+        row = int(np.searchsorted(drawn.keys, key))
+        if row == len(drawn.keys) or drawn.keys[row] != key:
+            return None
+        return drawn.T_odom_keyframe[row], drawn.since
+
+    def measured(
+        self, closure: LoopClosure, first: Keyframe, second: Keyframe, scan_poses: Sequence[FloatArray]
+    ) -> LoopClosure:
+        """The closure as registration measured it, where the local map held the first keyframe's submap.
+
+        Args:
+            closure: of two keyframes.
+            first, second: the keyframes.
+            scan_poses: (4, 4) of all scans, as registered.
+        """
+        place = self.place(closure.first, first.scan, scan_poses[first.scan], second.scan)
+        if place is None:
+            return closure
+        T_odom_first, since = place
+        way = np.array(scan_poses[since : second.scan + 1])
+        return as_registered(closure, T_odom_first, way, first.covariance, second.covariance, self._radius_m)
 
     def _distances(self, poses: FloatArray) -> FloatArray:
         """(K,) of poses (K, 4, 4) from the last keyframe."""
@@ -98,6 +168,11 @@ def connected_with_last(keyframes: Sequence[Keyframe], closures: Iterable[Relati
     return np.asarray(component == component[-1])
 
 
+def _reach_m(rows: Rows) -> float:
+    """How far a submap reaches. Where the local map ended before, its border would be of the latest scans alone."""
+    return float(np.linalg.norm(rows[:, POSITION], axis=1).max(initial=0.0))
+
+
 def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, radius_m: float) -> SurfelMap:
     """Surfels of submaps, each with `T_odom_keyframe` (4, 4) and its rows; full cells are those of the first ones."""
     drawn = SurfelMap(cell_m, radius_m)
@@ -106,5 +181,5 @@ def draw_local_map(submaps: Iterable[tuple[FloatArray, Rows]], cell_m: float, ra
         lengths = np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)
         elevations = -np.arcsin(np.clip(views[:, 2] / lengths[:, 0], -1.0, 1.0))
         points = transform_points(T_odom_keyframe, rows[:, POSITION].astype(np.float64))
-        drawn.insert_seen(points, elevations, views / lengths @ T_odom_keyframe[:3, :3].T)
+        drawn.insert_seen(points, elevations, views / lengths @ T_odom_keyframe[:3, :3].T, _WEIGHT)
     return drawn

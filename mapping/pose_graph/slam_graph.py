@@ -25,7 +25,6 @@ from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import refine
-from lidarslam.mapping.loops.revisits import as_registered
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.edges import first_connected, squared_error
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
@@ -57,7 +56,7 @@ class SlamGraph(KeyframeGraph):
     _relaxing: RelaxSchedule
     _unrefined: list[int]  # accepted closures, neighbours of whose later keyframe are still to come
     _laid: LaidSubmaps  # in the running local map
-    _looked_at: int  # closures that the local map has been compared with
+    _is_map_due: bool  # whether closures have been refined since the local map was compared with them
 
     def __init__(
         self,
@@ -68,11 +67,10 @@ class SlamGraph(KeyframeGraph):
     ) -> None:
         super().__init__(config.keyframes, directory, file)
         self._config = config
-        self._local_radius_m = local_radius_m
         self._detector = LoopDetector(config.loops, directory if file is None else file.parent)
         self._first_scans, self._poses, self._closures, self._unrefined = [], [], [], []
         self._relaxing = RelaxSchedule()
-        self._laid, self._looked_at = LaidSubmaps(local_radius_m), 0
+        self._laid, self._is_map_due = LaidSubmaps(local_radius_m), False
 
     def _after_restore(self) -> None:
         super()._after_restore()
@@ -107,15 +105,16 @@ class SlamGraph(KeyframeGraph):
     def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:
         """The local map drawn anew without the latest scan, in the frame of registration, with cells of that edge.
 
-        None unless loop closures since the last call show that submaps lie elsewhere in the local map, or are missing.
+        None unless loop closures refined since the last call show that submaps lie elsewhere in the local map, or are
+        missing.
         """
-        new, self._looked_at = self._closures[self._looked_at :], len(self._closures)
-        if not any(closure.accepted for closure in new):
+        is_due, self._is_map_due = self._is_map_due, False
+        if not is_due:
             return None
         certain = [one for one in self._accepted() if squared_error(one, self._poses) < CHI_SQUARED_99]
         members = connected_with_last(self.keyframes, certain)
-        T_odom_world = self.scan_poses[self.keyframes[-1].scan] @ inverse(self._poses[-1])
-        drawn = self._laid.redrawn(T_odom_world @ np.array(self._poses), members, cell_m, self.means)
+        targets = self.scan_poses[self.keyframes[-1].scan] @ inverse(self._poses[-1]) @ np.array(self._poses)
+        drawn = self._laid.redrawn(targets, members, cell_m, self.means, scan=len(self.scan_poses) - 1)
         self.redraws += [] if drawn is None else [len(self.keyframes)]
         return drawn
 
@@ -171,6 +170,9 @@ class SlamGraph(KeyframeGraph):
         self._chain(self.scan_poses, self.keyframes[-2:-1], self.keyframes[-1])
         self._laid.follow(scan.T_world_lidar)
 
+    def _is_one_map(self, first: int, second: int) -> bool:
+        return not self._laid.is_exchanged(first, second)
+
     def _chain(self, scan_poses: Sequence[FloatArray], before: Sequence[Keyframe], keyframe: Keyframe) -> None:
         """Add the pose of the next keyframe, from the one before it in its recording where there is one."""
         pose = scan_poses[keyframe.scan]
@@ -185,15 +187,18 @@ class SlamGraph(KeyframeGraph):
         found = self._detector.add(means_points(means), keyframe.path_m, keyframe.segment, np.array(self._poses))
         self._unrefined += [len(self._closures) + i for i, closure in enumerate(found) if closure.accepted]
         self._closures += found
-        self._refine_closures(until=index - REACH)
-        if self._relaxing.is_due(found, self._poses):
+        refined = self._refine_closures(until=index - REACH)
+        self._is_map_due = self._is_map_due or bool(refined)
+        if self._relaxing.is_due([*found, *refined], self._poses):
             self._poses = list(relax(np.array(self._poses), self.edges, self._accepted(), self.attitudes))
 
-    def _refine_closures(self, until: int) -> None:
+    def _refine_closures(self, until: int) -> list[LoopClosure]:
         """Register accepted closures again whose later keyframe is not after `until`: its neighbours are all there."""
-        for row in [row for row in self._unrefined if self._closures[row].second <= until]:
+        rows = [row for row in self._unrefined if self._closures[row].second <= until]
+        for row in rows:
             self._unrefined.remove(row)
             self._closures[row] = self._refined(self._closures[row])
+        return [self._closures[row] for row in rows]
 
     def _refined(self, closure: LoopClosure) -> LoopClosure:
         """A closure registered on all points of both submaps and their neighbours."""
@@ -202,10 +207,12 @@ class SlamGraph(KeyframeGraph):
         target, source = (near.submap(key, self._config.loops.max_range_m, cell_m) for key in ends)
         closure = refine(target, source, closure, near.drift(closure.first) + near.drift(closure.second)) or closure
         first, second = self.keyframes[closure.first], self.keyframes[closure.second]
-        if first.segment != second.segment or any(closure.first < count <= closure.second for count in self.redraws):
+        if first.segment != second.segment:
             return closure
-        way = np.array(self.scan_poses[first.scan : second.scan + 1])
-        return as_registered(closure, way, first.covariance, second.covariance, self._local_radius_m)
+        # Of a recording that was added, it is not known what lay where in the maps that were drawn anew.
+        if self._first_scans and any(closure.first < count <= closure.second for count in self.redraws):
+            return closure
+        return self._laid.measured(closure, first, second, self.scan_poses)
 
 
 def _by_key(items: Sequence[T], key: Callable[[T], int]) -> dict[int, list[T]]:

@@ -153,10 +153,13 @@ def write_views(points: FloatArray, sensor: FloatArray, views: Floats) -> None:
 @compiled
 def add_moments(
     points: FloatArray, elevations: FloatArray, views: Floats, keys: Keys, rows: Rows, cell_m: float,
-    grid_keys: Keys, sums: Floats,
+    grid_keys: Keys, sums: Floats, weight: float,
 ) -> None:  # fmt: skip
-    """Add points (N, 3) with elevations (N,) and views (N, 3) to the sums of their cells, unless these are frozen."""
-    scale = 1.0 / cell_m
+    """Add points (N, 3) with elevations (N,) and views (N, 3) to the sums of their cells, unless these are frozen.
+
+    Each counts as so many points as its weight.
+    """
+    scale, w = 1.0 / cell_m, np.float32(weight)
     is_growing = np.empty(len(rows), dtype=np.bool_)
     for n in range(len(rows)):
         is_growing[n] = sums[rows[n], 0] < _MOST_POINTS
@@ -171,21 +174,21 @@ def add_moments(
         z = np.float32(sz - cell_of(sz) - 0.5)
         elevation = np.float32(elevations[n])
         cell = sums[rows[n]]
-        cell[0] += np.float32(1.0)
-        cell[1] += x
-        cell[2] += y
-        cell[3] += z
-        cell[4] += x * x
-        cell[5] += x * y
-        cell[6] += x * z
-        cell[7] += y * y
-        cell[8] += y * z
-        cell[9] += z * z
-        cell[10] += elevation
-        cell[11] += elevation * elevation
-        cell[12] += views[n, 0]
-        cell[13] += views[n, 1]
-        cell[14] += views[n, 2]
+        cell[0] += w
+        cell[1] += w * x
+        cell[2] += w * y
+        cell[3] += w * z
+        cell[4] += w * x * x
+        cell[5] += w * x * y
+        cell[6] += w * x * z
+        cell[7] += w * y * y
+        cell[8] += w * y * z
+        cell[9] += w * z * z
+        cell[10] += w * elevation
+        cell[11] += w * elevation * elevation
+        cell[12] += w * views[n, 0]
+        cell[13] += w * views[n, 1]
+        cell[14] += w * views[n, 2]
 
 
 @compiled

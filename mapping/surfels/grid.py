@@ -75,13 +75,16 @@ class SurfelGrid(Stateful):
         self._resize(len(self._keys))
         self._index(len(self._keys))
 
-    def insert(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
+    def insert(
+        self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]], weight: float = 1.0
+    ) -> None:
         """Insert points (N, 3) of the world.
 
         Args:
             points: in the world.
             elevations: (N,) their angles above the sensor's equator, radians.
             views: (N, 3) unit directions from the points to the sensor.
+            weight: how many points each of them counts as.
         """
         if not len(points):
             return
@@ -99,7 +102,7 @@ class SurfelGrid(Stateful):
             self._reserve(len(self))
             kernels.link_sides(keys[turned], rows[turned], *self._hash.slots, self._sums)
         seen = np.ascontiguousarray(elevations), views
-        kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums)
+        kernels.add_moments(points, *seen, keys, rows, self.cell_m, self._keys, self._sums, weight)
 
     def insert_samples(self, points: FloatArray, elevations: FloatArray, views: FloatArray) -> None:
         """Insert the `samples` of another grid; samples in one cell may be of both its sides."""

@@ -83,10 +83,15 @@ class SurfelMap(Stateful):
             for grid in self._grids:
                 grid.tidy()
 
-    def insert_seen(self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]]) -> None:
-        """Insert points (N, 3) of the world, with elevations (N,), seen from along views (N, 3), unit length."""
+    def insert_seen(
+        self, points: FloatArray, elevations: FloatArray, views: NDArray[np.floating[Any]], weight: float = 1.0
+    ) -> None:
+        """Insert points (N, 3) of the world, with elevations (N,), seen from along views (N, 3), unit length.
+
+        Each counts as so many points as its weight.
+        """
         for grid in self._grids:
-            grid.insert(points, elevations, views)
+            grid.insert(points, elevations, views, weight)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray, level: int = 0) -> Correspondences:
         """Correspondences of points (N, 3) of the world, seen from a pose (4, 4).

@@ -32,10 +32,17 @@ NEAR = np.array([0.0, 0.002, 0.0, 0.012, -0.01, 0.0])
 
 
 def test_where_the_map_held_the_place_the_trajectory_measures_the_closure(round_trip: FloatArray) -> None:
-    found = as_registered(closure(round_trip, NEAR), round_trip, REGISTERED, REGISTERED, radius_m=100.0)
+    found = as_registered(closure(round_trip, NEAR), round_trip[0], round_trip, REGISTERED, REGISTERED, radius_m=100.0)
     np.testing.assert_allclose(found.T_first_second, inverse(round_trip[0]) @ round_trip[-1], atol=1e-12)
     assert found.accepted
     assert np.linalg.eigvalsh(found.covariance - REGISTERED).min() > 0.0, "both registrations err"
+
+
+def test_a_submap_that_was_laid_elsewhere_is_measured_there(round_trip: FloatArray) -> None:
+    """The local map was drawn anew before the last ten scans, which are registered to its surfaces."""
+    measured, T_odom_first = closure(round_trip, NEAR), round_trip[0] @ exp(0.5 * NEAR)
+    found = as_registered(measured, T_odom_first, round_trip[-10:], REGISTERED, REGISTERED, radius_m=30.0)
+    np.testing.assert_allclose(found.T_first_second, inverse(T_odom_first) @ round_trip[-1], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -52,4 +59,4 @@ def test_elsewhere_the_closure_counts(
     round_trip: FloatArray, radius_m: float, first: FloatArray | None, off: FloatArray
 ) -> None:
     measured = closure(round_trip, off)
-    assert as_registered(measured, round_trip, first, REGISTERED, radius_m) is measured
+    assert as_registered(measured, round_trip[0], round_trip, first, REGISTERED, radius_m) is measured

@@ -85,6 +85,17 @@ def test_several_batches_make_what_one_makes(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(other[:, COUNT], one[:, COUNT], rtol=1e-5)
 
 
+def test_a_point_counts_as_many_as_it_weighs(rng: np.random.Generator) -> None:
+    points, elevations = cloud(rng, 3_000), rng.normal(size=3_000)
+    weighed, repeated = SurfelGrid(CELL), SurfelGrid(CELL)
+    weighed.insert(points, elevations, from_above(3_000), weight=3.0)
+    repeated.insert(np.repeat(points, 3, axis=0), np.repeat(elevations, 3), from_above(9_000))
+    one, other = weighed.surfels(weighed.find(points)), repeated.surfels(repeated.find(points))
+    for columns in (MEAN, SPREADS, ELEVATION_SPREAD):
+        np.testing.assert_allclose(one[:, columns], other[:, columns], atol=1e-4)
+    np.testing.assert_allclose(one[:, COUNT], other[:, COUNT], rtol=1e-5)
+
+
 @pytest.mark.parametrize("offset", [-0.004, 0.004])
 def test_a_wall_along_the_border_of_cells_is_one_plane(rng: np.random.Generator, offset: float) -> None:
     """Noise throws half of its points into the cells on either side."""

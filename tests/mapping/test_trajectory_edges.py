@@ -62,3 +62,11 @@ def test_where_tracking_was_lost_the_edge_is_loose_whatever_the_covariances_of_t
 def test_without_a_map_the_odometry_counts_once() -> None:
     [edge] = trajectory_edges(1, STEP, motion_of(scan(STEP)), None, None)
     np.testing.assert_array_equal(edge.covariance, drift_covariance(1.5, registered=False))
+
+
+def test_between_two_maps_the_edge_is_that_of_an_odometry() -> None:
+    """One of them was drawn anew, and surfaces lie elsewhere in it."""
+    [edge] = trajectory_edges(1, STEP, motion_of(scan(None)), SIGMA, SIGMA, one_map=False)
+    apart = edge.covariance - drift_covariance(1.5, registered=False)
+    assert np.linalg.eigvalsh(apart).min() > 0.0
+    assert len(trajectory_edges(1, STEP, motion_of(scan(STEP)), SIGMA, SIGMA, one_map=False)) == 2

@@ -1,0 +1,105 @@
+"""A local map drawn anew from submaps: what it holds, how firmly, and where submaps lay in it at a scan."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.state.stateful import Saved, State
+from lidarslam.mapping.global_map.global_map import VoxelMeans
+from lidarslam.mapping.global_map.voxel_rows import Layout, Rows
+from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER, LaidSubmaps, draw_local_map
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+CELL_M, RADIUS_M, SPACING_M = 0.3, 10.0, 3.0
+WALL_M, OFF_M = 6.1, 0.1
+
+
+def means_of_wall(rng: np.random.Generator, x_m: float, half_size_m: float, spacing_m: float = 0.2) -> Rows:
+    """Means of a wall across the x axis, at that distance, in the keyframe's frame."""
+    along = np.arange(-half_size_m, half_size_m, spacing_m)
+    points = np.stack(np.meshgrid([x_m], along, along), axis=-1).reshape(-1, 3)
+    points = points + rng.normal(0.0, 0.003, points.shape)
+    views = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    return np.column_stack([points, views, np.ones(len(points))]).astype(np.float32)
+
+
+def at(x_m: float) -> FloatArray:
+    return exp([0.0, 0.0, 0.0, x_m, 0.0, 0.0])
+
+
+def off_wall_m(local_map: SurfelMap, half_size_m: float) -> float:
+    """By how much the surface that points of the wall correspond to lies behind it, the median."""
+    y, z = np.random.default_rng(5).uniform(-half_size_m, half_size_m, (2, 500))
+    matches = local_map.match(np.column_stack([np.full(500, WALL_M), y, z]), np.eye(4))
+    assert len(matches.index) > 400
+    return float(np.median(np.abs(matches.residuals(np.column_stack([np.full(500, WALL_M), y, z])[matches.index]))))
+
+
+def test_scans_that_follow_do_not_shift_what_was_drawn(rng: np.random.Generator) -> None:
+    """They are registered to it; their own errors would repeat, and carry the surfaces along."""
+    submaps = [(np.eye(4), means_of_wall(rng, WALL_M, 2.5)) for _ in range(2)]
+    drawn = draw_local_map(submaps, CELL_M, RADIUS_M)
+    assert off_wall_m(drawn, 1.5) < 0.005
+    for _ in range(20):
+        points = means_of_wall(rng, WALL_M + OFF_M, 2.5)[:, :3].astype(np.float64)
+        drawn.insert(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.zeros(3))
+    assert off_wall_m(drawn, 1.5) < 0.02
+
+
+def laid(submaps: dict[int, Rows], poses: Iterable[FloatArray], targets: FloatArray) -> tuple[LaidSubmaps, SurfelMap]:
+    """After the poses as registered, the map drawn with others, before scan 40."""
+    laid = LaidSubmaps(RADIUS_M)
+    for pose in poses:
+        laid.follow(pose)
+    members = np.ones(len(targets), dtype=np.bool_)
+    drawn = laid.redrawn(targets, members, CELL_M, lambda key: VoxelMeans(submaps[key], Layout()), scan=40)
+    assert drawn is not None
+    return laid, drawn
+
+
+def test_a_drawn_map_holds_all_that_its_submaps_reach(rng: np.random.Generator) -> None:
+    """Else the latest scans alone would make its border, which most of a scan may lie beyond."""
+    far_m = 2.5 * RADIUS_M
+    submaps = {key: means_of_wall(rng, far_m, 4.0) for key in range(2)}
+    _, drawn = laid(submaps, [at(0.0), at(1.0)], np.array([at(0.0), at(1.0)]) @ exp([0, 0, 0, 0.0, 1.0, 0.0]))
+    for x_m in (0.0, 0.3 * RADIUS_M):  # what is too far is dropped when the sensor has moved
+        drawn.insert(np.array([[x_m + 3.0, 0.0, 0.0]]), np.zeros(1), np.array([x_m, 0.0, 0.0]))
+    wall = np.column_stack([np.full(50, far_m), *rng.uniform(-2.0, 4.0, (2, 50))])
+    assert len(drawn.match(wall, np.eye(4)).index) > 40
+
+
+@pytest.fixture
+def revisited(rng: np.random.Generator) -> tuple[LaidSubmaps, FloatArray]:
+    """Out and back: keyframe 9 is beside keyframe 0, and has drifted off; keyframes 4 and 5 are beyond the radius."""
+    ways = [SPACING_M * min(key, 9 - key) for key in range(10)]
+    poses = np.array([at(way + (0.5 if key > 4 else 0.0)) for key, way in enumerate(ways)])
+    targets = np.array([at(way + 0.5) for way in ways])
+    submaps = {key: means_of_wall(rng, WALL_M, 2.5) for key in range(10)}
+    return laid(submaps, poses, targets)[0], poses
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_where_a_submap_lay_when_a_scan_was_registered(
+    revisited: tuple[LaidSubmaps, FloatArray], through_disk: Callable[[State], Saved], resumed: bool
+) -> None:
+    laid, poses = revisited
+    if resumed:
+        again = LaidSubmaps(RADIUS_M)
+        again.restore(through_disk(laid.state()))
+        laid = again
+    exchanged = 40 + SCANS_LATER
+    before = laid.place(0, 0, poses[0], exchanged - 1)
+    after = laid.place(0, 0, poses[0], exchanged)
+    assert before is not None
+    assert after is not None
+    assert (before[1], after[1]) == (0, exchanged)
+    np.testing.assert_array_equal(before[0], poses[0])
+    np.testing.assert_allclose(after[0], at(0.5), atol=1e-12)
+    assert laid.place(4, 16, poses[4], exchanged) is None, "beyond the radius"
+    later = laid.place(10, 45, at(-1.0), exchanged + 3)
+    assert later is not None
+    assert later[1] == 45, "of a keyframe since then, its own pose"
+    assert laid.is_exchanged(exchanged - 1, exchanged)
+    assert not laid.is_exchanged(exchanged, exchanged + 5)
