@@ -71,7 +71,7 @@ class _Graph(SlamGraph):
 
     def place_in_map(self, scan: int, at: int) -> FloatArray:
         """(4, 4) where a scan's surfaces lie in the map that another one was registered to."""
-        T, keys = self.scan_poses[scan], [keyframe.scan for keyframe in self._keyframes]
+        T, keys = self.scan_poses[scan], [keyframe.scan for keyframe in self.keyframes]
         laid = [poses for since, poses in self.laid if since <= at]
         key = int(np.searchsorted(keys, scan, side="right")) - 1
         if not laid or not 0 <= key < len(laid[-1]):

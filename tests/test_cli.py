@@ -25,8 +25,8 @@ from lidarslam.mapping.config import MappingName
 from lidarslam.odometry.config import ImageConfig, NetworkConfig
 from lidarslam.odometry.network.checkpoint import checkpoint_of, save_checkpoint
 from lidarslam.odometry.network.networks import make_network
-from lidarslam.run.modes.merge.merge import MergeOutcome
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.summary.written_map import WrittenMap
 
 

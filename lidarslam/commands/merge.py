@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from lidarslam.commands.shared.jobs import jobs_options, take_where
 from lidarslam.commands.shared.options import (
     PATH,
     CommandWithExample,
@@ -20,11 +21,18 @@ from lidarslam.commands.shared.options import (
 from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, say
 
 
-@click.command(cls=CommandWithExample, epilog="lidarslam merge ground_floor.mcap stairs.mcap -o building")
+@click.command(
+    cls=CommandWithExample,
+    epilog="""lidarslam merge ground_floor.mcap stairs.mcap -o building
+    lidarslam merge ground_floor.mcap stairs.mcap -o building --resume
+    lidarslam merge *.mcap -o site --jobs 4""",
+)
 @click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE...")
 @out_option("Directory of the merged map.", "merged/SOURCE_TIME, after the first")
 @odometry_options
 @map_options
+@jobs_options
+@click.option("--resume", is_flag=True, help="Continue a merge that was killed or stopped; repeat its other options.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier merge in the directory.")
 @reader_options
 @config_options
@@ -32,9 +40,9 @@ from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, s
 def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **options: Any) -> None:
     """Build one map of several recordings of a place.
 
-    Each recording is run, and joined to the earlier ones by loop closures. DIR holds the common map, and for each
-    recording a run directory with its poses in the common frame. A recording without a loop closure to the others is
-    left out of the common map, and the exit status is 1.
+    Each recording is tracked, --jobs at a time, and joined to the earlier ones by loop closures. DIR holds the common
+    map, and for each recording a run directory with its poses in the common frame. A recording without a loop closure
+    to the others is left out of the common map, and the exit status is 1.
     """
     from lidarslam.run.modes.merge.merge import merge as execute
     from lidarslam.run.modes.merge.parts import MergeRequest
@@ -42,9 +50,13 @@ def merge(ctx: click.Context, /, sources: tuple[Path, ...], out: Path | None, **
     from lidarslam.run.progress import show_progress
     from lidarslam.storage.default_places import source_name
 
-    config, map_formats = take_config(options, *sources), take_map_formats(options)
+    if options["resume"] and options["overwrite"]:
+        raise click.UsageError("--resume continues a merge, --overwrite replaces it; choose one")
+    if options["resume"] and out is None:
+        raise click.UsageError("--resume needs --out, the directory of the merge")
+    config, map_formats, where = take_config(options, *sources), take_map_formats(options), take_where(options)
     out = out or default_out("merged", source_name(sources[0], config.reader.sequence))
-    outcome = execute(MergeRequest(sources, out, config, map_formats, **options), show_progress)
+    outcome = execute(MergeRequest(sources, out, config, map_formats, where=where, **options), show_progress)
     say(format_merge(out, outcome))
     for line in outcome.stopped:
         note(line)

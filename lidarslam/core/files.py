@@ -6,6 +6,7 @@ import fcntl
 import os
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -14,6 +15,7 @@ from lidarslam.core.errors import OutputError
 
 _PARTIAL = ".partial-"
 _LOCKED = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+_POLL_S = 0.2
 
 
 @contextlib.contextmanager
@@ -113,26 +115,35 @@ def _linked(path: Path) -> OutputError:
 
 
 @contextlib.contextmanager
-def only_writer(directory: Path) -> Iterator[None]:
+def only_writer(directory: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Hold an advisory lock on an existing directory; it ends with the process, however that ends.
 
     Where the file system has no locks, nothing is locked.
 
     Raises:
-        OutputError: another process holds it.
+        OutputError: another process holds it, and does so for longer than `patience_s`.
     """
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in _LOCKED:
+        until = time.monotonic() + patience_s
+        while not _is_locked(descriptor):
+            if time.monotonic() >= until:
                 raise OutputError(
                     f"{directory}: another lidarslam is writing there; wait until it is done, or name another directory"
-                ) from None
+                )
+            time.sleep(_POLL_S)
         yield
     finally:
         os.close(descriptor)
+
+
+def _is_locked(descriptor: int) -> bool:
+    """Lock a directory; whether it is ours, or cannot be locked at all."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in _LOCKED
+    return True
 
 
 def cannot_write(path: Path, error: Exception, remedy: str = "") -> OutputError:

@@ -1,6 +1,5 @@
 """Faults of a recording's scans, counted while they are read."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,7 +35,7 @@ class Faults:
     """The faults of one pass through a recording, counted by kind; of each kind the first is remembered."""
 
     left_out: int = 0  # number of scans that were left out
-    _counts: Counter[str] = field(default_factory=Counter)
+    _counts: dict[str, int] = field(default_factory=dict)
     _first: dict[str, str] = field(default_factory=dict)
 
     def leave_out(self, kind: str, example: str, count: int = 1) -> None:
@@ -50,7 +49,7 @@ class Faults:
 
     def note(self, kind: str, example: str, count: int = 1) -> None:
         """Count scans that are used in spite of a fault."""
-        self._counts[kind] += count
+        self._counts[kind] = self._counts.get(kind, 0) + count
         self._first.setdefault(kind, example)
 
     def warnings(self) -> tuple[str, ...]:

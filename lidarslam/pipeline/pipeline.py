@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from threadpoolctl import threadpool_limits
 
@@ -19,14 +19,12 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.stages import Stages
-
-if TYPE_CHECKING:  # GTSAM takes a while to load
-    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 # Scans that may wait for the map, which now and then takes as long as several scans.
 _SCANS_BEHIND = 8
@@ -61,7 +59,7 @@ class Pipeline(Stateful):
         odometry: Odometry,
         localiser: Localiser,
         config: GlobalMapConfig,
-        graph: "SlamGraph | None" = None,
+        graph: KeyframeGraph | None = None,
         checkpointer: Checkpointer | None = None,
         store: TileStore | None = None,
     ) -> None:

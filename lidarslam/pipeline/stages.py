@@ -5,7 +5,6 @@ called on a thread of its own; the pose graph is built on another.
 """
 
 import time
-from typing import TYPE_CHECKING
 
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
@@ -13,6 +12,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import GlobalMapConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.background_worker import BackgroundWorker
@@ -20,9 +20,6 @@ from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult, graph
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.map_correction import MapCorrection
-
-if TYPE_CHECKING:  # GTSAM takes a while to load
-    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 # Calls that may wait for the graph, which takes as long for a loop closure as for all scans up to the next keyframe.
 _GRAPH_CALLS_BEHIND = 64
@@ -48,7 +45,7 @@ class Stages(Stateful):
         odometry: Odometry,
         localiser: Localiser,
         config: GlobalMapConfig,
-        graph: "SlamGraph | None" = None,
+        graph: KeyframeGraph | None = None,
         store: TileStore | None = None,
     ) -> None:
         self._odometry = odometry
@@ -118,7 +115,7 @@ class Stages(Stateful):
         self._graph_worker.close()
 
 
-def _follow(graph: "SlamGraph", scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
+def _follow(graph: KeyframeGraph, scan: GraphScan, cell_m: float | None) -> SurfelMap | None:
     """Give the graph a scan; the local map of surfels, where there is one and loop closures change it."""
     graph.add(scan)
     return None if cell_m is None else graph.redrawn_local_map(cell_m)

@@ -3,12 +3,12 @@
 import logging
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from lidarslam.config.settings import CheckpointConfig
 from lidarslam.core.errors import OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.plain_text import count
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.run.resuming import scans_left
@@ -16,9 +16,6 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RERUN
 from lidarslam.storage.state_file import write_state
 from lidarslam.storage.unfinished import Unfinished
-
-if TYPE_CHECKING:
-    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +40,7 @@ class Checkpoints:
         config: CheckpointConfig,
         odometry: Odometry,
         log: ScanLog,
-        graph: "SlamGraph | None",
+        graph: KeyframeGraph | None,
     ) -> None:
         self._unfinished = unfinished
         self._config = config

@@ -24,7 +24,7 @@ from lidarslam.storage.unfinished import About
 logger = logging.getLogger(__name__)
 
 # Sections of the configuration that do not change the results.
-_WITHOUT_EFFECT = {"viewer": True, "checkpoints": True}
+WITHOUT_EFFECT = {"viewer": True, "checkpoints": True}
 
 
 def describe_computed(request: RunRequest, recording: Recording) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def describe_computed(request: RunRequest, recording: Recording) -> dict[str, An
         InputError: a file cannot be read.
     """
     config = request.config
-    tree = config.model_dump(mode="json", exclude=_WITHOUT_EFFECT)
+    tree = config.model_dump(mode="json", exclude=WITHOUT_EFFECT)
     if config.odometry.is_learned:
         from lidarslam.odometry.network.shipped import default_weights
 
@@ -55,12 +55,12 @@ def lost_when_finished(request: RunRequest) -> bool | None:
     try:
         tree = read_yaml(out / files.CONFIG)
         was_run = tree.pop(files.RUN_SECTION)
-        was = Config.model_validate(tree).model_dump(exclude=_WITHOUT_EFFECT)
+        was = Config.model_validate(tree).model_dump(exclude=WITHOUT_EFFECT)
         summary = read_summary(out)
         lost = summary["lost_scans"] > 0 or len(summary.get("map_contradictions", [])) > 0
     except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
-    if was_run != describe_run(request) or was != request.config.model_dump(exclude=_WITHOUT_EFFECT):
+    if was_run != describe_run(request) or was != request.config.model_dump(exclude=WITHOUT_EFFECT):
         raise InputError(f"{out}: holds another finished run; name another directory, or replace it with --overwrite")
     return lost
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
@@ -31,9 +32,6 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
-
-if TYPE_CHECKING:
-    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
 T = TypeVar("T")
 Progress = Callable[[int, int, ScanResult], None]
@@ -75,7 +73,7 @@ def track(
     chosen: range,
     odometry: Odometry,
     log: ScanLog,
-    graph: "SlamGraph | None",
+    graph: KeyframeGraph | None,
     viewer: Viewer,
     progress: Progress,
     unfinished: Unfinished | None = None,

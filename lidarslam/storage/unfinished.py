@@ -17,7 +17,7 @@ from lidarslam.core.text.json_text import read_json
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
 
-_SUBMAPS, _TILES = "submaps.bin", "tiles.bin"
+_SUBMAPS, _TILES, _TRACKED = "submaps.bin", "tiles.bin", "tracked.npz"
 # Differences to another run that an error lists.
 _LISTED = 3
 
@@ -89,7 +89,7 @@ class About:
         sources = " ".join(self.description.get("sources", ["SOURCE..."]))
         out = run if self.description["merge"] == "all" else run.parent
         return (
-            f"this merge did not finish; make it again with lidarslam merge {sources} --out {out} --overwrite"
+            f"this merge did not finish; resume it with lidarslam merge {sources} --out {out} --resume"
             " and the options it was begun with"
         )
 
@@ -126,13 +126,16 @@ class Unfinished:
         run: its directory.
         about: which run it is.
         saved: the state to go on from, None to begin.
+        folder: where its files lie.
         state, submaps, tiles: the files of the state, of the pose graph's submaps, and of the global map's tiles.
+        tracked: the file of a recording of a merge that was tracked.
     """
 
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
-        self._folder = run / UNFINISHED
-        self.state, self.submaps, self.tiles = run / STATE, self._folder / _SUBMAPS, self._folder / _TILES
+        self.folder = run / UNFINISHED
+        self.state, self.submaps, self.tiles = run / STATE, self.folder / _SUBMAPS, self.folder / _TILES
+        self.tracked = self.folder / _TRACKED
         self.saved: Saved | None = None
 
     @classmethod
@@ -157,10 +160,10 @@ class Unfinished:
             _require_same(run, about.description, description)
         unfinished = cls(run, about or About(description), resume)
         try:
-            make_own_folder(unfinished._folder)
+            make_own_folder(unfinished.folder)
         except OSError as error:
-            raise cannot_write(unfinished._folder, error) from error
-        for folder in (run, unfinished._folder):
+            raise cannot_write(unfinished.folder, error) from error
+        for folder in (run, unfinished.folder):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()
         if about is None:
@@ -170,9 +173,14 @@ class Unfinished:
         try:
             yield unfinished
         except BaseException:
-            if not was_there and not unfinished.state.is_file() and not directory.is_mixed:
+            if not was_there and not unfinished.is_resumable and not directory.is_mixed:
                 unfinished._remove()
             raise
+
+    @property
+    def is_resumable(self) -> bool:
+        """Whether something was done that need not be done again: by it, or by the parts of a merge."""
+        return self.state.is_file() or self.tracked.is_file() or any(self.run.glob(f"*/{ABOUT}"))
 
     def begin(self, scans: int) -> None:
         """Mark the results in the directory, if any, as not this run's; `scans` are done already where it resumes."""
@@ -187,19 +195,24 @@ class Unfinished:
         else:
             self._remove()
 
+    def remove_checkpoint(self) -> None:
+        """All scans are tracked: nothing goes on from the state."""
+        for path in (self.state, self.tiles):
+            path.unlink(missing_ok=True)
+
     def _remove(self) -> None:
-        if self._folder.is_symlink():  # what it leads to is not ours
-            self._folder.unlink()
+        if self.folder.is_symlink():  # what it leads to is not ours
+            self.folder.unlink()
             return
         (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are nothing
         self._remove_files()
         with contextlib.suppress(OSError):  # another file lies there
-            self._folder.rmdir()
+            self.folder.rmdir()
 
     def _remove_files(self) -> None:
-        if self._folder.is_dir():
-            remove_partial_files(self._folder)
-        for path in (self.state, self.submaps, self.tiles):
+        if self.folder.is_dir():
+            remove_partial_files(self.folder)
+        for path in (self.state, self.submaps, self.tiles, self.tracked):
             path.unlink(missing_ok=True)
 
 

@@ -30,13 +30,10 @@ class Attitude:
 
 
 def measured_attitude(
-    scan: GraphScan, keyframes: Sequence[Keyframe], scan_poses: Sequence[FloatArray], first_scans: Sequence[int]
+    scan: GraphScan, keyframes: Sequence[Keyframe], scan_poses: Sequence[FloatArray]
 ) -> list[Attitude]:
-    """Gravity as measured with the latest scan, in the last keyframe; nothing where nothing was measured.
-
-    Nor in later recordings than the first: their worlds are not that of the graph.
-    """
-    if scan.gravity is None or not keyframes or len(first_scans) > 1:
+    """Gravity as measured with the latest scan, in the last keyframe; nothing where nothing was measured."""
+    if scan.gravity is None or not keyframes:
         return []
     T_lidar_keyframe = inverse(scan.T_world_lidar) @ scan_poses[keyframes[-1].scan]
     gravity = scan.gravity.turned(T_lidar_keyframe[:3, :3])

@@ -162,18 +162,15 @@ class LaidSubmaps(Stateful):
         return np.asarray(np.linalg.norm(poses[:, :3, 3] - self._poses[-1][:3, 3], axis=1), dtype=np.float64)
 
 
-def connected_with_last(
-    keyframes: Sequence[Keyframe], closures: Iterable[RelativePose], first_scan: int
-) -> NDArray[np.bool_]:
-    """(K,) the keyframes of the recording that begins with a scan, as far as their poses follow from the last one's.
+def connected_with_last(keyframes: Sequence[Keyframe], closures: Iterable[RelativePose]) -> NDArray[np.bool_]:
+    """(K,) the keyframes whose poses follow from the last one's.
 
     Those of a segment do; loop closures join segments.
     """
     segments = np.array([keyframe.segment for keyframe in keyframes])
     pairs = [(int(key), int(key) + 1) for key in np.flatnonzero(np.diff(segments) == 0)]
     component = first_connected(len(keyframes), pairs + [(closure.first, closure.second) for closure in closures])
-    is_own = np.array([keyframe.scan >= first_scan for keyframe in keyframes])
-    return np.asarray((component == component[-1]) & is_own)
+    return np.asarray(component == component[-1])
 
 
 def _reach_m(rows: Rows) -> float:

@@ -13,18 +13,18 @@ from lidarslam.mapping.pose_graph.keyframes import Keyframe
 _ROUNDING = 1e-6
 
 
-def require_submaps(keyframes: int, poses: int, laid: int, submaps: int) -> None:
-    """Refuse other numbers of poses than of keyframes; of the last one, the submap may still grow.
+def require_poses(keyframes: int, poses: int, laid: int) -> None:
+    """Refuse other numbers of poses than of keyframes.
 
     Raises:
         ValueError: they differ.
     """
-    if not keyframes == poses == laid or keyframes - submaps not in (0, 1):
-        raise ValueError(f"{keyframes} keyframes have {poses} and {laid} poses and {submaps} submaps")
+    if not keyframes == poses == laid:
+        raise ValueError(f"{keyframes} keyframes have {poses} and {laid} poses")
 
 
-def require_scans(keyframes: Sequence[Keyframe], first_scans: Sequence[int], scans: int) -> None:
-    """Refuse keyframes that are not of so many scans, in their order, or recordings that do not begin with one.
+def require_scans(keyframes: Sequence[Keyframe], scans: int) -> None:
+    """Refuse keyframes that are not of so many scans, in their order.
 
     Raises:
         ValueError: they are.
@@ -35,8 +35,6 @@ def require_scans(keyframes: Sequence[Keyframe], first_scans: Sequence[int], sca
     segments = [keyframe.segment for keyframe in keyframes]
     if segments != sorted(segments) or segments[-1:] > [scans]:
         raise ValueError(f"segments {segments[:3]}, ... of {scans} scans")
-    if list(first_scans) != sorted(first_scans) or first_scans[:1] != [0] or first_scans[-1] > scans:
-        raise ValueError(f"recordings do not begin with one of {scans} scans")
 
 
 def require_rows(rows: Iterable[int], count: int) -> None:

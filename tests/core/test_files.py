@@ -1,5 +1,6 @@
 """Files are whole or absent, and a directory has one writer."""
 
+import threading
 from pathlib import Path
 
 import pytest
@@ -56,3 +57,11 @@ def test_a_directory_has_one_writer(tmp_path: Path) -> None:
         pass
     with only_writer(tmp_path):
         pass
+
+
+def test_a_patient_writer_waits_for_the_other(tmp_path: Path) -> None:
+    other = only_writer(tmp_path)
+    other.__enter__()
+    threading.Timer(0.3, other.__exit__, (None, None, None)).start()
+    with only_writer(tmp_path, 60.0), pytest.raises(OutputError, match="another lidarslam is writing"):
+        only_writer(tmp_path).__enter__()

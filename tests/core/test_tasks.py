@@ -128,6 +128,18 @@ def test_a_cluster_that_is_not_there_is_named() -> None:
         pass
 
 
+def test_a_ray_that_does_not_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine it gives up, with an exception of no kind of its own."""
+    pytest.importorskip("ray")
+
+    def give_up(**_: object) -> None:
+        raise Exception("The current node timed out during startup.")
+
+    monkeypatch.setattr("ray.init", give_up)
+    with pytest.raises(ConfigError, match="--jobs 2: Ray does not start: The current node"), open_tasks(Where(2)):
+        pass
+
+
 def test_one_job_does_not_load_ray() -> None:
     code = "from lidarslam.core.tasks.start import *; from lidarslam.core.tasks.tasks import *; import sys\n"
     code += "with open_tasks(Where()) as tasks: print(list(tasks.run(abs, [-1])), 'ray' in sys.modules)"

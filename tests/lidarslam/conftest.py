@@ -1,7 +1,11 @@
 """Shared fixtures of the application's tests."""
 
+import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +15,31 @@ from lidarslam.cli import main
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
+
+
+@pytest.fixture(scope="session")
+def timeless() -> Callable[[Path], dict[str, Any]]:
+    """Reads every file of a merge; without times, memory, and how often it was resumed."""
+
+    def read(path: Path) -> Any:
+        if path.name == "summary.json":
+            return _timeless(json.loads(path.read_text()))
+        if path.name == "scans.csv":
+            rows = [row.split(",") for row in path.read_text().splitlines()]
+            timed = [column for column, title in enumerate(rows[0]) if title.startswith("ms_")]
+            return [[cell for column, cell in enumerate(row) if column not in timed] for row in rows]
+        return path.read_bytes()
+
+    return lambda out: {str(path.relative_to(out)): read(path) for path in out.rglob("*") if path.is_file()}
+
+
+def _timeless(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        timed = re.compile(r"_ms|ms_|elapsed_s|realtime|peak_rss|slowest|machine")
+        return {name: _timeless(value) for name, value in tree.items() if not timed.search(name)}
+    if isinstance(tree, list):
+        return [_timeless(value) for value in tree if "the run was resumed" not in str(value)]
+    return tree
 
 
 @pytest.fixture

@@ -5,10 +5,11 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +19,14 @@ from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
 from lidarslam.core.scan import Scan
+from lidarslam.core.tasks.tasks import Where
 from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.run.modes.merge.merge import MergeOutcome, merge
+from lidarslam.run.modes.merge.merge import merge
 from lidarslam.run.modes.merge.parts import MergeRequest
 from lidarslam.run.modes.merge.text import format_merge
+from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.tracking import Progress
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.motions import Motion
@@ -94,8 +97,8 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
-def request(out: Path, *sources: Path, overwrite: bool = False, settings: tuple[str, ...] = ()) -> MergeRequest:
-    return MergeRequest(sources, out, load_config(None, [*SETTINGS, *settings]), overwrite=overwrite)
+def request(out: Path, *sources: Path, settings: tuple[str, ...] = (), **more: Any) -> MergeRequest:
+    return MergeRequest(sources, out, load_config(None, [*SETTINGS, *settings]), **more)
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +214,19 @@ def test_each_recording_has_a_run_of_its_own(merged: tuple[Path, MergeOutcome]) 
     assert keyframes[0] + keyframes[2] == len(graph_keys(out)[0])
 
 
+@pytest.mark.slow
+def test_side_by_side_is_the_same_as_one_after_another(
+    merged: tuple[Path, MergeOutcome],
+    places: dict[str, Path],
+    tmp_path: Path,
+    timeless: Callable[[Path], dict[str, Any]],
+) -> None:
+    pytest.importorskip("ray")
+    sources = [places[name] for name in ("first", "foreign", "second")]
+    merge(request(tmp_path / "out", *sources, where=Where(2)), quiet)
+    assert timeless(tmp_path / "out") == timeless(merged[0])
+
+
 # What follows is about files and errors; the rooms are too small to be joined.
 FAST = (
     "odometry.method=kiss-icp",
@@ -218,6 +234,9 @@ FAST = (
     "odometry.kiss_icp.voxel_size_m=0.2",
     "odometry.kiss_icp.max_range_m=30",
 )
+
+
+MAPPED = ("odometry.method=constant-velocity", "checkpoints.every_scans=1")
 
 
 @pytest.fixture
@@ -279,9 +298,41 @@ def test_an_interruption_ends_all_with_what_there_is(rooms: list[Path], tmp_path
     assert len(read_tum(tmp_path / "out" / "02_in_room_1" / "trajectory.tum")) == 2
 
 
+def test_an_interrupted_merge_goes_on_where_it_was(
+    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
+) -> None:
+    """Neither the recording that was tracked is tracked again, nor the scans before the last checkpoint."""
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    merge(request(whole, *rooms, settings=MAPPED), quiet)
+    seen: list[tuple[str, int]] = []
+
+    @contextmanager
+    def interrupt(name: str) -> Iterator[Progress]:
+        def tell(number: int, _total: int, _result: ScanResult) -> None:
+            seen.append((name[:2], number))
+            if ("1/", 5) in seen and seen[-1] == ("2/", 3):  # not when it is resumed
+                raise KeyboardInterrupt
+
+        yield tell
+
+    outcome = merge(request(out, *rooms, settings=MAPPED), interrupt)
+    assert [recording.scans for recording in outcome.summary.recordings] == [5, 3, 0]
+    assert len(load_run(out / "02_in_room_1").trajectory) == 3  # the results so far are accepted
+    seen.clear()
+    with pytest.raises(InputError, match=r"was begun with global_map\.max_range_m .* \(now 7\.0\)"):
+        merge(request(out, *rooms, settings=(*MAPPED, "global_map.max_range_m=7"), resume=True), interrupt)
+    outcome = merge(request(out, *rooms, settings=MAPPED, resume=True), interrupt)
+    assert outcome.stopped == ()
+    assert {name for name, _ in seen} == {"2/", "3/"}
+    assert min(number for name, number in seen if name == "2/") > 1
+    assert timeless(out) == timeless(whole)
+    with pytest.raises(InputError, match="holds no run to resume"):
+        merge(request(out, *rooms, settings=MAPPED, resume=True), quiet)
+
+
 KILLED_MERGE = """
 import os, signal, sys
-import lidarslam.run.modes.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph, odometry.methods.kiss
+import lidarslam.run.modes.merge.merge, mapping.global_map.map_io, mapping.pose_graph.slam_graph
 from lidarslam.cli import main
 
 count = 0
@@ -311,13 +362,15 @@ for kill_at in kills:
 
 def killed_merges(root: Path, kills: list[int], rooms: list[Path]) -> str:
     """Merge into root/K for every K, each killed as it is about to do the Kth thing there; what was said."""
-    arguments = [argument for setting in (*SETTINGS, *FAST) for argument in ("--set", setting)]
+    arguments = [argument for setting in (*SETTINGS, *MAPPED) for argument in ("--set", setting)]
     command = [sys.executable, "-c", KILLED_MERGE, str(root), ",".join(map(str, kills)), *map(str, rooms), *arguments]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
 
 
-def test_a_killed_merge_is_refused_and_made_again(rooms: list[Path], tmp_path: Path) -> None:
+def test_a_killed_merge_is_refused_and_resumed_or_made_again(
+    rooms: list[Path], tmp_path: Path, timeless: Callable[[Path], dict[str, Any]]
+) -> None:
     """Killed as it begins, halfway and among its results, it leaves no run and no map."""
     rooms = rooms[:2]
     whole = tmp_path / "whole" / "1000000"
@@ -326,7 +379,7 @@ def test_a_killed_merge_is_refused_and_made_again(rooms: list[Path], tmp_path: P
     killed_merges(tmp_path / "killed", kills, rooms)
     for kill_at in kills:
         out = tmp_path / "killed" / str(kill_at)
-        again = f"this merge did not finish; make it again with lidarslam merge {rooms[0]} {rooms[1]} --out {out}"
+        again = f"this merge did not finish; resume it with lidarslam merge {rooms[0]} {rooms[1]} --out {out} --resume"
         with pytest.raises(InputError, match=re.escape(again)):
             load_map(out)
         for part in out.glob("0*"):
@@ -336,13 +389,13 @@ def test_a_killed_merge_is_refused_and_made_again(rooms: list[Path], tmp_path: P
             elif any((part / name).exists() for name in FILES):  # all was written, and only that was not said yet
                 assert len(load_run(part).trajectory) == 5
         with pytest.raises(OutputError, match=re.escape(again)):
-            merge(request(out, *rooms, settings=FAST), quiet)
-    merge(request(out, *rooms, overwrite=True, settings=FAST), quiet)
-    expected, made = ({path.relative_to(out) for path in out.rglob("*")} for out in (whole, out))
-    assert made == expected
-    assert len(load_run(out / "02_in_room_1").trajectory) == 5
+            merge(request(out, *rooms, settings=MAPPED), quiet)
+        if kill_at != kills[1]:
+            merge(request(out, *rooms, resume=True, settings=MAPPED), quiet)
+            assert timeless(out) == timeless(whole)
     reversed_out = tmp_path / "killed" / str(kills[1])
-    merge(request(reversed_out, *rooms[::-1], overwrite=True, settings=FAST), quiet)
+    merge(request(reversed_out, *rooms[::-1], overwrite=True, settings=MAPPED), quiet)
+    assert not list(reversed_out.rglob("unfinished"))
     assert sorted(path.name for path in reversed_out.iterdir() if path.is_dir()) == ["01_in_room_1", "02_in_room_0"]
 
 

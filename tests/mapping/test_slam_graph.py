@@ -17,6 +17,7 @@ from lidarslam.mapping.loops.closure import LoopClosure, RelativePose
 from lidarslam.mapping.pose_graph import slam_graph
 from lidarslam.mapping.pose_graph.correction import Corrected
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
@@ -131,7 +132,7 @@ def follow(walk: Walk, scans: list[GraphScan] | None = None, config: PoseGraphCo
     return graph
 
 
-def go_on(graph: SlamGraph, scans: Iterable[GraphScan]) -> None:
+def go_on(graph: KeyframeGraph, scans: Iterable[GraphScan]) -> None:
     before = len(graph.scan_poses)
     for i, scan in enumerate(scans):
         graph.add(scan)
@@ -139,12 +140,21 @@ def go_on(graph: SlamGraph, scans: Iterable[GraphScan]) -> None:
         assert len(graph.scan_poses) == before + i + 1
 
 
+def joined(*recordings: list[GraphScan]) -> SlamGraph:
+    """A graph of recordings that were tracked each by itself."""
+    graph = SlamGraph(CONFIG)
+    for scans in recordings:
+        tracked = KeyframeGraph(CONFIG.keyframes)
+        go_on(tracked, scans)
+        tracked.end_recording()
+        graph.add_recording(tracked)
+        tracked.close()
+    return graph
+
+
 def follow_all(*walks: Walk) -> tuple[SlamGraph, Corrected]:
     """One recording after the other."""
-    graph = follow(walks[0])
-    for walk in walks[1:]:
-        graph.begin_recording()
-        go_on(graph, walk.scans())
+    graph = joined(*(list(walk.scans()) for walk in walks))
     result = graph.finish()
     assert result is not None
     return graph, result
@@ -379,6 +389,17 @@ def test_a_file_of_submaps_that_was_changed_is_refused(
         SlamGraph(CONFIG, file=file).restore(saved)
 
 
+def test_a_recording_that_is_added_whole_has_the_result_of_one_that_is_followed(
+    walk: Walk, closed: tuple[SlamGraph, Corrected]
+) -> None:
+    _, expected = closed
+    _, result = follow_all(walk)
+    np.testing.assert_array_equal(result.T_world_lidar, expected.T_world_lidar)
+    assert result.inliers == expected.inliers
+    assert len(result.edges) == len(expected.edges)
+    assert len(result.closures) == len(expected.closures) > 0
+
+
 @pytest.fixture(scope="module")
 def two(walk: Walk, second_walk: Walk) -> tuple[SlamGraph, Corrected]:
     return follow_all(walk, second_walk)
@@ -449,13 +470,8 @@ def test_recordings_of_different_places_stay_apart(walk: Walk, foreign_walk: Wal
 def test_recordings_without_a_keyframe_are_in_frames_of_their_own(walk: Walk) -> None:
     """One without a scan, one whose scans are all lost; those around them are corrected as ever."""
     scans, far = list(walk.scans()), exp([0.0, 0.0, 0.0, 0.0, 0.0, 100.0])
-    graph = follow(walk, scans[:30])
-    graph.begin_recording()
-    graph.begin_recording()
     lost = [replace(s, T_world_lidar=far @ s.T_world_lidar, belongs_in_map=False, lost=True) for s in scans[:5]]
-    go_on(graph, lost)
-    graph.begin_recording()
-    go_on(graph, scans[29:39])
+    graph = joined(scans[:30], [], lost, scans[29:39])
     result = graph.finish()
     assert result is not None
     assert result.first_scans.tolist() == [0, 30, 30, 35]

@@ -43,7 +43,7 @@ def ray_tasks(where: Where) -> Iterator[Tasks]:
         try:
             with _own_signals():
                 _connect(where, place)
-        except (OSError, RuntimeError, ValueError, TimeoutError) as error:
+        except Exception as error:  # Ray raises plain ones, too
             raise ConfigError(_no_ray(where, error)) from error
         slots = int(ray.cluster_resources().get("CPU", 0))
         if not slots:

@@ -10,6 +10,7 @@ from typing import Any
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.files import only_writer, remove_partial_files
+from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.published.evalio_names import resolved
 from lidarslam.datasets.recording import Recording
@@ -36,9 +37,11 @@ class MergeRequest:
     config: Config  # loops are closed whatever it says
     map_formats: tuple[MapFormat, ...] = ()  # what the maps are written as beside .ply
     overwrite: bool = False  # whether an earlier merge, or a run, in `out` is replaced
+    resume: bool = False  # whether the merge in `out`, which was killed or stopped, is continued
+    where: Where = SERIAL  # where recordings are tracked
 
     def describe(self) -> dict[str, Any]:
-        """For config.yaml, and for an unfinished merge."""
+        """For config.yaml, and for the parts of an unfinished merge."""
         return {"version": version("lidarslam"), "sources": [str(resolved(source)) for source in self.sources]}
 
 
@@ -75,9 +78,8 @@ def open_parts(request: MergeRequest) -> list[tuple[RunRequest, Recording]]:
         name = safe_name(re.sub(r"[^\w.-]+", "_", recording.name).strip("._"))
         out = request.out / f"{number:02d}_{name}"
         require_apart(out, source)
-        run = RunRequest(source, out, request.config, map_formats=request.map_formats, overwrite=request.overwrite)
-        parts.append((run, recording))
-    about = None if request.overwrite else About.read(request.out)
+        parts.append((RunRequest(source, out, request.config, map_formats=request.map_formats), recording))
+    about = None if request.overwrite or request.resume else About.read(request.out)
     if about is not None:
         raise OutputError(f"{request.out}: {about.remedy(request.out)}")
     return parts

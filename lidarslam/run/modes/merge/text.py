@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from lidarslam.core.text.plain_text import count, joined
-from lidarslam.run.modes.merge.merge import MergeOutcome
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.results import RunOutcome
 from lidarslam.run.summary_text import format_map
 

@@ -1,0 +1,180 @@
+"""The results of a merge: the runs of the recordings, corrected by one graph, and the common map."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from lidarslam.config.settings import dump_yaml
+from lidarslam.core.errors import InputError
+from lidarslam.core.state.stateful import Saved
+from lidarslam.datasets.published.evalio_names import resolved
+from lidarslam.datasets.recording import Recording
+from lidarslam.mapping.global_map.moved_points import PlacedViews
+from lidarslam.mapping.pose_graph.g2o import format_g2o
+from lidarslam.run.loop_closing import FinishedGraph
+from lidarslam.run.modes.merge.parts import MergeRequest
+from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
+from lidarslam.run.modes.merge.tracked_part import read_part
+from lidarslam.run.modes.merge.tracking import PartDone
+from lidarslam.run.request import RunRequest, describe_run
+from lidarslam.run.results import RunOutcome, draw, final_map, write_map, write_results
+from lidarslam.run.summary.summary import GraphSummary, peak_rss_mb
+from lidarslam.run.summary.written_map import WrittenMap
+from lidarslam.run.tracking import Tracked, unless_damaged
+from lidarslam.storage import directory as files
+from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.state_file import read_state
+from lidarslam.storage.unfinished import About, Unfinished
+
+if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+
+# In the summary of a run; that of the merge says how to mend it.
+_OF_ITS_OWN = "its poses are in a frame of its own: nothing joins it to the other recordings"
+
+
+@dataclass(frozen=True)
+class MergeOutcome:
+    """A merge that was written."""
+
+    summary: MergeSummary  # in numbers
+    runs: tuple[RunOutcome | None, ...]  # of each recording; None where none of its scans could be used
+    stopped: tuple[str, ...]  # which recordings ended before their last scan, and why, a line each
+
+    @property
+    def apart(self) -> tuple[MergedRecording, ...]:
+        """The recordings that are not in the common map."""
+        return tuple(recording for recording in self.summary.recordings if not recording.joined)
+
+
+@dataclass(eq=False)
+class Part:
+    """A recording of a merge, with its run directory."""
+
+    request: RunRequest
+    recording: Recording
+    directory: RunDirectory
+    done: PartDone | None = None  # once it was tracked
+
+    @property
+    def scans(self) -> int:
+        """Number of scans that were tracked."""
+        return 0 if self.done is None else self.done.scans
+
+    @property
+    def unfinished(self) -> Unfinished:
+        """Where its task left the result."""
+        return Unfinished(self.request.out, About({}))
+
+    def saved(self) -> Saved:
+        """That result, read anew each time: those of all recordings need not fit into memory.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        return read_state(self.unfinished.tracked)
+
+    def tracked(self) -> Tracked:
+        """The recording as it was tracked; its map is drawn anew from the graph."""
+        part = read_part(self.saved())
+        truth = unless_damaged(lambda: self.recording.ground_truth, part.log, "no metrics")
+        error = None if part.stopped is None else KeyboardInterrupt() if part.interrupted else InputError(part.stopped)
+        log, faults, views, slides = part.log, part.faults, part.views, part.slides
+        return Tracked(self.recording, truth, log, part.asked, faults, None, views, slides, error)
+
+
+def missing(parts: Sequence[Part]) -> list[str]:
+    """Why there is no scan of some recordings, a line each."""
+    return [part.done.missing for part in parts if part.done is not None and part.done.missing]
+
+
+def write_merge(
+    request: MergeRequest, directory: RunDirectory, parts: Sequence[Part], graph: "SlamGraph", started: float
+) -> MergeOutcome:
+    """Optimise the graph, and write the runs and the common map."""
+    voxel_size_m = parts[0].request.config.global_map.voxel_size_m
+    scans = [part.scans for part in parts]
+    finished = (
+        None
+        if voxel_size_m is None
+        else FinishedGraph.of_recordings(graph, scans, voxel_size_m, request.config.global_map.most_points)
+    )
+    joined = [] if finished is None else finished.joined
+    runs = tuple(_write_run(part, finished, index, index in joined) for index, part in enumerate(parts))
+    common = None if finished is None else finished.common()
+    # First, because it says whose files the others are.
+    directory.write_text(files.CONFIG, dump_yaml(request.config, request.describe()))
+    written, beyond = WrittenMap(0, voxel_size_m, 0), None
+    if common is not None:
+        directory.write_text(files.POSE_GRAPH, format_g2o(common.keyframe_poses, common.edges))
+        views, begin = [], 0
+        for part in (parts[index] for index in joined):
+            if part.scans:
+                views.append(read_part(part.saved()).views.placed(common.T_world_lidar[begin : begin + part.scans]))
+            begin += part.scans
+        drawn = draw(common.global_map, PlacedViews.join(views), request.config.global_map, directory)
+        written, beyond = write_map(directory, drawn, request.map_formats), drawn.warning
+    recordings = tuple(_entry(part, runs[index], index in joined) for index, part in enumerate(parts))
+    summary = MergeSummary(
+        recordings=recordings,
+        elapsed_s=time.perf_counter() - started,
+        peak_rss_mb=peak_rss_mb(),
+        graph=None if common is None else GraphSummary.of(common),
+        map=written,
+        warnings=(*_warnings(recordings, runs), *missing(parts), *filter(None, [beyond])),
+    )
+    directory.write_json(files.SUMMARY, summary.to_json())
+    stopped = [
+        f"{part.request.source}: stopped after {run.summary.scans} scans: {run.stopped}"
+        for part, run in zip(parts, runs, strict=True)
+        if run is not None and run.stopped is not None
+    ]
+    return MergeOutcome(summary, runs, (*stopped, *missing(parts)))
+
+
+def _write_run(part: Part, finished: FinishedGraph | None, index: int, is_joined: bool) -> RunOutcome | None:
+    """The run of one recording, its poses as the graph corrected them."""
+    if not part.scans:
+        return None
+    tracked = part.tracked()
+    closed = None if finished is None else finished.outcome([index])
+    if closed is not None:
+        tracked.log.correct(closed.T_world_lidar)
+    if not is_joined:
+        tracked.log.warn(_OF_ITS_OWN)
+    drawn = final_map(tracked, closed, part.request.config.global_map, part.directory)
+    request = part.request
+    return write_results(
+        part.directory, request.config, describe_run(request), tracked, closed, drawn, request.map_formats
+    )
+
+
+def _entry(part: Part, run: RunOutcome | None, is_joined: bool) -> MergedRecording:
+    return MergedRecording(
+        name=part.recording.name,
+        directory=None if run is None else part.request.out.name,
+        source=str(resolved(part.request.source)),
+        scans=part.scans,
+        length_m=0.0 if run is None else run.summary.length_m,
+        lost_scans=0 if run is None else run.summary.lost_scans,
+        joined=is_joined,
+    )
+
+
+def _warnings(recordings: Sequence[MergedRecording], runs: Sequence[RunOutcome | None]) -> list[str]:
+    """Recordings that are not in the common map, and the warnings of runs."""
+    apart = [
+        f"{entry.directory}: left out of the common map, because no loop closure with the others was accepted."
+        f" Give recordings that share more of the way; the loops in {files.SUMMARY} say why each was rejected"
+        for entry in recordings
+        if not entry.joined and entry.directory is not None
+    ]
+    own = [
+        f"{entry.directory}: {warning}"
+        for entry, run in zip(recordings, runs, strict=True)
+        if run is not None
+        for warning in run.summary.warnings
+        if warning != _OF_ITS_OWN
+    ]
+    return [*apart, *own]

@@ -1,0 +1,134 @@
+"""The keyframes of one recording: their submaps, and edges along the trajectory; loop closures come later.
+
+Scans come with the poses that scan-to-map registration gave them. Some become keyframes; the points seen until the next
+one are the submap of each. Consecutive keyframes are joined by edges of the trajectory and of the odometry.
+"""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.scan import PointAttributes
+from lidarslam.core.state.stateful import TRANSFORM, Stateful
+from lidarslam.mapping.config import KeyframeConfig
+from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.attitude import Attitude, measured_attitude
+from lidarslam.mapping.pose_graph.edges import MotionSinceKeyframe, trajectory_edges
+from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.pose_graph.keyframes import Keyframe, KeyframeSelector
+from lidarslam.mapping.pose_graph.restored import require_edges, require_scans
+from lidarslam.mapping.pose_graph.submap_store import SubmapStore
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+
+class KeyframeGraph(Stateful):
+    """Follows one recording, scan after scan.
+
+    Args:
+        config: of the keyframes.
+        directory: where submaps are kept meanwhile, in a file without a name; None: where temporary files are.
+        file: where they are kept instead, for `restore`.
+    """
+
+    scan_poses: list[Annotated[FloatArray, TRANSFORM]]  # as registered
+    keyframe_ms: list[float]  # wall time of each keyframe
+    keyframes: list[Keyframe]
+    edges: list[RelativePose]  # along the trajectory
+    attitudes: list[Attitude]  # of keyframes
+    redraws: list[int]  # numbers of keyframes when the running local map was drawn anew
+    store: SubmapStore  # of all keyframes but the last, until `end_recording`
+    _selector: KeyframeSelector
+    _submap: GlobalMap | None  # of the last keyframe, in its frame
+    _motion: MotionSinceKeyframe
+    _path_m: float
+    _segment: int
+
+    def __init__(self, config: KeyframeConfig, directory: Path | None = None, file: Path | None = None) -> None:
+        self._selector = KeyframeSelector(config)
+        self.store = SubmapStore(directory, file)
+        self.scan_poses, self.keyframe_ms, self.keyframes, self.edges = [], [], [], []
+        self.attitudes, self.redraws = [], []
+        self._submap = None
+        self._motion, self._path_m, self._segment = MotionSinceKeyframe.none(), 0.0, 0
+
+    def _after_restore(self) -> None:
+        if len(self.keyframes) - len(self.store) not in (0, 1):
+            raise ValueError(f"{len(self.keyframes)} keyframes have {len(self.store)} submaps")
+        require_scans(self.keyframes, len(self.scan_poses))
+        require_edges(self.edges, self.attitudes, len(self.keyframes))
+
+    def draw(
+        self, points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: float, known: PointAttributes | None = None
+    ) -> None:
+        """Add points (N, 3) of the latest scan, at its pose as registered, to the submap of the last keyframe."""
+        if not self._is_submap_open:
+            return
+        if self._submap is None:
+            self._submap = GlobalMap(voxel_size_m)
+        self._submap.add(points, inverse(self.scan_poses[self.keyframes[-1].scan]) @ T_world_lidar, known)
+
+    def add(self, scan: GraphScan) -> None:
+        """Take the next scan; the points of the one before have been drawn by now."""
+        if self.scan_poses:
+            step_m = float(np.linalg.norm(scan.T_world_lidar[:3, 3] - self.scan_poses[-1][:3, 3]))
+            self._motion = self._motion.then(scan, step_m)
+            self._path_m += step_m
+        self.scan_poses.append(scan.T_world_lidar)
+        if scan.belongs_in_map and len(scan.points) and self._selector.is_due(scan.T_world_lidar, scan.points):
+            started = time.perf_counter()
+            self._selector.take(scan.T_world_lidar, scan.points)
+            self._close_submap()
+            self._begin_keyframe(scan)
+            self.keyframe_ms.append(1e3 * (time.perf_counter() - started))
+        self.attitudes += measured_attitude(scan, self.keyframes, self.scan_poses)
+
+    def redrawn_local_map(self, cell_m: float) -> SurfelMap | None:  # noqa: ARG002
+        """None: without loop closures the running local map stays as it is."""
+        return None
+
+    def end_recording(self) -> None:
+        """There are no more scans: the submap of the last keyframe is complete."""
+        self._close_submap()
+
+    def close(self) -> None:
+        """Give up the submaps on disk."""
+        self.store.close()
+
+    def means(self, key: int) -> VoxelMeans:
+        """The submap of a keyframe, be it the one that still grows."""
+        if key < len(self.store):
+            return self.store[key]
+        return (self._submap or GlobalMap(1.0)).means()
+
+    @property
+    def _is_submap_open(self) -> bool:
+        """Whether the last keyframe's submap still grows."""
+        return len(self.store) < len(self.keyframes)
+
+    def _close_submap(self) -> None:
+        """Keep the last keyframe's submap."""
+        if self._is_submap_open:
+            means, self._submap = self.means(len(self.keyframes) - 1), None
+            self._keep(means)
+
+    def _keep(self, means: VoxelMeans) -> None:
+        """Keep the submap of the last keyframe."""
+        self.store.append(means)
+
+    def _begin_keyframe(self, scan: GraphScan) -> None:
+        motion, self._motion = self._motion, MotionSinceKeyframe.none()
+        if self.keyframes:
+            last = self.keyframes[-1]
+            T_first_second = inverse(self.scan_poses[last.scan]) @ scan.T_world_lidar
+            key, one_map = len(self.keyframes), self._is_one_map(last.scan, len(self.scan_poses) - 1)
+            self.edges += trajectory_edges(key, T_first_second, motion, last.covariance, scan.covariance, one_map)
+            self._segment += motion.lost  # the drift model does not hold across
+        self.keyframes.append(Keyframe(len(self.scan_poses) - 1, self._segment, self._path_m, scan.covariance))
+
+    def _is_one_map(self, first: int, second: int) -> bool:  # noqa: ARG002
+        """Whether two scans were registered to the same local map, which is drawn anew after loop closures alone."""
+        return True
