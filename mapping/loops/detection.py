@@ -20,8 +20,10 @@ from lidarslam.mapping.loops.verification import MIN_INLIERS, Verification, veri
 
 logger = logging.getLogger(__name__)
 
-# Way after a closure before the next is looked for, in median ranges and at least in metres: another would repeat it.
-_SPACING_RANGES, _SPACING_M = 1.0, 2.0
+# Way after a closure before the next is sought: another would repeat it. After many on end it is the median range:
+# more of them cost time without improving the trajectory.
+_SPACING_M = 2.0
+_MANY = 40
 # A closure near the estimate needs no other while drift is less than this part of the median range.
 _ALONE_RANGES = 0.5
 # Any other needs so many consistent ones, spread over this way, in median ranges.
@@ -85,9 +87,11 @@ class LoopDetector(Stateful):
         """Whether the last closure is so recent that another would repeat it."""
         if self._pending or not self._accepted:
             return False
-        last, track = self._accepted[-1].second, self._database.track
-        spacing_m = max(_SPACING_M, _SPACING_RANGES * self._database.submaps[-1].range_m)
-        return bool(track.segment[last] == segment and way_m - track.way_m[last] < spacing_m)
+        track, range_m = self._database.track, self._database.submaps[-1].range_m
+        since_m = [way_m - track.way_m[one.second] for one in self._accepted[-_MANY:]]
+        are_many = len(since_m) == _MANY and since_m[0] < _MANY * range_m
+        spacing_m = max(_SPACING_M, range_m) if are_many else _SPACING_M
+        return bool(track.segment[self._accepted[-1].second] == segment and since_m[-1] < spacing_m)
 
     def _look(self, index: int) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""
