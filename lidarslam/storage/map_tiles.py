@@ -54,6 +54,7 @@ class TileWriter:
 
     def _begin(self) -> None:
         folder = self._directory.path / MAP_TILES
+        self._directory.before_change()
         try:
             if folder.is_symlink():
                 folder.unlink()

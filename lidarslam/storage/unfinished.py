@@ -2,10 +2,11 @@
 
 import contextlib
 import json
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, only_writer, remove_partial_files, replacing
@@ -13,11 +14,15 @@ from lidarslam.core.state.stateful import Saved
 from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
 
+logger = logging.getLogger(__name__)
+
 _SUBMAPS, _TILES = "submaps.bin", "tiles.bin"
 # Differences to another run that an error lists.
 _LISTED = 3
 
-Standing = Literal["at work", "stopped"]
+# At work; stopped, its results so far written; at work, with the results of an earlier run still whole.
+Standing = Literal["at work", "stopped", "over an earlier run"]
+_STANDINGS: tuple[Standing, ...] = get_args(Standing)
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,7 @@ class About:
     """Which run is unfinished; the content of run.json."""
 
     description: dict[str, Any]  # everything that decides what it computes
-    standing: Standing = "at work"  # at work, or stopped with its results so far written
+    standing: Standing = "at work"
     resumed_after: tuple[int, ...] = ()  # how many scans were done each time it was resumed
 
     @classmethod
@@ -38,7 +43,7 @@ class About:
         path = run / ABOUT
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-            standing: Standing = "stopped" if values["standing"] == "stopped" else "at work"
+            standing = next((one for one in _STANDINGS if one == values["standing"]), "at work")
             return cls(dict(values["description"]), standing, tuple(map(int, values["resumed_after"])))
         except (FileNotFoundError, NotADirectoryError):
             return None
@@ -74,7 +79,7 @@ class About:
 
 
 def require_whole(run: Path) -> None:
-    """Refuse the results of a run that was killed or is at work.
+    """Refuse the results of a run that was killed or is at work, unless they are still those of the run before.
 
     Raises:
         InputError: they are.
@@ -82,6 +87,8 @@ def require_whole(run: Path) -> None:
     about = About.read(run)
     if about is not None and about.standing == "at work":
         raise InputError(f"{run}: {about.remedy(run)}")
+    if about is not None and about.standing == "over an earlier run":
+        logger.warning("%s: these are the results of an earlier run; the one that was to replace it did not finish", run)
 
 
 def remove_unfinished(run: Path) -> None:
@@ -113,6 +120,7 @@ class Unfinished:
         self._folder = run / UNFINISHED
         self.state, self.submaps, self.tiles = run / STATE, self._folder / _SUBMAPS, self._folder / _TILES
         self.saved: Saved | None = None
+        self._keeps_earlier = False  # whether the results of an earlier run lie there, whole
 
     @classmethod
     @contextlib.contextmanager
@@ -140,10 +148,12 @@ class Unfinished:
         for folder in (run, unfinished._folder):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()
+        unfinished._keeps_earlier = directory.has_earlier and _holds_results(run)
         if about is None:
             unfinished._remove_files()
         elif unfinished.state.is_file():
             unfinished.saved = read_state(unfinished.state)
+        directory.before_change = unfinished._replace_earlier
         try:
             yield unfinished
         except BaseException:
@@ -152,10 +162,17 @@ class Unfinished:
             raise
 
     def begin(self, scans: int) -> None:
-        """Mark the results in the directory, if any, as not this run's; `scans` are done already where it resumes."""
+        """Mark the directory as one with a run at work; `scans` are done already where it resumes."""
         resumed = (*self.about.resumed_after, scans) if self._resumes else ()
-        self.about = replace(self.about, standing="at work", resumed_after=resumed)
+        standing: Standing = "over an earlier run" if self._keeps_earlier else "at work"
+        self.about = replace(self.about, standing=standing, resumed_after=resumed)
         self.about.write(self.run)
+
+    def _replace_earlier(self) -> None:
+        """Before the first result replaces one of an earlier run, mark these as not whole."""
+        if self.about.standing == "over an earlier run":
+            self.about = replace(self.about, standing="at work")
+            self.about.write(self.run)
 
     def end(self, stopped: bool) -> None:
         """The results are written; the checkpoint of a run that was stopped is kept."""
@@ -175,6 +192,15 @@ class Unfinished:
             remove_partial_files(self._folder)
         for path in (self.state, self.submaps, self.tiles):
             path.unlink(missing_ok=True)
+
+
+def _holds_results(run: Path) -> bool:
+    """Whether the results in a directory are whole: those of a run at work there may be mixed."""
+    try:
+        about = About.read(run)
+    except InputError:
+        return False
+    return about is None or about.standing != "at work"
 
 
 def _require_same(run: Path, was: dict[str, Any], asked: dict[str, Any]) -> None:
