@@ -9,8 +9,9 @@ state now and then, and to each peer in a process of its own. None is stored, al
 
 Prints a Markdown table, a row every `--every` scans: wall time of a scan, median and 99th percentile over those since
 the row before, of all stages but reading; the same of keyframes, on the graph's own thread; processor time of the whole
-process a scan; resident memory; size of the saved state and seconds to save it; size of the submaps on disk; cells of
-the local map, points of the global map, keyframes, loops accepted; the error of the position as it was registered. Then
+process a scan; resident memory; size of the saved state and seconds to save it; size of the submaps, and of tiles of
+the global map, on disk; cells of the local map, voxels of the global map in memory, keyframes, loops accepted; the
+error of the position as it was registered. Then
 the time of the final optimisation and of drawing the map anew, and ATE and KITTI's drift of all methods. The folder
 has the rows in `rows.jsonl` and the peers' in `NAME.jsonl`, as they come, and the end in `end.json`;
 `benchmarks/long_run_plot.py` draws them. A file `stop` in the folder ends the drive there, and everything is measured
@@ -42,7 +43,8 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_trajectory
-from lidarslam.mapping.config import PoseGraphConfig
+from lidarslam.mapping.config import GlobalMapConfig, PoseGraphConfig
+from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.config import OdometryConfig
@@ -74,8 +76,9 @@ class Row:
     state_mb: float
     save_s: float
     submaps_mb: float
+    tiles_mb: float
     cells: int
-    map_points: int
+    voxels: int
     keyframes: int
     loops: int
     error_m: float
@@ -123,7 +126,11 @@ def received(source: Connection, count: int, stop: Path) -> Iterator[Scan]:
 
 def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -> dict[str, Any]:
     """Our own pipeline over all scans, with a row now and then; what there is to report in the end."""
-    config = Config(odometry=OdometryConfig(method=options.odometry), pose_graph=PoseGraphConfig(enabled=True))
+    config = Config(
+        odometry=OdometryConfig(method=options.odometry),
+        global_map=GlobalMapConfig(most_points=options.most_points),
+        pose_graph=PoseGraphConfig(enabled=True),
+    )
     mapper = SurfelMapper(config.mapping)  # as `lidarslam run` makes it, but in reach
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
@@ -134,12 +141,13 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         log, odometry = ScanLog(), make_odometry(config.odometry)
         stack.callback(odometry.close)
         checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
-        pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, graph, checkpoints)
+        store = TileStore(options.out, unfinished.tiles)
+        pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, graph, checkpoints, store)
         scans = checkpoints.begin(pipeline, scans, is_recorded=False)
         for row in _rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished):
             print_row(row.cells_of_table())
             add_line(options.out / "rows.jsonl", asdict(row))
-        return _finish(graph, log, pipeline, truth)
+        return _finish(graph, log, pipeline, truth, options.most_points)
 
 
 def _rows(
@@ -173,11 +181,12 @@ def _rows(
             keyframe_p99_ms=float(np.percentile(keyframe_ms, 99.0)),
             cpu_ms=1e3 * (time.process_time() - cpu) / every,
             rss_mb=resident_mb(),
-            state_mb=unfinished.state.stat().st_size / 2**20 if unfinished.state.exists() else 0.0,
+            state_mb=_size_mb(unfinished.state),
             save_s=checkpoints.save_s,
-            submaps_mb=unfinished.submaps.stat().st_size / 2**20,
+            submaps_mb=_size_mb(unfinished.submaps),
+            tiles_mb=_size_mb(unfinished.tiles),
             cells=0 if mapper.local_map is None else len(mapper.local_map),
-            map_points=0 if pipeline.map.global_map is None else len(pipeline.map.global_map.points()),
+            voxels=0 if pipeline.map.global_map is None else len(pipeline.map.global_map._merged),
             keyframes=len(graph.keyframe_ms),
             loops=sum(closure.accepted for closure in list(graph._closures)),
             error_m=float(np.linalg.norm(true_position - result.T_world_lidar[:3, 3])),
@@ -186,7 +195,11 @@ def _rows(
         ms, keyframes, cpu = [], len(graph.keyframe_ms), time.process_time()
 
 
-def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajectory) -> dict[str, Any]:
+def _size_mb(file: Path) -> float:
+    return file.stat().st_size / 2**20 if file.exists() else 0.0
+
+
+def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajectory, most_points: int) -> dict[str, Any]:
     """Optimise, draw the map anew, and hold the trajectory against the truth, before and after."""
     stamps, before = log.stamps, log.trajectory
     started = time.perf_counter()
@@ -194,11 +207,12 @@ def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajector
     optimise_s = time.perf_counter() - started
     assert result is not None
     assert pipeline.map.voxel_size_m is not None
-    drawn = graph.draw_map(result, pipeline.map.voxel_size_m)
+    drawn = graph.draw_map(result, pipeline.map.voxel_size_m, most=most_points)
+    draw_s = time.perf_counter() - started - optimise_s
     return {
         "optimise_s": optimise_s,
-        "draw_s": time.perf_counter() - started - optimise_s,
-        "map_points": len(drawn.points()),
+        "draw_s": draw_s,
+        "map_points": sum(len(drawn.tile(tile).points()) for tile in drawn.tiles()),
         "loops": sum(result.inliers),
         "rss_mb": resident_mb(),
         "methods": {
@@ -246,6 +260,7 @@ def main() -> None:
     parser.add_argument("--columns", type=int, help="of a turn, to make less of a spinning sensor")
     parser.add_argument("--scans", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=1_000)
+    parser.add_argument("--most-points", type=int, default=2_000_000, help="of the global map in memory")
     parser.add_argument("--odometry", default="constant-velocity", help="in front of the map")
     parser.add_argument("--peers", nargs="*", default=["kiss-icp", "kiss-slam"])
     parser.add_argument("--seed", type=int, default=0)

@@ -32,6 +32,7 @@ def main() -> None:
     times.plot(ours["scans"], ours["cpu_ms"], "k-o", ms=3, label="lidarslam, map and graph")
     memory.plot(ours["scans"], ours["rss_mb"], "k-o", ms=3, label="lidarslam")
     memory.plot(ours["scans"], ours["submaps_mb"], "k--", label="its submaps, on disk")
+    memory.plot(ours["scans"], ours["tiles_mb"], "k-.", label="tiles of its map, on disk")
     memory.plot(ours["scans"], ours["state_mb"], "k:", label="its checkpoint, on disk")
     for name, rows in peers.items():
         times.plot(rows["scans"], rows["cpu_ms"], "-o", ms=3, label=name)

@@ -20,8 +20,8 @@ from lidarslam.mapping.loops.verification import MIN_INLIERS, Verification, veri
 
 logger = logging.getLogger(__name__)
 
-# Way after a closure before the next is looked for: another would repeat it.
-_SPACING_M = 2.0
+# Way after a closure before the next is looked for, in median ranges and at least in metres: another would repeat it.
+_SPACING_RANGES, _SPACING_M = 1.0, 2.0
 # A closure near the estimate needs no other while drift is less than this part of the median range.
 _ALONE_RANGES = 0.5
 # Any other needs so many consistent ones, spread over this way, in median ranges.
@@ -83,7 +83,8 @@ class LoopDetector(Stateful):
         if self._pending or not self._accepted:
             return False
         last, track = self._accepted[-1].second, self._database.track
-        return bool(track.segment[last] == segment and way_m - track.way_m[last] < _SPACING_M)
+        spacing_m = max(_SPACING_M, _SPACING_RANGES * self._database.submaps[-1].range_m)
+        return bool(track.segment[last] == segment and way_m - track.way_m[last] < spacing_m)
 
     def _look(self, index: int) -> list[LoopClosure]:
         """Verify a keyframe's candidates, and decide on those that pass."""

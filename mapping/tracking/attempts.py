@@ -70,12 +70,14 @@ class ScanMatcher:
         return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
 
     def register(self, prediction: Prediction, coarse_first: bool) -> Attempt:
-        """Register from the prediction; where that does not fit, by way of coarser cells."""
-        attempt = self._attempt(prediction, prediction, coarse_first)
-        if coarse_first or attempt.status is Status.OK or self._budget.is_spent:
-            return attempt
-        again = self._attempt(prediction, prediction, coarse_first=True)
-        return again if again.fit.inlier_share > attempt.fit.inlier_share else attempt
+        """Register some keypoints from the prediction; where these do not fit, all of them by way of coarser cells."""
+        attempt = None
+        if not coarse_first:
+            attempt = self._attempt(prediction, prediction, coarse_first=False, keypoints=self._few)
+            if attempt.status is Status.OK or self._budget.is_spent:
+                return attempt
+        again = self._attempt(prediction, prediction)
+        return again if attempt is None or again.fit.inlier_share > attempt.fit.inlier_share else attempt
 
     def register_turning(self, prediction: Prediction) -> Attempt:
         """Register patiently from the prediction, and from that with the best of several yaw rates."""
