@@ -5,6 +5,7 @@ import json
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -88,7 +89,17 @@ def require_whole(run: Path) -> None:
     if about is not None and about.standing == "at work":
         raise InputError(f"{run}: {about.remedy(run)}")
     if about is not None and about.standing == "over an earlier run":
-        logger.warning("%s: these are the results of an earlier run; the one that was to replace it did not finish", run)
+        _warn_of_earlier(run)
+
+
+@lru_cache
+def _warn_of_earlier(run: Path) -> None:
+    logger.warning(
+        "%s: these are the results of an earlier run; the one that is to replace them is not done: it may be at work,"
+        " be resumed with --resume, or be given up by removing the folder %s",
+        run,
+        run / UNFINISHED,
+    )
 
 
 def remove_unfinished(run: Path) -> None:

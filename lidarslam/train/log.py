@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from lidarslam.core.files import replacing
 from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
 
@@ -56,6 +57,9 @@ def _cut(path: Path, step: int) -> None:
         return
     with path.open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-    path.unlink()
-    for row in rows:
-        _append(path, row)
+    if not rows:
+        path.unlink()
+        return
+    with replacing(path) as partial:
+        for row in rows:
+            _append(partial, row)
