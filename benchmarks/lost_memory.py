@@ -19,7 +19,7 @@ import numpy as np
 from mapping_accuracy import print_row, without_odometry
 from mapping_memory import resident_mb
 
-from lidarslam.core.geometry import FloatArray
+from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
@@ -41,8 +41,8 @@ def room(rng: np.random.Generator, points: int) -> FloatArray:
     walls = rng.uniform(-1.0, 1.0, (points, 3))
     walls[np.arange(points), rng.integers(0, 3, points)] = rng.choice([-1.0, 1.0], points)
     turn = rng.uniform(-np.pi, np.pi)
-    c, s = np.cos(turn), np.sin(turn)
-    return np.asarray((walls - rng.uniform(-0.6, 0.6, 3)) * half @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+    R_world_room = exp(np.array([0.0, 0.0, turn, 0.0, 0.0, 0.0]))[:3, :3]
+    return np.asarray((walls - rng.uniform(-0.6, 0.6, 3)) * half @ R_world_room.T)
 
 
 def rooms(scans: int, points: int, lost_every: int | None) -> Iterator[Scan]:

@@ -12,12 +12,12 @@ from lidarslam.train import directory as files
 
 
 class TrainingLog:
-    """Appends to the tables; lines after the step that the training goes on from are dropped."""
+    """Appends to the tables; lines after the step that the training goes on from are dropped, all of a new one."""
 
-    def __init__(self, out: Path, step: int) -> None:
+    def __init__(self, out: Path, step: int | None) -> None:
         self._out = out
         for name in (files.LOSSES, files.VALIDATION):
-            _cut(out / name, step)
+            _cut(out / name, -1 if step is None else step)
         self._curves = SummaryWriter(str(out / files.CURVES), purge_step=step + 1 if step else None)
 
     def losses(self, step: int, row: Mapping[str, float]) -> None:
