@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check docs install clean
+.PHONY: demo test check audit docs install clean
 
 demo: $(VENV)/.base
 	$(BIN)/lidarslam demo
@@ -22,6 +22,11 @@ check: install
 	$(BIN)/mypy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	$(PYTEST)
+
+# Known vulnerabilities of the installed libraries; asks the databases on the network.
+audit: install
+	$(BIN)/python -m pip install --quiet pip-audit
+	$(BIN)/pip-audit --skip-editable
 
 # The documentation as a site; warnings are errors (mkdocs.yml), which --quiet would hide.
 docs: install

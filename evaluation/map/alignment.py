@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,6 +26,9 @@ _LEAST_INLIER_M = 0.2
 # Correspondence distances of ICP, coarse to fine.
 _ICP_STAGES_M = (2.0, 1.0, 0.5)
 _ICP_ITERATIONS = 40
+# ICP has converged when no component of a step, in radians and metres, exceeds this.
+_ICP_STEP = 1e-6
+_NORMAL_NEIGHBOURS = 12
 _FEWEST_POINTS = 30
 # Extents that differ by this factor differ in unit.
 _OTHER_UNIT = 100.0
@@ -185,25 +187,32 @@ class _Clouds:
         return MapAlignment(T, method, refine, fitness, rmse_m, self.inlier_m, moved_m, moved_deg)
 
     @cached_property
-    def _with_normals(self) -> Any:
-        """The reference as Open3D's cloud, with normals."""
+    def _normals(self) -> FloatArray:
+        """Unit normals (M, 3) of the reference."""
         import open3d as o3d
 
         still = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.reference))
-        still.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(12))
-        return still
+        still.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
+        return np.array(still.normals, dtype=np.float64)
 
     def _icp(self, T: FloatArray, mapped: FloatArray) -> FloatArray:
-        """Pose (4, 4) after point-to-plane ICP (Chen, Medioni, IVC 1992) with ever shorter correspondences."""
-        import open3d as o3d
+        """Pose (4, 4) after point-to-plane ICP (Chen, Medioni, IVC 1992) with ever shorter correspondences.
 
-        moving = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mapped))
-        registration = o3d.pipelines.registration
-        to_plane = registration.TransformationEstimationPointToPlane()
-        stop = registration.ICPConvergenceCriteria(max_iteration=_ICP_ITERATIONS)
+        Sums over correspondences have one order, whatever the number of threads; those of Open3D's ICP have none.
+        """
         for distance_m in _ICP_STAGES_M:
-            found = registration.registration_icp(moving, self._with_normals, distance_m, T, to_plane, stop)
-            T = np.array(found.transformation, dtype=np.float64)
+            for _ in range(_ICP_ITERATIONS):
+                moved = transform_points(T, mapped)
+                distances, found = self.tree.query(moved, distance_upper_bound=distance_m, workers=-1)
+                near = np.isfinite(distances)
+                nearest = np.asarray(found)[near]
+                p, n, q = moved[near], self._normals[nearest], self.reference[nearest]
+                J, residuals = np.hstack([np.cross(p, n), n]), np.einsum("ij,ij->i", n, p - q)
+                H, g = np.einsum("ij,ik->jk", J, J), np.einsum("ij,i->j", J, residuals)
+                step = np.linalg.lstsq(H, -g, rcond=None)[0]
+                T = exp(step) @ T
+                if float(np.abs(step).max()) < _ICP_STEP:
+                    break
         return T
 
     def _fitness(self, T: FloatArray) -> tuple[float, float | None]:

@@ -127,7 +127,7 @@ def _settings(comparison: Comparison) -> list[tuple[str, str]]:
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("lidarslam.evaluation.report", _TEMPLATES),
-        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
+        autoescape=lambda name: name is not None and name.endswith(".html.j2"),  # noqa: S701 # not Markdown
         finalize=lambda value: printable(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,

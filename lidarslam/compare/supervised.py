@@ -1,7 +1,6 @@
 """A command in a session of its own under supervision: its time, the memory of all its processes, how it ended."""
 
 import contextlib
-import os
 import signal
 import subprocess
 import threading
@@ -14,6 +13,7 @@ from typing import Literal
 import psutil
 
 from lidarslam.core.files import open_own
+from lidarslam.core.tasks.bound import bound
 
 # Between two looks at the memory; a look costs a millisecond or two of a core.
 _PERIOD_S = 0.2
@@ -46,7 +46,7 @@ class Ending:
 def supervise(
     command: Sequence[str], log: Path, limits: Limits, on_line: Callable[[str], None], cwd: Path | None = None
 ) -> Ending:
-    """Run a command to its end; none of its processes outlives this call.
+    """Run a command to its end; none of its processes outlives this call, nor this process.
 
     On Ctrl-C the command is interrupted too and given a minute to write its results; a second Ctrl-C ends that.
 
@@ -73,18 +73,15 @@ def supervise(
         reading = threading.Thread(target=_pass_on, args=(process.stdout, on_line), daemon=True)
         reading.start()
         peaks = [0.0]
-        try:
-            cause = _wait(process, limits, peaks)
-        except KeyboardInterrupt:
-            cause = "interrupt"
-            process.send_signal(signal.SIGINT)
-            with contextlib.suppress(KeyboardInterrupt):
-                _wait(process, Limits(limits.memory_mb, _GRACE_S), peaks)
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-            reading.join()
+        with bound(process):
+            try:
+                cause = _wait(process, limits, peaks)
+            except KeyboardInterrupt:
+                cause = "interrupt"
+                process.send_signal(signal.SIGINT)
+                with contextlib.suppress(KeyboardInterrupt):
+                    _wait(process, Limits(limits.memory_mb, _GRACE_S), peaks)
+        reading.join()
     return Ending(cause, process.returncode, time.monotonic() - started, max(peaks) or None)
 
 

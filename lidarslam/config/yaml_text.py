@@ -60,7 +60,7 @@ def parse_yaml(text: str) -> Any:
         YamlError: it is not YAML, asks for other objects, or a key occurs twice.
     """
     try:
-        return yaml.load(text, Loader=_StrictLoader)  # a SafeLoader that refuses more
+        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 # a SafeLoader that refuses more
     except yaml.YAMLError as error:
         raise YamlError(f"not YAML: {' '.join(str(error).split())}", is_syntax=True) from error
     except RecursionError as error:

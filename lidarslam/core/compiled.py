@@ -33,8 +33,9 @@ def compiled(function: Function) -> Function:
     their own names: what is kept on disk is outdated when a file of these functions changes. Arithmetic is IEEE's, in
     the order that is written; divisions by zero give infinity or NaN, as in NumPy. Indices are not checked.
 
-    Kept beside the source, else in the user's cache folder, else in a temporary folder of the user. Where nothing can
-    be kept (a full disk, a damaged file), every process compiles anew.
+    Kept beside the source, else in the user's cache folder, else in a temporary folder of the user; there, what was
+    kept beside the source when the program was installed is used too. Where nothing can be kept (a full disk, a damaged
+    file), every process compiles anew.
     """
     dispatcher = _kept_on_disk(function)
     if hasattr(dispatcher, "_cache"):  # not where numba is switched off
@@ -71,9 +72,18 @@ def _kept_on_disk(function: Function) -> Any:
     try:
         return _njit(function, cache=True, **_OPTIONS)
     except RuntimeError:
+        _warn_of_compiling_anew()
         return _njit(function, **_OPTIONS)
     finally:
         _config.CACHE_DIR = configured
+
+
+@lru_cache(maxsize=1)
+def _warn_of_compiling_anew() -> None:
+    _log.warning(
+        "compiled loops find no folder to be kept in, so that every start takes a minute longer;"
+        " set NUMBA_CACHE_DIR to a folder that can be written"
+    )
 
 
 @lru_cache(maxsize=1)
@@ -111,11 +121,23 @@ def _stamp(file: str) -> str:
         return ""
 
 
+def _installed_with(cache: Any) -> Any | None:
+    """The machine code beside a function's source, for a cache that lies elsewhere."""
+    if not hasattr(cache, "_cache_file"):
+        return None
+    beside = str(Path(cache._py_func.__code__.co_filename).parent / "__pycache__")
+    if cache.cache_path == beside:
+        return None
+    own: Any = cache._cache_file
+    return type(own)(beside, cache._impl.filename_base, own._source_stamp)
+
+
 class _ForgivingCache:
     """Numba's store of one function's machine code, whose files may be damaged and whose folder may be full."""
 
     def __init__(self, cache: Any) -> None:
         self._cache = cache
+        self._installed = _installed_with(cache)  # only read
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._cache, name)
@@ -125,18 +147,30 @@ class _ForgivingCache:
         if not hasattr(self._cache, "_cache_file"):
             return True
         try:
-            return bool(self._cache._cache_file._load_index())
+            installed = self._installed is not None and self._installed._load_index()
+            return bool(installed or self._cache._cache_file._load_index())
         except Exception as reason:  # a damaged pickle may raise anything
             _log.info("compiled code cannot be read: %s", reason)
             return False
 
     def load_overload(self, *arguments: Any) -> Any:
         """What is kept for these types; None when there is nothing, or nothing that can be read."""
+        loaded = self._load(*arguments)
+        if loaded is None and self._installed is not None:
+            own, self._cache._cache_file = self._cache._cache_file, self._installed
+            try:
+                loaded = self._load(*arguments)
+            finally:
+                self._cache._cache_file = own
+        return loaded
+
+    def _load(self, *arguments: Any) -> Any:
         try:
             return self._cache.load_overload(*arguments)
         except Exception as reason:  # a damaged pickle may raise anything
             _log.info("compiled code cannot be read, and is made anew: %s", reason)
-            self._begin_anew()
+            if self._cache._cache_file is not self._installed:
+                self._begin_anew()
             return None
 
     def save_overload(self, *arguments: Any) -> None:

@@ -17,6 +17,7 @@ from typing_extensions import Self
 
 from lidarslam.config.settings import Config
 from lidarslam.core.compiled import is_compiled
+from lidarslam.core.tasks.bound import bound
 from lidarslam.pipeline.rehearsal import PARTS
 
 # The processes start here, so that no package in the user's folder is found first.
@@ -82,11 +83,12 @@ class CompileAhead:
     def _compile(self, part: str) -> None:
         command = [sys.executable, "-m", "lidarslam.pipeline.rehearsal", part]
         none = subprocess.DEVNULL
-        process = subprocess.Popen(command, cwd=_ROOT, stdin=none, stdout=none, stderr=none)
-        self._running.append(process)
-        if self._is_closed:
-            process.kill()
-        process.wait()
+        process = subprocess.Popen(command, cwd=_ROOT, stdin=none, stdout=none, stderr=none, start_new_session=True)
+        with bound(process):
+            self._running.append(process)
+            if self._is_closed:
+                process.kill()
+            process.wait()
 
 
 def _cores() -> int:

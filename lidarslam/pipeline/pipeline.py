@@ -22,6 +22,7 @@ from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import Estimated, Localised, ScanResult
+from lidarslam.pipeline.free_memory import EVERY_SCANS, return_free_memory
 from lidarslam.pipeline.localisation import Localiser
 from lidarslam.pipeline.map_building import MapBuilder
 from lidarslam.pipeline.stages import Stages
@@ -91,7 +92,9 @@ class Pipeline(Stateful):
                 localised = registration.submit(self._stages.localise, estimated, following)
                 jobs.append(mapping.submit(self._build, estimated, localised))
 
-            for estimated in self._estimate(scans):
+            for number, estimated in enumerate(self._estimate(scans), start=1):
+                if number % EVERY_SCANS == 0:
+                    return_free_memory()
                 previous, self.held = self.held, estimated
                 if previous is None:
                     continue

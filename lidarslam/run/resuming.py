@@ -18,8 +18,8 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
+from lidarslam.storage.about import About
 from lidarslam.storage.summary_file import read_summary
-from lidarslam.storage.unfinished import About
 
 logger = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ import contextlib
 import errno
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,7 @@ class RunDirectory:
         self.path = path
         self._stale = set(earlier)
         self._written: set[str] = set()
+        self.before_change: Callable[[], None] = lambda: None  # called before files are replaced or removed
 
     @classmethod
     @contextlib.contextmanager
@@ -105,15 +106,21 @@ class RunDirectory:
                     path.rmdir()
 
     @property
+    def has_earlier(self) -> bool:
+        """Whether files of an earlier run lie there that have not been replaced."""
+        return bool(self._stale - {ABOUT})
+
+    @property
     def is_mixed(self) -> bool:
         """Whether some of an earlier run's files have been replaced, and some have not."""
-        return bool(self._written) and bool(self._stale - {ABOUT})
+        return bool(self._written) and self.has_earlier
 
     @contextlib.contextmanager
     def replacing(self, name: str) -> Iterator[Path]:
         """A path to write a file to; see `lidarslam.core.files.replacing`."""
         with replacing(self.path / name) as partial:
             yield partial
+            self.before_change()
         self._stale.discard(name)
         self._written.add(name)
 

@@ -21,9 +21,9 @@ from lidarslam.datasets.folders.point_table import coordinates, scalar_fields
 from lidarslam.datasets.published.unrecognised import absent
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.storage import directory as files
+from lidarslam.storage.about import require_whole
 from lidarslam.storage.not_a_run import not_a_run
 from lidarslam.storage.summary_file import read_summary
-from lidarslam.storage.unfinished import require_whole
 
 _CLOUD_READERS: dict[str, Callable[[Path], NDArray[np.void]]] = {".ply": read_ply, ".pcd": read_pcd}
 # In .ply and in .pcd files.

@@ -54,6 +54,7 @@ class TileWriter:
 
     def _begin(self) -> None:
         folder = self._directory.path / MAP_TILES
+        self._directory.before_change()
         try:
             make_own_folder(folder)
             (self._directory.path / MAP_INDEX).unlink(missing_ok=True)  # first: tiles of an earlier run are replaced

@@ -42,8 +42,8 @@ def earlier_training(path: Path, resume: bool, overwrite: bool) -> list[str]:
 
 
 def remove_results(path: Path, names: Iterable[str]) -> None:
-    """Make room for another training."""
-    for name in names:
+    """Make room for another training; what is left by a kill can neither be resumed nor is it foreign."""
+    for name in sorted(names, key=lambda name: (name == CONFIG, name != STATE)):
         if (path / name).is_dir() and not (path / name).is_symlink():
             shutil.rmtree(path / name)
         else:

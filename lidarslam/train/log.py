@@ -8,18 +8,18 @@ from pathlib import Path
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import make_own_folder, open_own
+from lidarslam.core.files import make_own_folder, open_own, replacing
 from lidarslam.odometry.training.training import Validation
 from lidarslam.train import directory as files
 
 
 class TrainingLog:
-    """Appends to the tables; lines after the step that the training goes on from are dropped."""
+    """Appends to the tables; lines after the step that the training goes on from are dropped, all of a new one."""
 
-    def __init__(self, out: Path, step: int) -> None:
+    def __init__(self, out: Path, step: int | None) -> None:
         self._out = out
         for name in (files.LOSSES, files.VALIDATION):
-            _cut(out / name, step)
+            _cut(out / name, -1 if step is None else step)
         make_own_folder(out / files.CURVES)
         self._curves = SummaryWriter(str(out / files.CURVES), purge_step=step + 1 if step else None)
 
@@ -62,6 +62,9 @@ def _cut(path: Path, step: int) -> None:
             rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: is damaged ({error!r}); remove it, or begin again with --overwrite") from error
-    path.unlink()
-    for row in rows:
-        _append(path, row)
+    if not rows:
+        path.unlink()
+        return
+    with replacing(path) as partial:
+        for row in rows:
+            _append(partial, row)

@@ -85,7 +85,8 @@ class TrainingLoop:
         self._config, self._devices, self._out, self._about, self._say = config, devices, out, about, say
         self._network, self._optimizer, self._progress = network, optimizer, progress
         self._module = devices.shared(_LossModule(network, config))
-        self._log = TrainingLog(out, progress.step) if devices.is_first else None
+        is_new = not progress.step and progress.best is None  # or killed before its first state
+        self._log = TrainingLog(out, None if is_new else progress.step) if devices.is_first else None
         self._clock = time.perf_counter()
 
     def run(self, recordings: Recordings, is_interrupted: Callable[[], bool]) -> bool:

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.files import make_directory, only_writer
+from lidarslam.core.files import make_directory, only_writer, remove_partial_files
 from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
 from lidarslam.odometry.network.networks import make_network
@@ -66,6 +66,7 @@ def execute(request: TrainRequest, say: Callable[[str], None]) -> bool:
         with only_writer(request.out) if devices.is_first else contextlib.nullcontext():
             recordings = _recordings(request, config.training, stretches, devices, is_interrupted)
             if devices.is_first:
+                remove_partial_files(request.out)  # of a training that was killed
                 files.remove_results(request.out, [] if request.resume else earlier)
                 RunDirectory(request.out).write_text(files.CONFIG, dump_train_yaml(config, about))
                 say(_summary(recordings, stretches, devices))

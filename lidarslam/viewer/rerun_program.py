@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from lidarslam.core.errors import OutputError
+from lidarslam.core.tasks.bound import bound
 from lidarslam.viewer.web_page import LOCAL, WebPage
 
 # Rerun's own default.
@@ -103,11 +104,10 @@ def _page_files() -> dict[str, bytes]:
     if process is None:
         raise OutputError("Rerun's page for browsers cannot be had; write a file instead")
     try:
-        return {path: _fetch(port, path) for path in _PAGE_FILES}
+        with bound(process):
+            return {path: _fetch(port, path) for path in _PAGE_FILES}
     except (http.client.HTTPException, OSError) as error:
         raise OutputError(f"Rerun's page for browsers cannot be had ({error}); write a file instead") from error
-    finally:
-        _end(process)
 
 
 def _fetch(port: int, path: str) -> bytes:

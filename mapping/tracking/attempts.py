@@ -33,7 +33,7 @@ _VIEW_RANGES, _VIEW_CELLS, _PLACES = 3.0, 4.0, 24
 # Changes of the yaw rate tried on a scan that fits poorly, rad/s: from full speed one way to full speed the other.
 _YAW_RATES = np.deg2rad(np.arange(-400.0, 401.0, 50.0))
 _YAW_STEP_DEG = 15.0
-# Points that are registered first; of poses found by search, those above this share of the best quality have all.
+# Points that are registered first from a pose found by search, and the share of the best quality above which all are.
 _FEW_POINTS, _LIKELY = 800, 0.5
 # Displacements tried where the velocity is unknown: the speed of a car, at most the median range, and their spacing in
 # cells, within reach of the coarse cells.
@@ -70,14 +70,12 @@ class ScanMatcher:
         return Attempt(prediction, self._map, None, NO_FIT, Status.LOST)
 
     def register(self, prediction: Prediction, coarse_first: bool) -> Attempt:
-        """Register some keypoints from the prediction; where these do not fit, all of them by way of coarser cells."""
-        attempt = None
-        if not coarse_first:
-            attempt = self._attempt(prediction, prediction, coarse_first=False, keypoints=self._few)
-            if attempt.status is Status.OK or self._budget.is_spent:
-                return attempt
-        again = self._attempt(prediction, prediction)
-        return again if attempt is None or again.fit.inlier_share > attempt.fit.inlier_share else attempt
+        """Register from the prediction; where that does not fit, by way of coarser cells."""
+        attempt = self._attempt(prediction, prediction, coarse_first)
+        if coarse_first or attempt.status is Status.OK or self._budget.is_spent:
+            return attempt
+        again = self._attempt(prediction, prediction, coarse_first=True)
+        return again if again.fit.inlier_share > attempt.fit.inlier_share else attempt
 
     def register_turning(self, prediction: Prediction) -> Attempt:
         """Register patiently from the prediction, and from that with the best of several yaw rates."""

@@ -8,9 +8,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
+from numba.core.caching import InTreeCacheLocator, UserWideCacheLocator
 
+from lidarslam.core import compiled as compiled_module
 from lidarslam.core.compiled import compiled, is_compiled
 
 SOURCE = """
@@ -141,6 +144,63 @@ def test_a_module_is_compiled_once_all_its_functions_are_on_disk(load: Load) -> 
     assert is_compiled(module)
     assert is_compiled(load("sums", source))
     assert not is_compiled(load("sums", f"{source}# changed"))
+
+
+@pytest.fixture
+def unprivileged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The installation is read-only; the folder that the user can write."""
+    folder = tmp_path / "cache"
+
+    def refuse(_: InTreeCacheLocator) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(InTreeCacheLocator, "ensure_cache_path", refuse)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(folder))
+    return folder
+
+
+@pytest.fixture
+def installed(load: Load) -> None:
+    """Compiled by who installed it."""
+    load("sums", SOURCE).total(np.arange(4.0))
+
+
+def test_an_installation_that_cannot_be_written_is_not_compiled_anew(
+    installed: None, unprivileged: Path, load: Load
+) -> None:
+    module = load("sums", SOURCE)
+    assert is_compiled(module)
+    assert module.total(np.arange(4.0)) == 6.0
+    assert loaded_from_disk(module.total) == 1
+    assert module.total(np.arange(4)) == 6  # of other types: kept by the user
+    assert sum(1 for _ in unprivileged.rglob("*.nbc")) == 1
+    again = load("sums", SOURCE)
+    assert (again.total(np.arange(4)), loaded_from_disk(again.total)) == (6, 1)
+    changed = load("sums", SOURCE + "# changed")
+    assert not is_compiled(changed)
+    assert (changed.total(np.arange(4.0)), loaded_from_disk(changed.total)) == (6.0, 0)
+
+
+def test_damage_to_an_installation_that_cannot_be_written_costs_time_once(
+    installed: None, unprivileged: Path, load: Load, tmp_path: Path
+) -> None:
+    for file in kept(tmp_path):
+        file.write_bytes(b"\x80\x04broken")
+    for hits in (0, 1):
+        module = load("sums", SOURCE)
+        assert (module.total(np.arange(4.0)), loaded_from_disk(module.total)) == (6.0, hits)
+
+
+def test_who_compiles_anew_at_every_start_is_told_so_once(
+    unprivileged: Path, load: Load, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", os.devnull)
+    monkeypatch.setattr(UserWideCacheLocator, "ensure_cache_path", InTreeCacheLocator.ensure_cache_path)
+    monkeypatch.setattr(compiled_module, "_temporary_folder", lambda: "")
+    compiled_module._warn_of_compiling_anew.cache_clear()
+    for name in ("sums", "more"):
+        assert load(name, SOURCE).total(np.arange(4.0)) == 6.0
+    assert caplog.text.count("set NUMBA_CACHE_DIR to a folder that can be written") == 1
 
 
 def test_a_user_without_a_home_keeps_code_in_a_temporary_folder(tmp_path: Path) -> None:

@@ -1,5 +1,10 @@
 """Maps brought back to where they were taken from."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -111,3 +116,27 @@ def test_a_place_with_two_fitting_poses_is_refused() -> None:
 def test_nothing_cannot_be_aligned(building: FloatArray) -> None:
     with pytest.raises(InputError, match="holds no point"):
         align_map(np.empty((0, 3)), building, {"none": np.eye(4)})
+
+
+THREADS = """
+import numpy as np
+from lidarslam.evaluation.map.alignment import align_map
+rng = np.random.default_rng(0)
+walls = np.concatenate([rng.uniform(-9.0, 9.0, (6000, 3)) * flat for flat in 1.0 - np.eye(3)])
+found = align_map(walls + rng.normal(0.05, 0.01, walls.shape), walls, {"guess": np.eye(4)})
+print(found.T_reference_map.tobytes().hex())
+"""
+
+
+def test_the_pose_is_the_same_for_any_number_of_threads() -> None:
+    """Sums of several threads have no fixed order."""
+    root = str(Path(__file__).parents[2])
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    poses = set()
+    for threads in ("1", "3", "4"):
+        environment = os.environ | {"PYTHONPATH": root} | dict.fromkeys(names, threads)
+        done = subprocess.run(
+            [sys.executable, "-c", THREADS], env=environment, capture_output=True, text=True, check=True
+        )
+        poses.add(done.stdout)
+    assert len(poses) == 1

@@ -1,8 +1,9 @@
 """When states are saved, who may be at work on a run, and where a resumed one goes on in its recording."""
 
 import contextlib
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -25,9 +26,11 @@ from lidarslam.run import checkpoints
 from lidarslam.run.checkpoints import Checkpoints
 from lidarslam.run.resuming import scans_left
 from lidarslam.run.scan_log import ScanLog
-from lidarslam.storage.directory import RunDirectory
+from lidarslam.storage.about import About, require_whole
+from lidarslam.storage.directory import CONFIG, RunDirectory
+from lidarslam.storage.map_tiles import TileWriter
 from lidarslam.storage.state_file import read_state
-from lidarslam.storage.unfinished import About, Unfinished, require_whole
+from lidarslam.storage.unfinished import Unfinished
 
 
 class Clock:
@@ -230,6 +233,42 @@ def test_a_stopped_run_may_be_looked_at_until_it_is_resumed(tmp_path: Path) -> N
         unfinished.end(stopped=False)
     require_whole(tmp_path)
     assert not (tmp_path / "unfinished").exists()
+
+
+def replace_first_file(directory: RunDirectory) -> None:
+    directory.write_text(CONFIG, "run:\n  version: 1\n")
+
+
+@pytest.mark.parametrize("change", [replace_first_file, lambda directory: TileWriter(directory)._begin()])
+def test_the_results_before_are_given_back_until_the_first_of_them_is_replaced(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, change: Callable[[RunDirectory], None]
+) -> None:
+    """What lies there at an instant is what a run leaves that is killed then."""
+    run, killed = tmp_path / "run", tmp_path / "killed"
+    with RunDirectory.create(run) as directory:
+        directory.write_text(CONFIG, "run:\n  version: 0\n")
+    with claim(run, {"a": 1}) as unfinished:
+        unfinished.begin(0)
+        shutil.copytree(run, killed)
+    require_whole(killed)
+    assert "results of an earlier run" in caplog.text
+    for description, resume in (({"a": 1}, True), ({"a": 2}, False)):
+        again, mixed = tmp_path / f"again {resume}", tmp_path / f"mixed {resume}"
+        shutil.copytree(killed, again)
+        with (
+            RunDirectory.create(again, not resume, resume) as directory,
+            Unfinished.claim(directory, description, resume) as unfinished,
+        ):
+            unfinished.begin(0)
+            require_whole(again)
+            change(directory)
+            shutil.copytree(again, mixed)
+        with pytest.raises(InputError, match="did not finish"):
+            require_whole(mixed)
+        with claim(mixed, {"a": 3}) as unfinished:  # another attempt does not make it whole
+            unfinished.begin(0)
+            with pytest.raises(InputError, match="did not finish"):
+                require_whole(mixed)
 
 
 def test_what_differs_is_named_and_not_too_much_of_it(tmp_path: Path) -> None:

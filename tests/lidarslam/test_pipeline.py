@@ -1,10 +1,13 @@
 """Scans of known truth through the pipeline: poses, map, and what happens when tracking is lost."""
 
+import ctypes
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from lidarslam.core.errors import InputError
@@ -18,6 +21,7 @@ from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanResult
+from lidarslam.pipeline.free_memory import EVERY_SCANS
 from lidarslam.pipeline.localisation import OdometryAlone
 from lidarslam.pipeline.pipeline import Pipeline
 
@@ -63,6 +67,19 @@ def test_a_single_scan_becomes_the_map(true_odometry: ExternalOdometry, room_sca
     np.testing.assert_array_equal(result.T_world_lidar, np.eye(4))
     assert pipeline.map.global_map is not None
     assert len(pipeline.map.global_map.points()) > 1_000
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
+def test_free_memory_is_returned(true_odometry: ExternalOdometry, room_scans: list[Scan]) -> None:
+    """Blocks that are kept between others hold what is freed around them."""
+    blocks = [b"x" * 60_000 for _ in range(4_000)]
+    kept = blocks[::50]
+    del blocks
+    before = psutil.Process().memory_info().rss
+    scans = [replace(room_scans[0].select(np.arange(0)), stamp=0.1 * k) for k in range(EVERY_SCANS + 1)]
+    list(Pipeline(true_odometry, OdometryAlone(ConsistencyCheck()), GlobalMapConfig()).run(scans))
+    assert len(kept) == 80
+    assert psutil.Process().memory_info().rss < before - 100e6
 
 
 def test_no_scans_give_no_results(true_odometry: ExternalOdometry) -> None:

@@ -528,6 +528,34 @@ def test_a_killed_run_is_neither_replaced_nor_evaluated_unasked(
     assert (result.exit_code, "did not finish" in result.stderr) == (1, True)
 
 
+@pytest.mark.parametrize("part", [0.5, 0.9])
+def test_what_a_killed_overwrite_was_to_replace_is_given_back(
+    run: Run,
+    whole: Callable[[str], Whole],
+    source: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    part: float,
+) -> None:
+    """Killed on its way, and among its final results."""
+    expected, out = whole("constant velocity"), tmp_path / "run"
+    run(source, out, *expected.arguments, "--stop", "6")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    kill_at = int(part * expected.ended.events)
+    assert run(source, out, *expected.arguments, "--overwrite", kill_at=kill_at).status == KILLED
+    untouched = all((out / name).read_bytes() == content for name, content in before.items())
+    assert untouched == (part == 0.5)
+    if untouched:
+        assert len(load_run(out).trajectory) == 6
+        assert CliRunner().invoke(main, ["evaluate", str(out)]).exit_code == 0
+        assert caplog.text.count("results of an earlier run") == 1
+    else:
+        with pytest.raises(InputError, match="did not finish"):
+            load_run(out)
+    assert run(source, out, *expected.arguments, "--resume").status == expected.ended.status
+    assert_same(out, expected.out)
+
+
 def test_a_finished_run_is_left_as_it_is(run: Run, whole: Callable[[str], Whole], source: Path) -> None:
     expected = whole("constant velocity")
     before = contents(expected.out)

@@ -2,12 +2,15 @@
 
 import csv
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +29,7 @@ from lidarslam.odometry.training.training import summarise, validate
 from lidarslam.simulation.recording.mixture import ingredients_of
 from lidarslam.train import data as training_data
 from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
+from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
 from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
 from lidarslam.train.train import TrainRequest, execute
 
@@ -113,6 +117,55 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(room_folder: Path
     assert same_weights(whole, parts)
     execute(request(room_folder, other, ready, "training.seed=1"), Console())
     assert not same_weights(whole, other)
+
+
+@contextmanager
+def copied_before_each_change(out: Path, copies: Path) -> Iterator[None]:
+    """Copies a directory before every file of it that is put in its place or removed: what a kill then leaves."""
+    copies.mkdir()
+
+    def copy_first(change: Callable[..., Any]) -> Callable[..., Any]:
+        def changed(path: Path, *arguments: Any, **options: Any) -> Any:
+            if path.parent == out and path.exists():
+                shutil.copytree(out, copies / f"{len(list(copies.iterdir())):02d}")
+            return change(path, *arguments, **options)
+
+        return changed
+
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("replace", "unlink"):
+            patched.setattr(Path, name, copy_first(getattr(Path, name)))
+        yield
+
+
+def test_a_killed_training_goes_on_to_the_same_weights(room_folder: Path, tmp_path: Path, ready: Path) -> None:
+    whole, parts, copies = tmp_path / "whole", tmp_path / "parts", tmp_path / "copies"
+    assert execute(request(room_folder, whole, ready), Console())
+    with copied_before_each_change(parts, copies):
+        assert execute(request(room_folder, parts, ready), Console())
+        assert execute(request(room_folder, parts, ready, resume=True), Console())
+    killed = sorted(copies.iterdir())
+    assert len(killed) > 9
+    for left in [*killed[1:8:3], *killed[-4:]]:
+        assert execute(request(room_folder, left, ready, resume=True), Console())
+        assert losses(left) == losses(whole), left.name
+        assert (left / "validation.csv").read_bytes() == (whole / "validation.csv").read_bytes(), left.name
+        assert same_weights(whole, left), left.name
+        assert not list(left.glob(".partial*"))
+
+
+def test_a_killed_overwrite_of_a_training_can_be_repeated(tmp_path: Path) -> None:
+    out, copies = tmp_path / "out", tmp_path / "copies"
+    out.mkdir()
+    for name in RESULTS:
+        (out / name).write_text("trained_on:\n")
+    with copied_before_each_change(out, copies):
+        remove_results(out, RESULTS)
+    killed = sorted(copies.iterdir())
+    assert len(killed) == len(RESULTS)
+    for left in killed:
+        assert earlier_training(left, resume=False, overwrite=True)
+    assert not any((left / STATE).exists() for left in killed[1:])
 
 
 def test_what_a_training_leaves(room_folder: Path, tmp_path: Path, ready: Path) -> None:

@@ -29,8 +29,9 @@ from lidarslam.run.modes.merge.tracking import PartDone, PartTask, Show, track_p
 from lidarslam.run.modes.merge.writing import MergeOutcome, Part, missing, write_merge
 from lidarslam.run.progress import show_count
 from lidarslam.run.resuming import WITHOUT_EFFECT
+from lidarslam.storage.about import About
 from lidarslam.storage.directory import RunDirectory
-from lidarslam.storage.unfinished import About, Unfinished
+from lidarslam.storage.unfinished import Unfinished
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph

@@ -19,9 +19,10 @@ from lidarslam.mapping.config import MapFormat
 from lidarslam.run.request import RunRequest
 from lidarslam.run.run import require_apart
 from lidarslam.storage import directory as files
+from lidarslam.storage.about import About
 from lidarslam.storage.directory import remove_run
 from lidarslam.storage.summary_file import read_summary
-from lidarslam.storage.unfinished import About, remove_unfinished
+from lidarslam.storage.unfinished import remove_unfinished
 
 # The names that `open_parts` gives to directories; whatever else a summary names is not ours to remove.
 _PART = re.compile(r"\d{2,}_[\w.-]+")

@@ -21,9 +21,10 @@ from lidarslam.run.resuming import describe_computed
 from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import NoScanError, Progress, track
+from lidarslam.storage.about import About
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
-from lidarslam.storage.unfinished import About, Unfinished
+from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
 
 # A process whose node was lost may be at work for some seconds more.

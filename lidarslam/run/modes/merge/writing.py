@@ -23,9 +23,10 @@ from lidarslam.run.summary.summary import GraphSummary, peak_rss_mb
 from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
+from lidarslam.storage.about import About
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
-from lidarslam.storage.unfinished import About, Unfinished
+from lidarslam.storage.unfinished import Unfinished
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph

@@ -1,0 +1,97 @@
+"""Processes end with the one that started them, however it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lidarslam.core.tasks.bound import bound
+
+ROOT = Path(__file__).parents[2]
+SLEEP = "import time; time.sleep(60)"
+# Print its own process and that of its child, and sleep.
+FAMILY = f"""
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", {SLEEP!r}])
+print(os.getpid(), child.pid, flush=True)
+time.sleep(60)
+"""
+# What a comparison, a first run, and a run with KISS-ICP start, as `PARENT` starts it; each prints processes.
+SUPERVISED = f"""
+from pathlib import Path
+from lidarslam.compare.supervised import Limits, supervise
+supervise([sys.executable, "-c", {FAMILY!r}], Path(os.devnull), Limits(), lambda line: print(line, flush=True))
+"""
+COMPILING = """
+import subprocess
+from lidarslam.pipeline import compile_ahead
+compile_ahead.uncompiled = lambda names: names
+started = subprocess.Popen
+def start(command, **options):
+    if "-m" in command:
+        command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    process = started(command, **options)
+    if "-c" in command and command[0] == sys.executable:
+        print(process.pid, flush=True)
+    return process
+subprocess.Popen = start
+with compile_ahead.CompileAhead(["map"]):
+    time.sleep(60)
+"""
+KISS = """
+from lidarslam.odometry.config import KissConfig
+from lidarslam.odometry.methods.kiss import KissOdometry
+print(KissOdometry(KissConfig())._worker._process.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is alive, after a moment to end."""
+    for _ in range(100):
+        try:
+            state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0]
+        except FileNotFoundError:
+            return False
+        if state == b"Z":
+            return False
+        time.sleep(0.05)
+    return True
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+@pytest.mark.parametrize("killed_by", [signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize("code", [SUPERVISED, COMPILING, KISS], ids=["supervised", "compiling", "kiss"])
+def test_who_is_killed_leaves_no_process_behind(code: str, killed_by: signal.Signals) -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", f"import os, sys, time\n{code}"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True
+    ) as parent:
+        assert parent.stdout is not None
+        children = [int(word) for word in parent.stdout.readline().split()]
+        assert children
+        time.sleep(0.2)  # until it is watched
+        parent.send_signal(killed_by)
+    assert not [child for child in children if runs(child)]
+
+
+def test_a_process_and_its_children_end_with_the_context() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", FAMILY], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stdout is not None
+        with bound(process):
+            family = [int(word) for word in process.stdout.readline().split()]
+    assert not [one for one in family if runs(one)]
+
+
+def test_one_that_has_ended_is_no_error() -> None:
+    with subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], start_new_session=True) as process:
+        with bound(process):
+            process.wait()
+        assert process.returncode == 3
