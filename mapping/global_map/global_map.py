@@ -10,6 +10,7 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import PointAttributes
 from lidarslam.core.state.stateful import State, Stateful
 from lidarslam.mapping.global_map import kernels
+from lidarslam.mapping.global_map.normals import estimate_normals
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
 from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
@@ -18,8 +19,6 @@ from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.
 _MIN_PENDING = 250_000
-# Nearest points that a normal is estimated from.
-_NORMAL_NEIGHBOURS = 20
 # Those of more points are estimated tile by tile: they take half a kilobyte of memory a point. Neighbours of a tile's
 # points are looked for within this distance around it.
 _MANY_POINTS = 2_000_000
@@ -232,17 +231,6 @@ class GlobalMap(Stateful):
     def _mean_points(self, voxels: Voxels) -> FloatArray:
         within = voxels.sums[:, POSITION] / voxels.sums[:, COUNT, None]
         return key_cells(voxels.keys) * self.voxel_size_m + within
-
-
-def estimate_normals(points: FloatArray) -> FloatArray:
-    """Unit normals (N, 3) of points (N, 3) by PCA of the nearest ones; their sign is arbitrary."""
-    if len(points) < 3:
-        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    import open3d as o3d
-
-    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
-    cloud.estimate_normals(max_nn=_NORMAL_NEIGHBOURS)  # type: ignore[call-arg] # the stub lacks the defaults
-    return np.array(cloud.point.normals.numpy(), dtype=np.float64)
 
 
 def voxel_size_for(points: FloatArray) -> float:
