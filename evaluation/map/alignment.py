@@ -203,9 +203,10 @@ class _Clouds:
         for distance_m in _ICP_STAGES_M:
             for _ in range(_ICP_ITERATIONS):
                 moved = transform_points(T, mapped)
-                distances, nearest = self.tree.query(moved, distance_upper_bound=distance_m, workers=-1)
+                distances, index = self.tree.query(moved, distance_upper_bound=distance_m, workers=-1)
                 near = np.isfinite(distances)
-                p, n, q = moved[near], self._normals[nearest[near]], self.reference[nearest[near]]
+                nearest = np.asarray(index)[near]
+                p, n, q = moved[near], self._normals[nearest], self.reference[nearest]
                 J, residuals = np.hstack([np.cross(p, n), n]), np.einsum("ij,ij->i", n, p - q)
                 H, g = np.einsum("ij,ik->jk", J, J), np.einsum("ij,i->j", J, residuals)
                 step = np.linalg.lstsq(H, -g, rcond=None)[0]

@@ -23,6 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 _njit: Any = numba.njit
 _config: Any = numba.config
+_index_file: Any = IndexDataCacheFile
 # Nothing calls these loops by their addresses: an entry less to compile.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
@@ -129,7 +130,7 @@ def _installed_with(cache: Any) -> Any | None:
     beside = str(Path(cache._py_func.__code__.co_filename).parent / "__pycache__")
     if cache.cache_path == beside:
         return None
-    return IndexDataCacheFile(beside, cache._impl.filename_base, cache._cache_file._source_stamp)
+    return _index_file(beside, cache._impl.filename_base, cache._cache_file._source_stamp)
 
 
 class _ForgivingCache:

@@ -44,7 +44,7 @@ class About:
         path = run / ABOUT
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-            standing = next((one for one in _STANDINGS if one == values["standing"]), "at work")
+            standing: Standing = next((one for one in _STANDINGS if one == values["standing"]), "at work")
             return cls(dict(values["description"]), standing, tuple(map(int, values["resumed_after"])))
         except (FileNotFoundError, NotADirectoryError):
             return None
