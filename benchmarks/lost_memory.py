@@ -25,7 +25,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline import pipeline as pipelines
+from lidarslam.pipeline import free_memory
 from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--keep-free", action="store_true")
     arguments = parser.parse_args()
     if arguments.keep_free:
-        vars(pipelines)["EVERY_SCANS"] = arguments.scans + 1
+        free_memory.EVERY_SCANS = arguments.scans + 1
     header = ["scans", "memory, MB", "most, MB", "cells", "map points", "lost", "maps begun", "ms a scan"]
     print_row(header)
     print_row(["---"] * len(header))

@@ -8,6 +8,7 @@ Every scan and the ground truth are turned about the sensor before the program s
 """
 
 import argparse
+import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import islice
@@ -81,7 +82,8 @@ def main() -> None:
     for start in arguments.starts:
         for name in arguments.turns:
             turned = MountedRecording(From(recorded, start), TURNS[name])  # type: ignore[arg-type]
-            back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
+            with warnings.catch_warnings(action="ignore"):  # at 90 degrees of pitch, one of several angles is taken
+                back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
             given: RollPitchYaw = tuple(np.round(back, 6).tolist())
             settings: dict[str, Mounting] = {"as it is": "upright", "guessed": "auto", "set": given}
             for setting, mounting in settings.items():
