@@ -206,8 +206,8 @@ def test_scans_left_out_are_counted(recording: Path, tmp_path: Path, monkeypatch
 
     read = ScanFolderRecording.scans
 
-    def stuttering(self: Any, *chosen: Any) -> Any:
-        for index, scan in enumerate(read(self, *chosen)):
+    def stuttering(self: Any, *chosen: Any, **options: Any) -> Any:
+        for index, scan in enumerate(read(self, *chosen, **options)):
             yield replace(scan, stamp=scan.stamp - 0.2) if index in (4, 5) else scan
 
     monkeypatch.setattr(ScanFolderRecording, "scans", stuttering)
@@ -235,8 +235,8 @@ def test_damage_that_no_scan_can_be_left_out_for_ends_the_run_with_what_there_is
 
     read = ScanFolderRecording.scans
 
-    def broken(self: Any, *chosen: Any) -> Any:
-        yield from list(read(self, *chosen))[:12]
+    def broken(self: Any, *chosen: Any, **options: Any) -> Any:
+        yield from list(read(self, *chosen, **options))[:12]
         raise InputError("the disk broke")
 
     monkeypatch.setattr(ScanFolderRecording, "scans", broken)

@@ -193,9 +193,9 @@ def _origin(path: Path | None, settings: Sequence[str]) -> str:
 
 def _explain(error: ValidationError, model: type[BaseModel], origin: str) -> str:
     """All faults in one line: the key, what is wrong, and for a misspelt key the likely one."""
-    faults = error.errors(include_url=False)
-    # A value that may be one of several kinds has a fault for each.
-    explained = list(dict.fromkeys(_explain_fault(fault, model) for fault in faults))
+    # A value that may be one of several kinds has a fault for each, of which the first one has the bounds.
+    texts = (_explain_fault(fault, model) for fault in reversed(error.errors(include_url=False)))
+    explained = [*{text.partition(": ")[0]: text for text in texts}.values()][::-1]
     further = len(explained) - _MOST_FAULTS
     explained = explained[:_MOST_FAULTS] + ([f"and {further} more"] if further > 0 else [])
     return f"configuration ({origin}): {'; '.join(explained)}"

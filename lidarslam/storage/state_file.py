@@ -47,7 +47,7 @@ def read_state(path: Path) -> Saved:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT), file)
+            values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT, any_number=True), file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except _DAMAGE as error:

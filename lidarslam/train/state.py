@@ -49,7 +49,9 @@ def load_state(path: Path, network: nn.Module, optimizer: torch.optim.Optimizer)
     tensors, content = read_tensor_file(path, _KIND)
     try:
         weights = _below(tensors, _NETWORK)
-        moments = _moments(_below(tensors, _OPTIMIZER), list(network.parameters()))
+        moments = _moments(
+            _below(tensors, _OPTIMIZER), [p for group in optimizer.param_groups for p in group["params"]]
+        )
         if damaged := next((name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())), None):
             raise ValueError(f"{damaged} is not finite")
         network.load_state_dict(weights)

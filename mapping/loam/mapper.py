@@ -57,7 +57,7 @@ class LoamMapper(Stateful):
         predicted = _predict(scan.stamp, prior, last, self._config)
         if len(features) < MIN_POINTS:
             mapped = _lost(predicted, None, f"only {len(features)} features within range")
-        elif float(np.abs(predicted.T_world_lidar[:3, 3]).max()) + self._config.max_range_m > reach_m(spacing_m):
+        elif not self._is_within_reach(last if prior.T_prev_curr is None else predicted, spacing_m):
             mapped = _lost(predicted, None, beyond_reach(spacing_m))
         elif not len(self._edges) + len(self._planes):
             mapped = MappedScan(predicted, predicted.T_world_lidar, False, Status.OK, added=True)
@@ -66,6 +66,10 @@ class LoamMapper(Stateful):
             mapped = self._track(features, prior, predicted, last)
         self._last, self._last_middle_s = mapped.state, features.middle_s
         return mapped
+
+    def _is_within_reach(self, near: MotionState, spacing_m: float) -> bool:
+        farthest_m = float(np.abs(near.T_world_lidar[:3, 3]).max()) + self._config.max_range_m
+        return farthest_m <= reach_m(spacing_m)
 
     def _track(self, features: Features, prior: Prior, predicted: MotionState, last: MotionState) -> MappedScan:
         """Register compensated features from the predicted pose, judge the pose by its fit, insert."""

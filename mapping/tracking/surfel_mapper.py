@@ -82,7 +82,7 @@ class SurfelMapper(Stateful):
 
     def _after_restore(self) -> None:
         numbers = [one.number for one in self._recent]
-        if self._map_since > self._scans or numbers != sorted({*numbers}) or max(numbers, default=0) > self._scans:
+        if self._map_since > self._scans or numbers != sorted(numbers) or max(numbers, default=0) > self._scans:
             raise ValueError(f"scans {numbers}, and a map since scan {self._map_since}, of {self._scans} scans")
 
     @property
@@ -122,7 +122,9 @@ class SurfelMapper(Stateful):
         prediction = self._tracker.predict(scan, prior, last)
         if scan.is_sparse:
             return self._lose(scan, prediction, surfel_map, None, _sparse_message(scan))
-        if not surfel_map.reaches(prediction.T_world_lidar[:3, 3], self._config.max_range_m):
+        # A velocity that is extrapolated over a gap in the stamps leads anywhere.
+        T_world_near = (last if prior.T_prev_curr is None else prediction).T_world_lidar
+        if not surfel_map.reaches(T_world_near[:3, 3], self._config.max_range_m):
             return self._lose(scan, prediction, surfel_map, None, beyond_reach(surfel_map.cell_m))
         # Register the keypoints to the surfels; where that fails, relocalise.
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)

@@ -10,6 +10,8 @@ from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.text.trajectory_io import format_kitti
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti import correction
+from lidarslam.datasets.kitti.odometry import KittiOdometryRecording
+from lidarslam.datasets.mounting.recording import MountedRecording
 from lidarslam.datasets.registry import choose_reader, open_recording
 
 # The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.
@@ -213,7 +215,9 @@ def test_missing_stamps_continue_at_the_rate_and_are_told_once(tmp_path, rng):
     _write_sequence(tmp_path, rng)
     (tmp_path / "sequences" / "04" / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
     recording = open_recording(tmp_path)
-    assert recording.stamps[-1] == pytest.approx(0.5)
+    assert isinstance(recording, MountedRecording)
+    assert isinstance(recording.recorded, KittiOdometryRecording)
+    assert recording.recorded.stamps[-1] == pytest.approx(0.5)
     (warning,) = [line for line in recording.warnings if "times.txt" in line]
     assert (
         warning == "times.txt has only 4 lines for the scans up to number 5; the missing stamps continue at its rate."

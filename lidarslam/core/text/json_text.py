@@ -36,8 +36,13 @@ def read_json(path: Path, shape: TypeAdapter[T]) -> T:
     return parse_json(content, shape)
 
 
-def parse_json(text: str | bytes, shape: TypeAdapter[T]) -> T:
+def parse_json(text: str | bytes, shape: TypeAdapter[T], any_number: bool = False) -> T:
     """The values of a text.
+
+    Args:
+        text: in UTF-8.
+        shape: of the values.
+        any_number: whether numbers may be infinite, NaN, or of any length.
 
     Raises:
         ValueError: it is not JSON, is nested too deeply, has another shape, a number that is not finite, an integer
@@ -47,7 +52,7 @@ def parse_json(text: str | bytes, shape: TypeAdapter[T]) -> T:
         values = json.loads(text if isinstance(text, str) else text.decode("utf-8"))
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    _require_plain(values)
+    _require_plain(values, any_number)
     try:
         return shape.validate_python(values)
     except ValidationError as error:
@@ -56,7 +61,7 @@ def parse_json(text: str | bytes, shape: TypeAdapter[T]) -> T:
         raise ValueError(one_line(f"{place}: {fault['msg']}" if place else fault["msg"])) from None
 
 
-def _require_plain(values: Any) -> None:
+def _require_plain(values: Any, any_number: bool) -> None:
     """Go through the values level by level."""
     level = [values]
     for _ in range(_DEEPEST):
@@ -67,20 +72,24 @@ def _require_plain(values: Any) -> None:
                 inner += value.values()
             elif isinstance(value, list):
                 inner += value
-            else:
-                _require_plain_leaf(value)
+            elif isinstance(value, str):
+                _require_text(value)
+            elif not any_number:
+                _require_number(value)
         if not inner:
             return
         level = inner
     raise ValueError("nested too deeply")
 
 
-def _require_plain_leaf(value: Any) -> None:
-    if isinstance(value, str):
-        if "\0" in value:
-            raise ValueError("a text has a NUL character")
-        value.encode()  # half of a surrogate pair raises a ValueError
-    elif isinstance(value, float) and not math.isfinite(value):
+def _require_text(value: str) -> None:
+    if "\0" in value:
+        raise ValueError("a text has a NUL character")
+    value.encode()  # half of a surrogate pair raises a ValueError
+
+
+def _require_number(value: Any) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
         raise ValueError("a number is not finite")
-    elif isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
+    if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
         raise ValueError("an integer has more than 64 bits")
