@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,24 @@ def interruptible() -> Iterator[None]:
     earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, earlier)
+
+
+@pytest.fixture
+def still_runs() -> Callable[[int], bool]:
+    """Whether a process is alive, by its number, after a moment to end."""
+
+    def still_runs(pid: int) -> bool:
+        for _ in range(100):
+            try:
+                state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0]
+            except FileNotFoundError:
+                return False
+            if state == b"Z":
+                return False
+            time.sleep(0.05)
+        return True
+
+    return still_runs
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -50,23 +51,12 @@ time.sleep(60)
 """
 
 
-def runs(pid: int) -> bool:
-    """Whether a process is alive, after a moment to end."""
-    for _ in range(100):
-        try:
-            state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0]
-        except FileNotFoundError:
-            return False
-        if state == b"Z":
-            return False
-        time.sleep(0.05)
-    return True
-
-
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 @pytest.mark.parametrize("killed_by", [signal.SIGKILL, signal.SIGHUP])
 @pytest.mark.parametrize("code", [SUPERVISED, COMPILING, KISS], ids=["supervised", "compiling", "kiss"])
-def test_who_is_killed_leaves_no_process_behind(code: str, killed_by: signal.Signals) -> None:
+def test_who_is_killed_leaves_no_process_behind(
+    code: str, killed_by: signal.Signals, still_runs: Callable[[int], bool]
+) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", f"import os, sys, time\n{code}"]
     with subprocess.Popen(
@@ -77,17 +67,17 @@ def test_who_is_killed_leaves_no_process_behind(code: str, killed_by: signal.Sig
         assert children
         time.sleep(0.2)  # until it is watched
         parent.send_signal(killed_by)
-    assert not [child for child in children if runs(child)]
+    assert not [child for child in children if still_runs(child)]
 
 
-def test_a_process_and_its_children_end_with_the_context() -> None:
+def test_a_process_and_its_children_end_with_the_context(still_runs: Callable[[int], bool]) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", FAMILY], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         assert process.stdout is not None
         with bound(process):
             family = [int(word) for word in process.stdout.readline().split()]
-    assert not [one for one in family if runs(one)]
+    assert not [one for one in family if still_runs(one)]
 
 
 def test_one_that_has_ended_is_no_error() -> None:

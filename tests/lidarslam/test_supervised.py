@@ -4,7 +4,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -54,7 +53,9 @@ def test_an_abort_is_told_by_its_signal(run: Run) -> None:
     assert run("import os; os.abort()").status == -signal.SIGABRT
 
 
-def test_one_that_hangs_is_ended_with_its_children(run: Run, lines: list[str]) -> None:
+def test_one_that_hangs_is_ended_with_its_children(
+    run: Run, lines: list[str], still_runs: Callable[[int], bool]
+) -> None:
     child = "import time; time.sleep(60)"
     code = f"""
 import subprocess, sys, time
@@ -64,7 +65,7 @@ time.sleep(60)
     ending = run(code, timeout_s=1.0)
     assert (ending.cause, ending.status) == ("time", -signal.SIGKILL)
     assert ending.wall_s < 10.0
-    assert not _runs(int(lines[0]))
+    assert not still_runs(int(lines[0]))
 
 
 def test_one_that_closes_its_output_is_waited_for(run: Run) -> None:
@@ -99,16 +100,3 @@ except KeyboardInterrupt:
 
 def test_a_process_that_is_gone_has_no_memory() -> None:
     assert tree_rss_mb(2**30) == 0.0
-
-
-def _runs(pid: int) -> bool:
-    """Whether the process is alive; one that has just been killed may take a moment to go."""
-    for _ in range(50):
-        try:
-            state = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[0]
-        except FileNotFoundError:
-            return False
-        if state == b"Z":
-            return False
-        time.sleep(0.02)
-    return True
