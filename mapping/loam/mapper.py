@@ -19,7 +19,7 @@ from lidarslam.mapping.loam.registration import FeatureMaps, register
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prior
 from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
-from lidarslam.mapping.surfels.voxel_hash import beyond_reach, reach_m
+from lidarslam.mapping.surfels.voxel_hash import beyond_reach
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.pose_status import reservation
@@ -55,10 +55,12 @@ class LoamMapper(Stateful):
         features = extract_features(scan, self._config.min_range_m, self._config.max_range_m, spacing_m)
         last = self._last or MotionState(scan.stamp, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
         predicted = _predict(scan.stamp, prior, last, self._config)
+        near = last if prior.T_prev_curr is None else predicted  # an extrapolated velocity leads anywhere
+        beyond = beyond_reach(near.T_world_lidar[:3, 3], self._config.max_range_m, spacing_m)
         if len(features) < MIN_POINTS:
             mapped = _lost(predicted, None, f"only {len(features)} features within range")
-        elif not self._is_within_reach(last if prior.T_prev_curr is None else predicted, spacing_m):
-            mapped = _lost(predicted, None, beyond_reach(spacing_m))
+        elif beyond is not None:
+            mapped = _lost(predicted, None, beyond)
         elif not len(self._edges) + len(self._planes):
             mapped = MappedScan(predicted, predicted.T_world_lidar, False, Status.OK, added=True)
             self._insert(features, predicted)
@@ -66,10 +68,6 @@ class LoamMapper(Stateful):
             mapped = self._track(features, prior, predicted, last)
         self._last, self._last_middle_s = mapped.state, features.middle_s
         return mapped
-
-    def _is_within_reach(self, near: MotionState, spacing_m: float) -> bool:
-        farthest_m = float(np.abs(near.T_world_lidar[:3, 3]).max()) + self._config.max_range_m
-        return farthest_m <= reach_m(spacing_m)
 
     def _track(self, features: Features, prior: Prior, predicted: MotionState, last: MotionState) -> MappedScan:
         """Register compensated features from the predicted pose, judge the pose by its fit, insert."""

@@ -10,7 +10,7 @@ from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.surfels.cell_kernels import write_views
 from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.matching import Correspondences, Matcher
-from lidarslam.mapping.surfels.voxel_hash import reach_m, require_reach
+from lidarslam.mapping.surfels.voxel_hash import require_reach
 
 # Sizes of the grids, in cells. A point's correspondence is the plane of the finest grid that has one.
 LEVELS = (1, 2, 4)
@@ -65,10 +65,6 @@ class SurfelMap(Stateful):
         sizes = [grid.cell_m / level for grid, level in zip(self._grids, LEVELS, strict=True)]
         if not (self._radius_m > 0.0 and np.allclose(sizes, self.cell_m, rtol=1e-9, atol=0.0)):
             raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")
-
-    def reaches(self, sensor: FloatArray, range_m: float) -> bool:
-        """Whether there are cells for all points within a range of a position (3,)."""
-        return float(np.abs(sensor).max()) + range_m < reach_m(self.cell_m)
 
     def __len__(self) -> int:
         """Number of cells in all grids."""

@@ -36,8 +36,10 @@ def reach_m(cell_m: float) -> float:
     return (kernels.OFFSET - 2) * cell_m
 
 
-def beyond_reach(cell_m: float) -> str:
-    """Why a scan is lost that lies farther from the first one than the map has cells."""
+def beyond_reach(position: FloatArray, range_m: float, cell_m: float) -> str | None:
+    """Why points within a range of a position (3,) have no cells, all of them; None where they have."""
+    if float(np.abs(position).max()) + range_m < reach_m(cell_m):
+        return None
     return f"beyond the reach of a map with cells of {cell_m:g} m, {reach_m(cell_m) / 1000.0:.0f} km"
 
 

@@ -124,8 +124,9 @@ class SurfelMapper(Stateful):
             return self._lose(scan, prediction, surfel_map, None, _sparse_message(scan))
         # A velocity that is extrapolated over a gap in the stamps leads anywhere.
         T_world_near = (last if prior.T_prev_curr is None else prediction).T_world_lidar
-        if not surfel_map.reaches(T_world_near[:3, 3], self._config.max_range_m):
-            return self._lose(scan, prediction, surfel_map, None, beyond_reach(surfel_map.cell_m))
+        beyond = beyond_reach(T_world_near[:3, 3], self._config.max_range_m, surfel_map.cell_m)
+        if beyond is not None:
+            return self._lose(scan, prediction, surfel_map, None, beyond)
         # Register the keypoints to the surfels; where that fails, relocalise.
         attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
         if attempt.status is Status.LOST or attempt.registration is None:

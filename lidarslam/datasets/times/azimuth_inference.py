@@ -30,8 +30,6 @@ _OFFERED = (
 _UNORDERED = "The points have no times, and are not in the order of one turn, from which times could follow."
 _NO_ORDER = "Times were to follow from the azimuth, but the points are not in the order of one turn."
 _TOO_SLOW = "Times were to follow from the azimuth, but the scans lie farther apart than a sweep lasts."
-
-
 _NO_TIMES = (
     "; the scans are taken as measured at one instant, or motion compensated. If they are neither, name another field"
     " with --set reader.time_field=NAME, or give its unit with reader.time_unit; --set reader.time_reference=none"
