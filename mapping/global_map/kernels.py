@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import EMPTY, OFFSET, cell_of, key_of
+from lidarslam.mapping.surfels.cell_kernels import EMPTY, cell_of, key_of
+from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 Keys = NDArray[np.int64]
 Sums = NDArray[np.float32]
+
+_reach_m = compiled_part(reach_m)
 
 
 @compiled
@@ -25,7 +28,7 @@ def write_sums(points: FloatArray, T_world_lidar: FloatArray, voxel_size_m: floa
         Number of points beyond the reach of the voxels, whose keys are `EMPTY`.
     """
     T, sensor = T_world_lidar, T_world_lidar[:3, 3]
-    reach, beyond = (OFFSET - 2) * voxel_size_m, 0
+    reach, beyond = _reach_m(voxel_size_m), 0
     for n in range(len(points)):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]

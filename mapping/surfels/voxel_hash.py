@@ -37,7 +37,7 @@ def reach_m(cell_m: float) -> float:
 
 
 def beyond_reach(position: FloatArray, range_m: float, cell_m: float) -> str | None:
-    """Why points within a range of a position (3,) have no cells, all of them; None where they have."""
+    """The reason why not all points within a range of a position (3,) have a cell; None where they have."""
     if float(np.abs(position).max()) + range_m < reach_m(cell_m):
         return None
     return f"beyond the reach of a map with cells of {cell_m:g} m, {reach_m(cell_m) / 1000.0:.0f} km"
