@@ -2,6 +2,7 @@
 
     python benchmarks/local_map_correction.py --cases office/handheld/2 --scans 1200
     python benchmarks/local_map_correction.py recordings/streets --step 2 --radius-m 40
+    python benchmarks/local_map_correction.py recordings/loop --pairs loop_pairs.txt --radius-m 25
 
 A case is WORLD/MOTION or WORLD/MOTION/STEP, where every STEP-th scan is taken. Prints a Markdown table with two rows
 for each recording, the second one where the local map is drawn anew after loop closures:
@@ -10,6 +11,8 @@ for each recording, the second one where the local map is drawn anew after loop 
   much surfaces, as far away as the median range, are apart in the local map of that moment; root mean square and 95 %,
   over scans after the first accepted loop closure;
 - ATE in metres after SE(3) alignment, of the poses as registered and as the graph corrects them in the end;
+- closing error, in place of both where there is no ground truth but known relative poses (`--pairs`, rows of `i j` and
+  3 x 4 numbers of T_i_j for scans i and j): median and most, metres;
 - loop closures; how often the map was drawn, the milliseconds of it (on the graph's thread), and those of the exchange
   (on the thread of registration), of the processor: median and most.
 """
@@ -141,6 +144,28 @@ def apart_m(outcome: Outcome, truth: Trajectory, pairs: NDArray[np.intp], range_
     return np.array(apart)
 
 
+def closing_errors_m(trajectory: Trajectory, pairs: FloatArray) -> FloatArray:
+    """(P,) how far the relative positions are from those known, a row of `--pairs` each."""
+    first, second = pairs[:, :2].astype(np.intp).T
+    T = inverse(trajectory.T_world_lidar[first]) @ trajectory.T_world_lidar[second]
+    known = np.tile(np.eye(4), (len(pairs), 1, 1))
+    known[:, :3] = pairs[:, 2:].reshape(-1, 3, 4)
+    return np.asarray(np.linalg.norm((inverse(known) @ T)[:, :3, 3], axis=1), dtype=np.float64)
+
+
+def measure_pairs(name: str, scans: Sequence[Scan], pairs: FloatArray, config: Config) -> None:
+    """The rows of a recording with known relative poses."""
+    for label, redraws in (("as it was", False), ("drawn anew", True)):
+        outcome = take(scans, config, redraws)
+        errors = [closing_errors_m(one, pairs) for one in (outcome.trajectory, outcome.corrected)]
+        shown = (f"{np.median(error):.3f}, {error.max():.3f}" for error in errors)
+        print_row([
+            f"{name}, {config.odometry.method}, radius {config.mapping.radius_m:g} m", label, str(len(pairs)), "-",
+            *shown, str(outcome.closures), str(len(outcome.graph.drawn_ms)),
+            _most(outcome.graph.drawn_ms), _most(outcome.exchange_ms),
+        ])  # fmt: skip
+
+
 def measure(name: str, scans: Sequence[Scan], truth: Trajectory, config: Config) -> None:
     """The rows of a recording."""
     stamps = np.array([scan.stamp for scan in scans])
@@ -167,7 +192,8 @@ def _most(milliseconds: Sequence[float]) -> str:
 def main() -> None:
     """Parse the command line and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth")
+    parser.add_argument("sources", nargs="*", type=Path, help="recordings with ground truth, or the one of --pairs")
+    parser.add_argument("--pairs", type=Path, metavar="FILE", help="known relative poses of the recording's scans")
     parser.add_argument("--cases", nargs="*", default=[], metavar="WORLD/MOTION[/STEP]", help="simulated recordings")
     parser.add_argument("--sensor", default="vlp-16")
     parser.add_argument("--scans", type=int, default=1000)
@@ -182,8 +208,8 @@ def main() -> None:
         pose_graph=PoseGraphConfig(enabled=True),
     )
     print_row([
-        "recording", "local map", "scans of later rounds", "apart, RMS / 95 %, m", "ATE as registered, m",
-        "ATE in the end, m", "closures", "drawn", "drawing, ms", "exchange, ms",
+        "recording", "local map", "scans of later rounds", "apart, RMS / 95 %, m",
+        "ATE as registered, m", "ATE in the end, m", "closures", "drawn", "drawing, ms", "exchange, ms",
     ])  # fmt: skip
     print_row(["---"] * 10)
     for case in options.cases:
@@ -191,9 +217,12 @@ def main() -> None:
         measure(recorded.name, recorded.scans, recorded.truth, config)
     for source in options.sources:
         recording = open_recording(source)
+        scans = list(in_order(recording.scans(stop=options.scans, step=options.step)))
+        if options.pairs is not None:
+            measure_pairs(recording.name, scans, np.loadtxt(options.pairs, ndmin=2), config)
+            continue
         truth = recording.ground_truth
         assert truth is not None, f"{source}: has no ground truth"
-        scans = list(in_order(recording.scans(stop=options.scans, step=options.step)))
         measure(recording.name, scans, truth, config)
 
 

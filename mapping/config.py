@@ -187,7 +187,7 @@ class PoseGraphConfig(BaseModel):
 
     enabled: bool = Field(False, description="build a pose graph, close loops, and correct trajectory and map")
     corrects_local_map: bool = Field(
-        False, description="surfels only: draw the local map anew after a loop closure, while the run goes on"
+        True, description="surfels only: draw the local map anew after a loop closure, while the run goes on"
     )
     keyframes: KeyframeConfig = KeyframeConfig()
     loops: LoopConfig = LoopConfig()

@@ -12,6 +12,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.motion.prediction import GravityDirection
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
+from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.odometry.interface import Motion
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")
@@ -24,7 +25,8 @@ class Estimated:
     scan: Scan  # as read
     motion: Motion  # the estimated motion since the previous scan
     interval_s: float | None  # time between the two stamps; None when no motion was measured
-    stage_ms: dict[str, float] = field(default_factory=dict)  # wall time of reading and odometry
+    stage_ms: dict[str, float] = field(default_factory=dict)  # wall time of the stages so far, see `STAGES`
+    sampled: SampledScan | None = None  # thinned for registration; None where that is left to the localiser
 
     @property
     def velocity(self) -> FloatArray | None:

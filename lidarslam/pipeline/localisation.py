@@ -13,6 +13,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
+from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion
@@ -26,6 +27,9 @@ class Localiser(Protocol):
     @property
     def surfel_mapper(self) -> SurfelMapper | None:
         """The mapper whose local map may be drawn anew; None without such a map."""
+
+    def sample(self, scan: Scan) -> SampledScan | None:
+        """What can be computed of the next scan ahead of its pose, on another thread; None where nothing can."""
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """The pose of a scan, given the odometry of the next; None after the last."""
@@ -61,6 +65,9 @@ class OdometryAlone(Stateful):
     def __init__(self, check: ConsistencyCheck) -> None:
         self._check = check
         self._T_odom_lidar = np.eye(4)
+
+    def sample(self, scan: Scan) -> None:
+        """Nothing."""
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Chain the motion, and compare the scan with the previous one."""
@@ -110,6 +117,10 @@ class ScanToMap(Stateful):
         """The mapper, where it has surfels; see `Localiser`."""
         return self._mapper if isinstance(self._mapper, SurfelMapper) else None
 
+    def sample(self, scan: Scan) -> SampledScan | None:
+        """The points that surfels are made from; see `Localiser`."""
+        return None if self.surfel_mapper is None else self.surfel_mapper.sample(scan)
+
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Refine the odometry's pose; where it measured nothing, the mapper predicts with the last velocity."""
         started = time.perf_counter()
@@ -119,7 +130,10 @@ class ScanToMap(Stateful):
         prior = Prior(motion.T_prev_curr if measured else None, odometry.mean(estimated.scan), motion.covariance)
         if self._inertial is not None:
             prior = self._inertial.prior(estimated.scan, prior)
-        mapped = self._mapper.process(estimated.scan, prior)
+        if self.surfel_mapper is None or estimated.sampled is None:
+            mapped = self._mapper.process(estimated.scan, prior)
+        else:
+            mapped = self.surfel_mapper.process_sampled(estimated.sampled, prior)
         if self._inertial is not None:
             self._inertial.update(estimated.scan, mapped)
         expected = inverse(self._T_world_last) @ mapped.T_world_predicted
@@ -137,7 +151,7 @@ class ScanToMap(Stateful):
             residual_m=mapped.fit.residual_m if mapped.fit else None,
             inlier_ratio=mapped.fit.inlier_ratio if mapped.fit else None,
             degenerate=mapped.degenerate,
-            stage_ms={"refine": 1e3 * (time.perf_counter() - started)},
+            stage_ms={"refine": estimated.stage_ms.get("refine", 0.0) + 1e3 * (time.perf_counter() - started)},
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
             cell_m=None if self.surfel_mapper is None else self.surfel_mapper.cell_m,

@@ -58,14 +58,18 @@ class Stages(Stateful):
         self.map = MapBuilder(config, store)
 
     def estimate(self, scan: Scan, read_ms: float = 0.0) -> Estimated:
-        """The odometry of the next scan, which took so long to read."""
+        """The odometry of the next scan, which took so long to read; thinned for registration, which is busier."""
         started = time.perf_counter()
         motion = self._odometry.estimate(scan)
-        stage_ms = {"read": read_ms, "odometry": _ms(started, time.perf_counter())}
+        moved = time.perf_counter()
+        sampled = self._localiser.sample(scan)
+        stage_ms = {"read": read_ms, "odometry": _ms(started, moved)}
+        if sampled is not None:
+            stage_ms["refine"] = _ms(moved, time.perf_counter())
         measured, previous = motion.failure is None, self._measured_stamp
         interval_s = scan.stamp - previous if measured and previous is not None else None
         self._measured_stamp = scan.stamp if measured else None
-        return Estimated(scan, motion, interval_s, stage_ms)
+        return Estimated(scan, motion, interval_s, stage_ms, sampled)
 
     def localise(self, estimated: Estimated, following: Estimated | None = None) -> Localised:
         """The pose of a scan; the odometry of the following one gives the motion after the stamp, where it is known."""

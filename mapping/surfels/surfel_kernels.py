@@ -14,7 +14,7 @@ from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, find_one, middl
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # A surfel is computed again when its cell has grown by this factor.
-_GROWTH = np.float32(1.3)
+_GROWTH = np.float32(1.5)
 # By how much less a neighbouring cell's points weigh, for each coordinate in which it differs.
 _LESS_PER_AXIS = 0.2
 # Fewer points make no plane.

@@ -95,13 +95,17 @@ class SurfelMapper(Stateful):
         """Edge of the map's finest cells; None before the first scan."""
         return None if self._map is None else self._map.cell_m
 
+    def sample(self, scan: Scan) -> SampledScan:
+        """Thin the next scan, for `process_sampled`; on any thread, while that works on an earlier one."""
+        return self._sampler.sample(scan)
+
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
-        self._budget.begin(np.inf if self._last is None else scan.stamp - self._last.stamp)
-        return self.process_sampled(self._sampler.sample(scan), prior)
+        return self.process_sampled(self.sample(scan), prior)
 
     def process_sampled(self, scan: SampledScan, prior: Prior) -> MappedScan:
         """Register the next scan, thinned already, and insert it."""
+        self._budget.begin(np.inf if self._last is None else scan.stamp - self._last.stamp)
         self._scans += 1
         velocity = np.zeros(6) if prior.velocity is None else prior.velocity
         last = self._last or MotionState(scan.stamp, np.eye(4), velocity, UNKNOWN_VELOCITY)
