@@ -49,7 +49,7 @@ from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
-from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
@@ -131,7 +131,9 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         global_map=GlobalMapConfig(most_points=options.most_points),
         pose_graph=PoseGraphConfig(enabled=True),
     )
-    mapper = SurfelMapper(config.mapping)  # as `lidarslam run` makes it, but in reach
+    localiser = make_localiser(config)
+    mapper = localiser.surfel_mapper
+    assert mapper is not None
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
         unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
@@ -142,7 +144,7 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         stack.callback(odometry.close)
         checkpoints = TimedCheckpoints(unfinished, config.checkpoints, odometry, log, graph)
         store = TileStore(options.out, unfinished.tiles)
-        pipeline = Pipeline(odometry, ScanToMap(mapper), config.global_map, graph, checkpoints, store)
+        pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
         scans = checkpoints.begin(pipeline, scans, is_recorded=False)
         for row in _rows(options.every, scans, truth, pipeline, mapper, log, graph, checkpoints, unfinished):
             print_row(row.cells_of_table())
@@ -214,6 +216,7 @@ def _finish(graph: SlamGraph, log: ScanLog, pipeline: Pipeline, truth: Trajector
         "draw_s": draw_s,
         "map_points": sum(len(drawn.tile(tile).points()) for tile in drawn.tiles()),
         "loops": sum(result.inliers),
+        "redraws": len(graph.redraws),
         "rss_mb": resident_mb(),
         "methods": {
             "before the graph": errors(before, truth),
@@ -237,7 +240,8 @@ def report(found: dict[str, Any], peers: list[FedPeer], truth: Trajectory) -> di
     """Print the end, with the peers beside ours."""
     print(
         f"\nfinal optimisation {found['optimise_s']:.1f} s ({found['loops']} loops kept), map drawn anew in"
-        f" {found['draw_s']:.1f} s ({found['map_points']:,} points), {found['rss_mb']:.0f} MB\n"
+        f" {found['draw_s']:.1f} s ({found['map_points']:,} points), {found['rss_mb']:.0f} MB; local map drawn anew"
+        f" {found['redraws']} times\n"
     )
     for peer in peers:
         estimate = peer.result()
