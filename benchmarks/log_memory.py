@@ -55,7 +55,7 @@ def watch(config: Config, scans: int, every: int) -> list[tuple[int, float, floa
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
         unfinished = stack.enter_context(Unfinished.claim(directory, {}, resume=False))
         log = ScanLog()
-        graph = begin_graph(config, file=unfinished.submaps)
+        graph = begin_graph(config, file=unfinished.files.submaps)
         ends = Trajectory(np.array([0.0, 0.1 * scans]), np.tile(np.eye(4), (2, 1, 1)))
         odometry = ExternalOdometry(ends, largest_interval_s=np.inf)
         keeper = Checkpoints(unfinished, CheckpointConfig(every_scans=every // 2), odometry, log, graph)
@@ -65,7 +65,7 @@ def watch(config: Config, scans: int, every: int) -> list[tuple[int, float, floa
             log.add(result)
             if number % every:
                 continue
-            state_mb = unfinished.state.stat().st_size / 2**20
+            state_mb = unfinished.files.state.stat().st_size / 2**20
             samples.append((number, resident_mb(), state_mb))
             ms = 1e3 * (time.perf_counter() - started) / every
             print_row([f"{number:,}", f"{samples[-1][1]:.1f}", f"{state_mb:.2f}", f"{ms:.1f}"])

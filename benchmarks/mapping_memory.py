@@ -89,7 +89,7 @@ def _follow(
         rss_mb = resident_mb()
         cells = 0 if mapper.local_map is None else len(mapper.local_map)
         points = 0 if pipeline.map.global_map is None else len(pipeline.map.global_map.points())
-        state_mb = unfinished.state.stat().st_size / 2**20 if unfinished.state.exists() else 0.0
+        state_mb = unfinished.files.state.stat().st_size / 2**20 if unfinished.files.state.exists() else 0.0
         sample = Sample(number, rss_mb, state_mb, cells, points)
         samples.append(sample)
         print_row([

@@ -4,6 +4,7 @@ They are compiled on their first call and run without the interpreter's lock, so
 side. Both need this file and share nothing else but the core.
 """
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -15,6 +16,7 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
 
 _log = logging.getLogger(__name__)
 
@@ -33,9 +35,9 @@ def compiled(function: Function) -> Function:
     their own names: what is kept on disk is outdated when a file of these functions changes. Arithmetic is IEEE's, in
     the order that is written; divisions by zero give infinity or NaN, as in NumPy. Indices are not checked.
 
-    Kept beside the source, else in the user's cache folder, else in a temporary folder of the user; there, what was
-    kept beside the source when the program was installed is used too. Where nothing can be kept (a full disk, a damaged
-    file), every process compiles anew.
+    Kept beside the source, else in the user's cache folder, else in a temporary folder of the user. What was kept
+    beside the source when the program was installed is used wherever the rest is kept. Where nothing can be kept (a
+    full disk, a damaged file), every process compiles the rest anew.
     """
     dispatcher = _kept_on_disk(function)
     if hasattr(dispatcher, "_cache"):  # not where numba is switched off
@@ -72,16 +74,22 @@ def _kept_on_disk(function: Function) -> Any:
     try:
         return _njit(function, cache=True, **_OPTIONS)
     except RuntimeError:
-        _warn_of_compiling_anew()
-        return _njit(function, **_OPTIONS)
+        return _only_installed(function)
     finally:
         _config.CACHE_DIR = configured
+
+
+def _only_installed(function: Function) -> Any:
+    dispatcher = _njit(function, **_OPTIONS)
+    with contextlib.suppress(RuntimeError):  # a function without a file
+        dispatcher._cache = cast(Any, _InstalledCache)(function)
+    return dispatcher
 
 
 @lru_cache(maxsize=1)
 def _warn_of_compiling_anew() -> None:
     _log.warning(
-        "compiled loops find no folder to be kept in, so that every start takes a minute longer;"
+        "compiled loops find no folder to be kept in, so that every start compiles them, for up to a minute;"
         " set NUMBA_CACHE_DIR to a folder that can be written"
     )
 
@@ -132,6 +140,30 @@ def _installed_with(cache: Any) -> Any | None:
     return type(own)(beside, cache._impl.filename_base, own._source_stamp)
 
 
+class _Installed(InTreeCacheLocator):
+    """The folder beside a function's source, where it cannot be written."""
+
+    def ensure_cache_path(self) -> None:
+        """Nothing is made."""
+
+
+class _InstalledImpl(CompileResultCacheImpl):
+    _locator_classes: Any = (_Installed,)
+
+
+class _InstalledCache(FunctionCache):
+    """The machine code beside a function's source, where there is no folder for the rest."""
+
+    _impl_class = _InstalledImpl
+
+    def save_overload(self, *_: Any) -> None:
+        """Nothing is kept."""
+        _warn_of_compiling_anew()
+
+    def flush(self) -> None:
+        """Nothing is made anew."""
+
+
 class _ForgivingCache:
     """Numba's store of one function's machine code, whose files may be damaged and whose folder may be full."""
 
@@ -144,7 +176,7 @@ class _ForgivingCache:
 
     def has_overloads(self) -> bool:
         """Whether anything is kept; True where nothing can be."""
-        if not hasattr(self._cache, "_cache_file"):
+        if not hasattr(self._cache, "_cache_file") or isinstance(self._cache, _InstalledCache):
             return True
         try:
             installed = self._installed is not None and self._installed._load_index()

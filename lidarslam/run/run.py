@@ -93,7 +93,7 @@ def execute(
             outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, formats)
         if unfinished is not None:
             unfinished.end(outcome.stopped is not None)
-            is_resumable = outcome.stopped is not None and unfinished.state.is_file()
+            is_resumable = outcome.stopped is not None and unfinished.files.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
         if request.report:
             from lidarslam.viewer.page.run_report import Accuracy, leave_report
@@ -113,8 +113,8 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
         return begin_graph(config, directory.path)
     saved = unfinished.saved
     if saved is None:
-        return begin_graph(config, file=unfinished.submaps)
-    return restore_graph(config, saved.part("graph"), unfinished.submaps) if saved.has("graph") else None
+        return begin_graph(config, file=unfinished.files.submaps)
+    return restore_graph(config, saved.part("graph"), unfinished.files.submaps) if saved.has("graph") else None
 
 
 @contextmanager

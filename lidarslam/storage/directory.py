@@ -162,7 +162,7 @@ class RunDirectory:
 def remove_files(path: Path) -> None:
     """Remove all files of a run."""
     for name in (*tile_names(path), *FILES):
-        (path / name).unlink(missing_ok=True)
+        _unlink(path, name)
     _remove_empty(path)
 
 
@@ -176,9 +176,11 @@ def tile_names(path: Path) -> list[str]:
 
 
 def _unlink(path: Path, name: str) -> None:
-    """Remove a file of a run, or the link in place of its folder."""
+    """Remove a file of a run, or the link in place of its folder; a folder in place of the file is not of the run."""
     top = path / Path(name).parts[0]
-    (top if top.is_symlink() else path / name).unlink(missing_ok=True)
+    file = top if top.is_symlink() else path / name
+    if file.is_symlink() or not file.is_dir():
+        file.unlink(missing_ok=True)
 
 
 def _remove_empty(path: Path) -> None:

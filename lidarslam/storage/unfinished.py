@@ -1,4 +1,4 @@
-"""The folder `unfinished` in a run directory: the checkpoint of a run until it is finished."""
+"""An unfinished run in its directory: which run it is, and its checkpoint until it is finished."""
 
 import contextlib
 from collections.abc import Iterator
@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.files import cannot_write, make_own_folder, only_writer, remove_partial_files
+from lidarslam.core.files import only_writer, remove_partial_files
 from lidarslam.core.state.stateful import Saved
 from lidarslam.storage.about import About, Standing, require_same
-from lidarslam.storage.directory import ABOUT, STATE, UNFINISHED, RunDirectory, remove_files
+from lidarslam.storage.checkpoint_files import CheckpointFiles
+from lidarslam.storage.directory import ABOUT, RunDirectory, remove_files
 from lidarslam.storage.state_file import read_state
-
-_SUBMAPS, _TILES, _TRACKED = "submaps.bin", "tiles.bin", "tracked.npz"
 
 
 def remove_unfinished(run: Path) -> None:
@@ -25,7 +24,7 @@ def remove_unfinished(run: Path) -> None:
     with only_writer(run):
         remove_partial_files(run)
         remove_files(run)
-        Unfinished(run, About({})).end(stopped=False)
+        CheckpointFiles(run).remove()
     if not any(run.iterdir()):
         run.rmdir()
 
@@ -37,16 +36,12 @@ class Unfinished:
         run: its directory.
         about: which run it is.
         saved: the state to go on from, None to begin.
-        folder: where its files lie.
-        state, submaps, tiles: the files of the state, of the pose graph's submaps, and of the global map's tiles.
-        tracked: the file of a recording of a merge that was tracked.
+        files: those of its checkpoint.
     """
 
     def __init__(self, run: Path, about: About, resumes: bool = False) -> None:
         self.run, self.about, self._resumes = run, about, resumes
-        self.folder = run / UNFINISHED
-        self.state, self.submaps, self.tiles = run / STATE, self.folder / _SUBMAPS, self.folder / _TILES
-        self.tracked = self.folder / _TRACKED
+        self.files = CheckpointFiles(run)
         self.saved: Saved | None = None
         self._keeps_earlier = False  # whether the results of an earlier run lie there, whole
 
@@ -63,38 +58,35 @@ class Unfinished:
             OutputError: the folder cannot be written.
         """
         run = directory.path
-        if resume and (run / UNFINISHED).is_symlink():
-            raise InputError(f"{run / UNFINISHED}: is a link to another place; begin again with --overwrite")
+        if resume:
+            CheckpointFiles(run).require_own()
         about = About.read(run) if resume else None
         if resume and about is None:
             raise InputError(f"{run}: holds no run to resume; leave --resume out to begin one")
         if about is not None:
             require_same(run, about.description, description)
         unfinished = cls(run, about or About(description), resume)
-        try:
-            make_own_folder(unfinished.folder)
-        except OSError as error:
-            raise cannot_write(unfinished.folder, error) from error
-        for folder in (run, unfinished.folder):
+        unfinished.files.make_folder()
+        for folder in (run, unfinished.files.folder):
             remove_partial_files(folder)  # of a run that was killed
         was_there = (run / ABOUT).exists()
         unfinished._keeps_earlier = directory.has_earlier and _holds_results(run)
         if about is None:
-            unfinished._remove_files()
-        elif unfinished.state.is_file():
-            unfinished.saved = read_state(unfinished.state)
+            unfinished.files.clear()
+        elif unfinished.files.state.is_file():
+            unfinished.saved = read_state(unfinished.files.state)
         directory.before_change = unfinished._replace_earlier
         try:
             yield unfinished
         except BaseException:
             if not was_there and not unfinished.is_resumable and not directory.is_mixed:
-                unfinished._remove()
+                unfinished.files.remove()
             raise
 
     @property
     def is_resumable(self) -> bool:
         """Whether something was done that need not be done again: by it, or by the parts of a merge."""
-        return self.state.is_file() or self.tracked.is_file() or any(self.run.glob(f"*/{ABOUT}"))
+        return self.files.state.is_file() or self.files.tracked.is_file() or any(self.run.glob(f"*/{ABOUT}"))
 
     def begin(self, scans: int) -> None:
         """Mark the directory as one with a run at work; `scans` are done already where it resumes."""
@@ -114,26 +106,11 @@ class Unfinished:
         if stopped:
             replace(self.about, standing="stopped").write(self.run)
         else:
-            self._remove()
+            self.files.remove()
 
     def remove_checkpoint(self) -> None:
         """All scans are tracked: nothing goes on from the state."""
-        for path in (self.state, self.tiles):
-            path.unlink(missing_ok=True)
-
-    def _remove(self) -> None:
-        if self.folder.is_symlink():  # what it leads to is not ours
-            self.folder.unlink()
-            return
-        (self.run / ABOUT).unlink(missing_ok=True)  # first: without it the other files are nothing
-        self._remove_files()
-        with contextlib.suppress(OSError):  # another file lies there
-            self.folder.rmdir()
-
-    def _remove_files(self) -> None:
-        if self.folder.is_dir():
-            remove_partial_files(self.folder)
-        for path in (self.state, self.submaps, self.tiles, self.tracked):
+        for path in (self.files.state, self.files.tiles):
             path.unlink(missing_ok=True)
 
 

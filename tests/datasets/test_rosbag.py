@@ -108,7 +108,7 @@ def test_livox_times_in_microseconds(bag_kit, rng, clock_ns):
     assert any("in units of us instead of ns" in warning for warning in recording.warnings)
     asked = open_recording(path, ReaderConfig(time_unit="ns"))
     assert next(asked.scans()).time_offsets.max() == pytest.approx(99e-6)
-    assert asked.warnings == ()
+    assert not any("in units" in warning for warning in asked.warnings)
 
 
 def test_single_files_of_a_rosbag2_folder(make_bag_kit, make_sweep):

@@ -1,5 +1,6 @@
 """The reader of scan folders: every format with every type of field, stamps, truth, and damaged files."""
 
+import logging
 import struct
 from pathlib import Path
 
@@ -274,6 +275,26 @@ def test_absolute_times_on_a_clock_that_begins_at_zero(tmp_path, rng):
     (tmp_path / "times.txt").write_text("".join(f"{0.1 * index:.3f}\n" for index in range(40)))
     for scan in open_recording(tmp_path).scans(0, None, 13):
         np.testing.assert_allclose([scan.time_offsets.min(), scan.time_offsets.max()], [0.0, 0.0625], atol=1e-9)
+
+
+def test_points_on_another_clock_than_times_txt_are_one_warning(tmp_path, rng, caplog):
+    """A clock that begins at zero is ambiguous, so that several scans are looked at; 1.7 s are 1.7e9 s read as ns."""
+    for index in range(40):
+        _write(tmp_path, f"scan_{index}.npy", _absolute(rng, 1.7e9 + 0.1 * index, 20))
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * index:.3f}\n" for index in range(40)))
+    with caplog.at_level(logging.WARNING):
+        recording = open_recording(tmp_path)
+        for index, scan in enumerate(recording.scans()):
+            assert scan.stamp == pytest.approx(0.1 * index)
+            np.testing.assert_allclose([scan.time_offsets.min(), scan.time_offsets.max()], [0.0, 0.0625], atol=1e-6)
+        info = recording.describe()
+    assert caplog.records == []
+    (warning,) = recording.warnings
+    assert warning == (
+        "The time field 'timestamp' reads another clock than the scans' stamps, so the earliest point of each scan"
+        " gets its stamp."
+    )
+    assert [note for note in info.notes if "clock" in note] == [warning]
 
 
 def _write_numbered(folder: Path, rng, names: list[str]) -> None:

@@ -84,7 +84,7 @@ def test_saving_takes_two_percent_of_the_time_at_most(
     clock.now += 0.02
     assert kept.is_due()
     kept.save(pipeline)
-    assert read_state(unfinished.state).part("log").value("messages") == []
+    assert read_state(unfinished.files.state).part("log").value("messages") == []
     clock.now += pause_s - 0.01
     assert not kept.is_due()
     clock.now += 0.02

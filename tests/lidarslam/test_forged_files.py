@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.odometry.network.exported import DESCRIPTION, read_exported
 from lidarslam.odometry.network.shipped import default_weights
 from lidarslam.storage.comparison_folder import run_directories
+from lidarslam.storage.unfinished import Unfinished
 
 FAST = ("--odometry", "constant-velocity", "--no-report")
 DEEP = "[" * 100_000
@@ -155,6 +157,39 @@ def test_a_tampered_rerun_recording(tmp_path: Path, finished_run: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         rerun_output.show_file_in_window(tmp_path)
     assert lidarslam("view", finished_run, "--save", tmp_path / "view.rrd").exit_code == 0
+
+
+def flipped(content: bytes) -> bytes:
+    """Some bits in the middle, which only Rerun could find."""
+    return bytes(byte ^ (64 < at < len(content) - 64 and at % 997 == 0) for at, byte in enumerate(content))
+
+
+@pytest.mark.parametrize("forge", [lambda content: content[:99], flipped, lambda _: b"ply\n", None],
+                         ids=["cut", "flipped", "another file", "a folder"])  # fmt: skip
+def test_nothing_but_view_reads_the_rerun_recording_of_a_run(
+    tmp_path: Path, finished_run: Path, small_recording: Path, forge: Callable[[bytes], bytes] | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    killed = tmp_path / "killed"
+    with monkeypatch.context() as patch:
+        patch.setattr(Unfinished, "end", lambda *_, **__: None)
+        lidarslam("run", small_recording, "--out", killed, *FAST, "--set", "checkpoints.every_scans=2")
+    lidarslam("view", finished_run, "--save", tmp_path / "recording.rrd")
+    for run in (finished_run, killed):
+        if forge is None:
+            (run / "recording.rrd").mkdir()
+        else:
+            (run / "recording.rrd").write_bytes(forge((tmp_path / "recording.rrd").read_bytes()))
+    for words in (
+        ("evaluate", finished_run),
+        ("view", finished_run, "--picture", tmp_path / "view.png"),
+        ("run", small_recording, "--out", killed, *FAST, "--resume"),
+        ("run", small_recording, "--out", finished_run, *FAST, "--overwrite"),
+    ):
+        result = lidarslam(*words)
+        assert (result.exit_code, result.stderr) == (0, "")
+    for run in (finished_run, killed):
+        assert (run / "recording.rrd").exists() == (forge is None)  # of no run, and left where it is
 
 
 def test_two_methods_of_one_name(tmp_path: Path) -> None:

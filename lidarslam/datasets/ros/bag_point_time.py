@@ -45,17 +45,10 @@ class BagPointTime:
             return self.azimuth.offsets(Sweep(cloud.points, cloud.rings))
         return field_offsets(cloud, self._field, stamp)
 
-    def notes(self, cloud: DecodedCloud, stamp: float) -> Iterator[str]:
-        """Facts for the user, by the first cloud."""
-        if self.azimuth.note is not None:
-            yield self.azimuth.note
-        if cloud.time_field is None or cloud.times is None:
-            return
-        if self._field is not None and not self._field.shares_clock(cloud.times, stamp):
-            yield (
-                f"The point field {cloud.time_field} reads another clock than the stamps,"
-                " so the earliest point of each scan gets the scan's stamp."
-            )
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Facts for the user."""
+        return () if self.azimuth.note is None else (self.azimuth.note,)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -234,7 +234,7 @@ class BagRecording:
                 *self.warnings,
                 *faults.warnings(),
                 *unreadable.warnings(),
-                *self._point_time.notes(cloud, first.stamp),
+                *self._point_time.notes,
             ),
             imu=self._imu.summary(),
         )

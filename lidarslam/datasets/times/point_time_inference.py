@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 _CLOUDS_LOOKED_AT, _CLOUDS_WITHOUT_TIME = 30, 3
 # Sweeps last 0.02 to 0.3 s. The limits leave room for partial ones and are less than one unit (1000) apart.
 _SWEEP_S, _SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 0.1, 0.005, 1.0
+# Seconds since 1970 read as nanoseconds are 1.7 s, which may be near the stamp; a sweep is then shorter than this.
+_NO_SWEEP_S = 1e-6
 # The same relative to the time between scans, where that is known and itself plausible.
 _SHORTEST_OF_PERIOD, _LONGEST_OF_PERIOD = 0.05, 1.5
 _PLAUSIBLE_PERIOD_S = (1e-3, 2.0)
@@ -49,7 +51,8 @@ class LearnedTime(NamedTuple):
     """What is known of a time field."""
 
     model: PointTimeModel | None = None  # None: it gives the points no times
-    warning: str | None = None  # a correction; without a model, what is wrong, to be continued with a semicolon
+    # A correction, or another clock; without a model, what is wrong, to be continued with a semicolon.
+    warning: str | None = None
 
 
 def learn_point_time(
@@ -101,7 +104,8 @@ def infer_point_time(
 
     Returns:
         No model when the values are no per-point time: `reference` is "none" or "azimuth", all values are equal, too
-        coarse (an epoch in float32), or span a sweep in no unit; but for the first, the warning says so.
+        coarse (an epoch in float32), or span a sweep in no unit; but for the first, the warning says so. With a model,
+        the warning says how it corrects the values, or that they read another clock than the stamp.
     """
     if reference in ("none", "azimuth") or not len(values):
         return LearnedTime()
@@ -127,10 +131,14 @@ def infer_point_time(
         span = f"({spread.first:.9g} to {spread.last:.9g})"
         return LearnedTime(None, f"The time field {field!r} {span} spans a sweep in no unit")
     model = PointTimeModel(field, found, "absolute" if by_clock else _reference(spread, found, reference))
-    if model.reference == "absolute" and stamp is not None and not model.shares_clock(values, stamp):
-        said = "time field %r reads another clock than the scans' stamps: the earliest point of a scan gets its stamp"
-        logger.warning(said, field)
-    return LearnedTime(model)
+    return LearnedTime(model, _other_clock(model, values, stamp))
+
+
+def _other_clock(model: PointTimeModel, values: NDArray[np.generic], stamp: float | None) -> str | None:
+    if model.reference != "absolute" or stamp is None or model.shares_clock(values, stamp):
+        return None
+    said = f"The time field {model.field!r} reads another clock than the scans' stamps"
+    return f"{said}, so the earliest point of each scan gets its stamp."
 
 
 def _without_spread(values: NDArray[np.generic]) -> str:
@@ -186,7 +194,8 @@ def _unit_by_clock(spread: ValueSpread, stamp: float | None, units: Sequence[str
         return None
     for unit in units:
         per_second = UNITS_PER_SECOND[unit]
-        if abs(spread.middle / per_second - stamp) <= CLOCK_LIMIT_S and spread.span / per_second <= _LONGEST_SWEEP_S:
+        reads_the_same = abs(spread.middle / per_second - stamp) <= CLOCK_LIMIT_S
+        if reads_the_same and _NO_SWEEP_S < spread.span / per_second <= _LONGEST_SWEEP_S:
             return unit
     return None
 

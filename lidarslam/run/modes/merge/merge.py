@@ -30,6 +30,7 @@ from lidarslam.run.modes.merge.writing import MergeOutcome, Part, missing, write
 from lidarslam.run.progress import show_count
 from lidarslam.run.resuming import WITHOUT_EFFECT
 from lidarslam.storage.about import About
+from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.unfinished import Unfinished
 
@@ -61,10 +62,10 @@ def merge(request: MergeRequest, show: Show) -> MergeOutcome:
             unfinished.begin(0)
             parts = []
             for run, recording in runs:
-                if request.overwrite:
-                    Unfinished(run.out, About({})).end(stopped=False)
                 if run.out.is_symlink():
                     run.out.unlink()
+                if request.overwrite:
+                    CheckpointFiles(run.out).remove()
                 own = stack.enter_context(RunDirectory.create(run.out, request.overwrite, request.resume))
                 parts.append(Part(replace(run, config=config), recording, own))
             graph = begin_graph(request.config, request.out)
@@ -146,6 +147,6 @@ def _add(graph: "SlamGraph", part: Part) -> None:
     config = part.request.config
     tracked = KeyframeGraph(config.pose_graph.keyframes)
     if part.scans:
-        tracked = read_graph(part.saved(), config, part.unfinished.submaps)
+        tracked = read_graph(part.saved(), config, part.checkpoint.submaps)
     graph.add_recording(tracked)
     tracked.close()

@@ -41,7 +41,7 @@ class TrackedPart:
         Raises:
             OutputError: it cannot be written.
         """
-        write_state(unfinished.tracked, {"part": encode(TrackedPart, self), "graph": graph.state()})
+        write_state(unfinished.files.tracked, {"part": encode(TrackedPart, self), "graph": graph.state()})
 
 
 def read_part(saved: Saved) -> TrackedPart:

@@ -22,6 +22,7 @@ from lidarslam.run.run import open_odometry
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.tracking import NoScanError, Progress, track
 from lidarslam.storage.about import About
+from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
 from lidarslam.storage.unfinished import Unfinished
@@ -78,14 +79,15 @@ def track_part(task: PartTask, show: Show = _unseen) -> PartDone:
             )
         interruptions = stack.enter_context(Interruptions())
         recording = open_recording(task.request.source, task.request.config.reader)
-        folder = Unfinished(out, About({})).folder
-        folder.mkdir(parents=True, exist_ok=True)
-        stack.enter_context(only_writer(folder, _PATIENCE_S))
+        files = CheckpointFiles(out)
+        files.require_own()
+        files.make_folder()
+        stack.enter_context(only_writer(files.folder, _PATIENCE_S))
         description = describe_computed(task.request, recording) | task.merge
         is_begun = About.read(out) is not None
         unfinished = stack.enter_context(Unfinished.claim(RunDirectory(out), description, is_begun))
-        if unfinished.tracked.is_file():
-            earlier = read_part(read_state(unfinished.tracked))
+        if unfinished.files.tracked.is_file():
+            earlier = read_part(read_state(unfinished.files.tracked))
             if not earlier.interrupted:
                 return PartDone(len(earlier.log))
         with show(task.name) as progress:
@@ -120,8 +122,8 @@ def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:
     """The graph of one recording, new or as it was saved; with loop closures only where they correct the local map."""
     graph: KeyframeGraph | None = None
     if config.pose_graph.corrects_local_map:
-        graph = begin_graph(config, file=unfinished.submaps)
-    graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=unfinished.submaps)
+        graph = begin_graph(config, file=unfinished.files.submaps)
+    graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=unfinished.files.submaps)
     if unfinished.saved is not None:
         graph.restore(unfinished.saved.part("graph"))
     return graph

@@ -23,10 +23,9 @@ from lidarslam.run.summary.summary import GraphSummary, peak_rss_mb
 from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.run.tracking import Tracked, unless_damaged
 from lidarslam.storage import directory as files
-from lidarslam.storage.about import About
+from lidarslam.storage.checkpoint_files import CheckpointFiles
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.storage.state_file import read_state
-from lidarslam.storage.unfinished import Unfinished
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -64,9 +63,9 @@ class Part:
         return 0 if self.done is None else self.done.scans
 
     @property
-    def unfinished(self) -> Unfinished:
+    def checkpoint(self) -> CheckpointFiles:
         """Where its task left the result."""
-        return Unfinished(self.request.out, About({}))
+        return CheckpointFiles(self.request.out)
 
     def saved(self) -> Saved:
         """That result, read anew each time: those of all recordings need not fit into memory.
@@ -74,7 +73,7 @@ class Part:
         Raises:
             InputError: the file is damaged.
         """
-        return read_state(self.unfinished.tracked)
+        return read_state(self.checkpoint.tracked)
 
     def tracked(self) -> Tracked:
         """The recording as it was tracked; its map is drawn anew from the graph."""
