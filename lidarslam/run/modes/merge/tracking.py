@@ -121,7 +121,7 @@ def _track(
 def _open_graph(config: Config, unfinished: Unfinished) -> KeyframeGraph:
     """The graph of one recording, new or as it was saved; with loop closures only where they correct the local map."""
     graph: KeyframeGraph | None = None
-    if config.pose_graph.corrects_local_map:
+    if config.mapping.method == "surfels" and config.pose_graph.corrects_local_map:
         graph = begin_graph(config, file=unfinished.files.submaps)
     graph = graph or KeyframeGraph(config.pose_graph.keyframes, file=unfinished.files.submaps)
     if unfinished.saved is not None:
