@@ -11,7 +11,7 @@ Upright and tilted recordings are to be left as recorded, and the last count is 
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +36,7 @@ POSES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "upright": ((0, 0, 0),),
     "tilted": ((30, 0, 0), (-45, 0, 0), (0, 25, 0), (0, -45, 90), (0, 45, 0)),
     "on its side": ((90, 0, 0), (-90, 0, 0), (0, 90, 0), (0, -90, 0)),
-    "camera": ((-90, 0, -90),),
+    "camera": ((90, -90, 0),),  # x to the right, y down
     "upside down": ((180, 0, 0), (160, 15, 0)),
 }
 OUTCOMES = ("turned", "warned", "left", "wrong")
@@ -126,16 +126,16 @@ def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -
                 yield f"{upright.name} {start} {angles}", *result
 
 
-def mounted(upright: Simulation, R: FloatArray, looks: range) -> tuple[list[FloatArray], FloatArray, FloatArray]:
+def mounted(upright: Simulation, R: FloatArray, looks: range) -> tuple[Iterator[FloatArray], FloatArray, FloatArray]:
     """The scans of a sensor that is mounted so, no more turn, and upwards (3,) as recorded."""
     T = upright.T_body_lidar @ make_transform(R.T, np.zeros(3))
     simulation = replace(upright, T_body_lidar=T)
     vars(simulation)["_caster"] = upright._caster  # building one takes longer than the scans
     up = simulation.ground_truth_at(simulation.stamps[looks.start : looks.start + 1]).T_world_lidar[0, 2, :3]
-    return [simulation.scan(index).scan.points for index in looks], np.eye(3), up
+    return (simulation.scan(index).scan.points for index in looks), np.eye(3), up
 
 
-def guessed(scans: Sequence[FloatArray], R: FloatArray, up: FloatArray) -> tuple[Guess, float]:
+def guessed(scans: Iterable[FloatArray], R: FloatArray, up: FloatArray) -> tuple[Guess, float]:
     """The guess from scans turned by R, with the tilt after it; upwards (3,) is before the turn."""
     guess = guess_mounting(points @ R.T for points in scans)
     after = transform_of(guess.mounting)[:3, :3] @ R @ up

@@ -180,7 +180,7 @@ def test_an_odd_attitude_is_guessed_by_its_angles():
     assert up[2] > np.cos(np.deg2rad(2.0))
 
 
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120)])
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120), (0, 55, 0)])
 def test_a_sensor_that_is_tilted_is_left_alone(angles):
     assert guess_mounting(points @ turn(*angles).T for points in street()) == UPRIGHT
 
