@@ -210,6 +210,13 @@ def test_the_wall_beside_a_gallery_is_no_ground(angles, opposite):
     assert guess_mounting(points @ turn(*angles).T for points in hall) == UPRIGHT
 
 
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -30, 0)])
+def test_a_facade_beside_a_flying_sensor_is_no_ground(angles):
+    facade = ((-20.0, 2.5, -7.0), (20.0, 12.0, 12.0))
+    flight = [cast(rays(-15.0, 15.0, 16), 0.2 * number, [facade], height_m=7.0) for number in range(5)]
+    assert guess_mounting(points @ turn(*angles).T for points in flight) == UPRIGHT
+
+
 def test_what_only_some_scans_show_is_a_warning_and_no_more():
     R, grass = turn(*QUARTERS["left"]), np.random.default_rng(0).normal(0.0, 5.0, (4000, 3))
     guess = guess_mounting([street(1)[0] @ R.T, street(2)[1] @ R.T, grass, grass, grass])

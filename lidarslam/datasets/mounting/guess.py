@@ -88,7 +88,9 @@ def _upwards(points: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     if _sees_one_side(points, R_image_recorded[2]):
         return None, None
     axis = None if np.array_equal(R_image_recorded, np.eye(3)) else R_image_recorded[2]
-    grounds = [plane for plane in seen if plane.up[2] < _TURNED and _is_ground(plane, seen, axis)]
+    # Beside the spin axis a wall is like the ground of a sensor on its side.
+    across = [plane for plane in seen if abs(plane.up @ R_image_recorded[2]) > _UPRIGHT]
+    grounds = [plane for plane in across if plane.up[2] < _TURNED and _is_ground(plane, seen, axis)]
     largest = max(grounds, key=lambda plane: plane.share, default=None)
     if any(_may_be_upright(plane, largest) for plane in seen):
         return None, None
