@@ -4,7 +4,8 @@
     python benchmarks/mounting.py KITTI --sequence 04 --methods learned constant-velocity+map kiss-icp
 
 Every scan and the ground truth are turned about the sensor before the program sees them. `as it is` is
-`reader.mounting=upright`; `guessed` is the default, with what it came to.
+`reader.mounting=upright`; `guessed` is the default, with what it came to. A recording without ground truth is compared
+with the trajectory of the same method on it as it was recorded.
 """
 
 import argparse
@@ -39,9 +40,12 @@ TURNS: dict[str, RollPitchYaw] = {
     "roll -90": (-90.0, 0.0, 0.0),
     "roll 180": (180.0, 0.0, 0.0),
     "pitch 90": (0.0, 90.0, 0.0),
+    "pitch -90": (0.0, -90.0, 0.0),
+    "camera": (90.0, -90.0, 0.0),
     "roll 45": (45.0, 0.0, 0.0),
     "odd": (70.0, 25.0, 110.0),
 }
+SETTINGS = ("as it is", "guessed", "set")
 METHODS = ("learned", "learned+map", "constant-velocity+map", "kiss-icp")
 
 
@@ -73,6 +77,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, nargs="+", default=[0])
     parser.add_argument("--scans", type=int, default=40)
     parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--settings", nargs="+", default=SETTINGS, choices=SETTINGS)
     parser.add_argument("--turns", nargs="+", default=list(TURNS), choices=list(TURNS))
     arguments = parser.parse_args()
     recorded = open_recording(arguments.source, ReaderConfig(sequence=arguments.sequence, mounting="upright"))
@@ -80,17 +85,19 @@ def main() -> None:
     print(f"| start | turned by | reader.mounting | {' | '.join(arguments.methods)} |")
     print("|---" * (3 + len(arguments.methods)) + "|")
     for start in arguments.starts:
+        upright = MountedRecording(From(recorded, start), "upright")  # type: ignore[arg-type]
+        truths = {method: reference(upright, method, arguments.scans) for method in arguments.methods}
         for name in arguments.turns:
-            turned = MountedRecording(From(recorded, start), TURNS[name])  # type: ignore[arg-type]
+            turned = MountedRecording(upright, TURNS[name])
             with warnings.catch_warnings(action="ignore"):  # at 90 degrees of pitch, one of several angles is taken
                 back = Rotation.from_euler("xyz", TURNS[name], degrees=True).inv().as_euler("xyz", degrees=True)
             given: RollPitchYaw = tuple(np.round(back, 6).tolist())
             settings: dict[str, Mounting] = {"as it is": "upright", "guessed": "auto", "set": given}
             for setting, mounting in settings.items():
-                if name == "none" and setting == "set":
+                if setting not in arguments.settings or (name == "none" and setting == "set"):
                     continue
                 mounted = MountedRecording(turned, mounting)
-                cells = [run(mounted, method, arguments.scans) for method in arguments.methods]
+                cells = [cell(mounted, method, arguments.scans, truth) for method, truth in truths.items()]
                 print(f"| {start} | {name} | {shown(mounted, setting, mounting)} | {' | '.join(cells)} |", flush=True)
 
 
@@ -102,8 +109,20 @@ def shown(recording: MountedRecording, setting: str, mounting: Mounting) -> str:
     return f"{setting}: turned by {tilt_deg:.0f} degrees"
 
 
-def run(recording: MountedRecording, method: str, count: int) -> str:
-    """The error of a method over the first scans, and how many were lost."""
+def reference(recording: Recording, method: str, count: int) -> Trajectory:
+    """The ground truth, or else the trajectory of a method."""
+    truth = recording.ground_truth
+    return tracked(recording, method, count)[0] if truth is None else truth
+
+
+def cell(recording: MountedRecording, method: str, count: int, truth: Trajectory) -> str:
+    """The error of a method over the first scans, and how many were lost; positions do not depend on the mounting."""
+    trajectory, lost = tracked(recording, method, count)
+    return f"{evaluate_trajectory(trajectory, truth).errors.ate_rmse_m:.3f} / {lost}"
+
+
+def tracked(recording: Recording, method: str, count: int) -> tuple[Trajectory, int]:
+    """The trajectory of the first scans by a method, and how many were lost."""
     odometry, _, mapping = method.partition("+")
     config = load_config(settings=[f"odometry.method={odometry}", f"mapping.method={'surfels' if mapping else 'off'}"])
     stamps, poses, lost = list[float](), list[FloatArray](), 0
@@ -113,11 +132,7 @@ def run(recording: MountedRecording, method: str, count: int) -> str:
             stamps.append(result.stamp)
             poses.append(result.T_world_lidar)
             lost += result.status is Status.LOST
-    truth = recording.ground_truth
-    if truth is None:
-        return f"- / {lost}"
-    errors = evaluate_trajectory(Trajectory(np.array(stamps), np.array(poses)), truth).errors
-    return f"{errors.ate_rmse_m:.3f} / {lost}"
+    return Trajectory(np.array(stamps), np.array(poses)), lost
 
 
 if __name__ == "__main__":

@@ -45,11 +45,13 @@ def rays(low_deg: float = -25.0, high_deg: float = 10.0, rings: int = 32) -> Flo
     return np.stack(parts, axis=-1).reshape(-1, 3)
 
 
-def cast(directions: FloatArray, x: float, boxes: list, ceiling_m: float = np.inf) -> FloatArray:
+def cast(
+    directions: FloatArray, x: float, boxes: list, ceiling_m: float = np.inf, height_m: float = HEIGHT_M
+) -> FloatArray:
     """Points (N, 3) that a sensor at x along a street, or in a room, measures."""
     origin = np.array([x, 0.0, 0.0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        ranges = np.where(directions[:, 2] < 0.0, -HEIGHT_M / directions[:, 2], ceiling_m / directions[:, 2])
+        ranges = np.where(directions[:, 2] < 0.0, -height_m / directions[:, 2], ceiling_m / directions[:, 2])
         for low, high in boxes:
             near, far = (np.array(corner) - origin for corner in (low, high))
             enter = np.minimum(near / directions, far / directions).max(axis=1)
@@ -178,7 +180,7 @@ def test_an_odd_attitude_is_guessed_by_its_angles():
     assert up[2] > np.cos(np.deg2rad(2.0))
 
 
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120)])
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -35, 0), (45, 0, 0), (30, 30, 120), (0, 55, 0)])
 def test_a_sensor_that_is_tilted_is_left_alone(angles):
     assert guess_mounting(points @ turn(*angles).T for points in street()) == UPRIGHT
 
@@ -186,6 +188,33 @@ def test_a_sensor_that_is_tilted_is_left_alone(angles):
 @pytest.mark.parametrize("angles", [(0, 0, 0), (180, 0, 0), (25, 0, 0)])
 def test_walls_of_a_corridor_are_no_ground(angles):
     assert guess_mounting(points @ turn(*angles).T for points in corridor()) == UPRIGHT
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, 90, 0), (180, 0, 0)])
+def test_a_dome_that_sees_the_ceiling_and_not_the_floor_is_left_alone(angles):
+    walls = [((-6.0, 4.0, -2.0), (6.0, 4.2, 9.0)), ((-6.0, -3.2, -2.0), (6.0, -3.0, 9.0))]
+    walls += [((6.0, -4.0, -2.0), (6.2, 5.0, 9.0)), ((-6.2, -4.0, -2.0), (-6.0, 5.0, 9.0))]
+    room = [cast(rays(-7.0, 52.0), 0.1 * number, walls, ceiling_m=1.2) for number in range(5)]
+    assert guess_mounting(points @ turn(*angles).T for points in room) == UPRIGHT
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -30, 0)])
+@pytest.mark.parametrize(
+    "opposite", [[((-3.0, -16.1, -4.0), (3.0, -16.0, 3.0))], []], ids=["a wall opposite", "nothing opposite"]
+)
+def test_the_wall_beside_a_gallery_is_no_ground(angles, opposite):
+    """The floor of the hall is beyond that of the gallery, nothing is beyond the wall."""
+    wall, gallery = ((-60.0, 2.5, -9.0), (60.0, 3.0, 9.0)), ((-60.0, -2.2, -1.6), (60.0, 2.5, -1.5))
+    boxes = [wall, gallery, *opposite]
+    hall = [cast(rays(-45.0, 45.0, 64), 0.2 * number, boxes, 4.6, height_m=7.0) for number in range(5)]
+    assert guess_mounting(points @ turn(*angles).T for points in hall) == UPRIGHT
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (25, 0, 0), (0, -30, 0)])
+def test_a_facade_beside_a_flying_sensor_is_no_ground(angles):
+    facade = ((-20.0, 2.5, -7.0), (20.0, 12.0, 12.0))
+    flight = [cast(rays(-15.0, 15.0, 16), 0.2 * number, [facade], height_m=7.0) for number in range(5)]
+    assert guess_mounting(points @ turn(*angles).T for points in flight) == UPRIGHT
 
 
 def test_what_only_some_scans_show_is_a_warning_and_no_more():

@@ -163,7 +163,9 @@ def test_interrupted_it_writes_what_came(
     np.testing.assert_allclose([position.x, position.y, position.z], expected, atol=1e-8)
 
 
-def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8) -> bytes:
+def message_at(
+    stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8, axes: tuple[int, int, int] = (0, 1, 2)
+) -> bytes:
     """A serialised cloud of 200 points, with times from 0 to 0.1 s in nanoseconds."""
     types = STORE.types
     fields = [
@@ -171,7 +173,7 @@ def message_at(stamp_s: float, frame_id: str = "lidar", last_time: float = 1e8) 
         for column, name in enumerate("xyzt")
     ]
     table = np.zeros(200, np.dtype([("xyz", "<f4", 3), ("t", "<u4")]))
-    table["xyz"] = np.random.default_rng(0).uniform(1.0, 5.0, (200, 3))
+    table["xyz"] = np.random.default_rng(0).uniform(1.0, 5.0, (200, 3))[:, axes]
     table["t"] = np.linspace(0.0, last_time, 200)
     stamp_ns = round(1e9 * stamp_s)
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
@@ -194,6 +196,18 @@ def test_point_times_are_inferred_from_the_first_cloud() -> None:
     assert live is not None
     assert (live.stamp_ns, live.frame_id, live.scan.stamp) == (1_000_500_000_000, "os", 1000.5)
     np.testing.assert_allclose(live.scan.time_offsets, np.linspace(0.0, 0.1, 200), atol=1e-8)
+
+
+def test_clouds_are_turned_as_set() -> None:
+    """y, z, x of the upright axes are x, y, z of the recorded ones."""
+    scans = []
+    for axes, mounting in (((0, 1, 2), "upright"), ((1, 2, 0), (90.0, 0.0, 90.0))):
+        config = ReaderConfig.model_validate({"mounting": mounting})
+        live = CloudDecoder(config, "sensor_msgs/msg/PointCloud2", Faults()).scan(message_at(100.0, axes=axes), 0)
+        assert live is not None
+        scans.append(live.scan)
+    np.testing.assert_array_equal(scans[1].points, scans[0].points)
+    np.testing.assert_array_equal(scans[1].time_offsets, scans[0].time_offsets)
 
 
 def test_a_time_field_without_times_is_a_warning() -> None:

@@ -188,6 +188,28 @@ def test_the_summary_tells_who_is_joined_by_what(merged: tuple[Path, MergeOutcom
     assert "02_foreign: 12 scans" in text
 
 
+@pytest.mark.slow
+def test_recordings_of_a_sensor_on_its_side_are_merged_as_upright_ones(
+    merged: tuple[Path, MergeOutcome], places: dict[str, Path], tmp_path: Path
+) -> None:
+    for place in places.values():
+        turned = tmp_path / place.name
+        turned.mkdir()
+        for path in sorted(place.glob("*.npy")):
+            table = np.load(path)
+            table["y"], table["z"] = -table["z"], table["y"].copy()
+            np.save(turned / path.name, table)
+        (turned / "timestamps.txt").write_bytes((place / "timestamps.txt").read_bytes())
+    sources = [tmp_path / name for name in ("first", "foreign", "second")]
+    outcome = merge(request(tmp_path / "merged", *sources, settings=("reader.mounting=left",)), quiet)
+    assert [recording.joined for recording in outcome.summary.recordings] == [True, False, True]
+    for name in (".", "01_first", "02_foreign", "03_second"):
+        np.testing.assert_allclose(load_map(tmp_path / "merged" / name).points, load_map(merged[0] / name).points)
+        if name != ".":
+            poses, expected = (read_tum(out / name / "trajectory.tum") for out in (tmp_path / "merged", merged[0]))
+            np.testing.assert_allclose(poses.T_world_lidar, expected.T_world_lidar, atol=1e-6)
+
+
 def graph_keys(out: Path) -> tuple[list[int], int]:
     """Keys of the poses of a pose graph, and how many edges it has."""
     words = [line.split() for line in (out / "pose_graph.g2o").read_text().splitlines()]

@@ -13,10 +13,17 @@ from lidarslam.datasets.mounting.rotation import mounting_with_up, written
 
 # A plane that faces up within this may be the ground of a sensor that is upright, or held at an angle.
 _UPRIGHT = np.cos(np.deg2rad(50.0))
+# Ground is taken from planes that face farther from up than this: normals of a few points are off by some degrees.
+_TURNED = np.cos(np.deg2rad(60.0))
 # No sensor but one that flies is farther above the ground.
 _MOST_HEIGHT_M = 4.0
 # Ground is seen within this of the spin axis, and the scans agree within as much.
 _ALIKE = np.cos(np.deg2rad(25.0))
+# A plane opposite with more than this share of the surfaces is a ceiling, or the other wall.
+_MOST_OPPOSITE = 0.01
+# A sensor that looks farther from its equator than the first on one side and less than the second on the other sees
+# the ceiling and not the floor, or the other way round; strays are left out.
+_FAR_TO_ONE_SIDE, _NEAR_TO_OTHER, _STRAY_SHARE = np.sin(np.deg2rad(35.0)), np.sin(np.deg2rad(9.0)), 0.005
 _SCANS = 5
 _ENOUGH_SCANS, _SOME_SCANS = 4, 2
 
@@ -78,24 +85,37 @@ def _upwards(points: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     if not seen or any(_may_be_upright(plane, None) for plane in seen if plane.height_m < _MOST_HEIGHT_M):
         return None, None
     R_image_recorded = image_axes(points)
+    if _sees_one_side(points, R_image_recorded[2]):
+        return None, None
     axis = None if np.array_equal(R_image_recorded, np.eye(3)) else R_image_recorded[2]
-    grounds = [plane for plane in seen if plane.up[2] < _UPRIGHT and _is_ground(plane, seen, axis)]
+    # Beside the spin axis a wall is like the ground of a sensor on its side.
+    across = [plane for plane in seen if abs(plane.up @ R_image_recorded[2]) > _UPRIGHT]
+    grounds = [plane for plane in across if plane.up[2] < _TURNED and _is_ground(plane, seen, axis)]
     largest = max(grounds, key=lambda plane: plane.share, default=None)
     if any(_may_be_upright(plane, largest) for plane in seen):
         return None, None
     if largest is not None:
         return largest.up, axis
-    return None, axis if axis is not None and abs(axis[2]) < _UPRIGHT else None
+    return None, axis if axis is not None and abs(axis[2]) < _TURNED else None
+
+
+def _sees_one_side(points: FloatArray, axis: FloatArray) -> bool:
+    """Whether points (N, 3) lie far to one side of the equator of an axis (3,), and hardly any to the other."""
+    ranges = np.linalg.norm(points, axis=1)
+    usable = ranges > 0.0
+    low, high = np.quantile(points[usable] @ axis / ranges[usable], [_STRAY_SHARE, 1.0 - _STRAY_SHARE])
+    return bool(min(-low, high) < _NEAR_TO_OTHER and max(-low, high) > _FAR_TO_ONE_SIDE)
 
 
 def _is_ground(plane: Plane, seen: Sequence[Plane], axis: FloatArray | None) -> bool:
     """Whether a plane is the ground without doubt; less is asked of one that the sensor spins parallel to."""
     if plane.height_m > _MOST_HEIGHT_M:
         return False
-    if axis is not None and abs(plane.up @ axis) > _ALIKE:
-        return plane.share > 0.03 and plane.sectors >= 6 and plane.beyond < 0.02
     opposite = max((other.share for other in seen if other.up @ plane.up < -_ALIKE), default=0.0)
-    is_alone = opposite < 0.25 * plane.share
+    if axis is not None and abs(plane.up @ axis) > _ALIKE:
+        is_alone = opposite < 0.25 * plane.share
+        return plane.share > 0.03 and plane.sectors >= 6 and plane.beyond < 0.02 and is_alone
+    is_alone = opposite < _MOST_OPPOSITE
     return plane.share > 0.08 and plane.sectors >= 9 and plane.beyond < 0.01 and is_alone
 
 
@@ -104,5 +124,5 @@ def _may_be_upright(plane: Plane, ground: Plane | None) -> bool:
     if plane.up[2] < _UPRIGHT or plane.share < 0.01 or plane.sectors < 4:
         return False
     if plane.height_m < _MOST_HEIGHT_M:
-        return plane.beyond < 0.03
+        return plane.beyond < 0.03 or (ground is not None and plane.share > 0.25 * ground.share)
     return plane.beyond < 0.01 and (ground is None or plane.share > ground.share)

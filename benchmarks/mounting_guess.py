@@ -1,0 +1,151 @@
+"""How often the guess of the mounting finds it, warns, leaves a recording as it is, or turns it wrongly.
+
+    python benchmarks/mounting_guess.py KITTI --sequence 04
+    python benchmarks/mounting_guess.py --worlds street office --sensors vlp-16 os1-64 --motions handheld
+
+Guesses are made from several starts in a recording. Recordings on disk are taken to be upright and are turned about the
+sensor as a whole (`axes`). In simulated ones the sensor is mounted so too, and sees what it sees then (`mounted`). Each
+cell has four counts: turned upright / warned / left as recorded / turned wrongly, by more than 30 degrees from upright.
+Upright and tilted recordings are to be left as recorded, and the last count is to be 0.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidarslam.core.geometry import FloatArray, make_transform
+from lidarslam.core.scan import ScanSequence
+from lidarslam.datasets.config import ReaderConfig
+from lidarslam.datasets.mounting.guess import Guess, guess_mounting
+from lidarslam.datasets.mounting.rotation import transform_of
+from lidarslam.datasets.registry import open_recording
+from lidarslam.simulation.casting.caster import Caster
+from lidarslam.simulation.motion.carriers import CARRIERS
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensors.table import SENSORS, find_sensor
+from lidarslam.simulation.worlds.registry import WORLDS, build_world
+
+# Roll, pitch, yaw of the sensor, degrees.
+POSES: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "upright": ((0, 0, 0),),
+    "tilted": ((30, 0, 0), (-45, 0, 0), (0, 25, 0), (0, -45, 90), (0, 45, 0)),
+    "on its side": ((90, 0, 0), (-90, 0, 0), (0, 90, 0), (0, -90, 0)),
+    "camera": ((90, -90, 0),),  # x to the right, y down
+    "upside down": ((180, 0, 0), (160, 15, 0)),
+}
+OUTCOMES = ("turned", "warned", "left", "wrong")
+STEP, LOOK = 4, 17  # scans from one that is looked at to the next, as the program does, and of all
+WRONG_DEG = 30.0
+
+
+def main() -> None:
+    """Print a table, a row for each recording, or for each world, sensor and motion."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", type=Path, nargs="*")
+    parser.add_argument("--sequence")
+    parser.add_argument("--every", type=int, default=8, help="scans from one start to the next, of recordings on disk")
+    parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=[])
+    parser.add_argument("--sensors", nargs="+", choices=list(SENSORS), default=list(SENSORS))
+    parser.add_argument("--motions", nargs="+", choices=list(CARRIERS), default=["handheld"])
+    parser.add_argument("--starts", type=int, default=2, help="of simulated recordings")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cases", action="store_true", help="print those that came out wrong")
+    arguments = parser.parse_args()
+    print(f"| recording | turned | {' | '.join(POSES)} |\n{'|---' * (2 + len(POSES))}|")
+    for source in arguments.sources:
+        recorded = open_recording(source, ReaderConfig(sequence=arguments.sequence, mounting="upright"))
+        row(recorded.name, "axes", (on_disk(recorded, pose, arguments.every) for pose in POSES), arguments.cases)
+    for world in arguments.worlds:
+        made = list(simulations(world, arguments))
+        for turned in ("axes", "mounted"):
+            row(world, turned, (simulated(made, pose, turned, arguments.starts) for pose in POSES), arguments.cases)
+
+
+def row(name: str, turned: str, columns: Iterator[Iterator[tuple[str, Guess, float]]], shows_cases: bool) -> None:
+    """Print a row, and cases that came out wrong above it."""
+    cells = []
+    for pose, cases in zip(POSES, columns, strict=True):
+        counts = Counter[str]()
+        for case, guess, tilt_deg in cases:
+            result = outcome(guess, tilt_deg)
+            counts[result] += 1
+            if shows_cases and (result == "wrong" or (pose in ("upright", "tilted") and result != "left")):
+                print(f"{name}, {turned}, {pose}, {case}: {guess.mounting}, {tilt_deg:.0f} degrees; {guess.warning}")
+        cells.append(" / ".join(str(counts[result]) for result in OUTCOMES))
+    print(f"| {name} | {turned} | {' | '.join(cells)} |", flush=True)
+
+
+def outcome(guess: Guess, tilt_deg: float) -> str:
+    """What a guess came to, with the tilt of the scans after it."""
+    if guess.mounting == "upright":
+        return "left" if guess.warning is None else "warned"
+    return "turned" if tilt_deg < WRONG_DEG else "wrong"
+
+
+def on_disk(recorded: ScanSequence, pose: str, every: int) -> Iterator[tuple[str, Guess, float]]:
+    """The guesses from every start, with the tilts after them."""
+    for start in range(0, max(1, len(recorded) - LOOK), every):
+        scans = [scan.points for scan in recorded.scans(start, start + LOOK, STEP)]
+        for angles in POSES[pose]:
+            yield f"{start} {angles}", *guessed(scans, matrix(angles), np.array([0.0, 0.0, 1.0]))
+
+
+def simulations(world: str, arguments: argparse.Namespace) -> Iterator[Simulation]:
+    """A world's recordings, upright, of all motions and sensors."""
+    built = build_world(world, arguments.seed)
+    caster = Caster(built)
+    for name in arguments.motions:
+        motion = motion_along_route(name, built, arguments.seed)
+        T_body_lidar = make_transform(np.eye(3), [0.0, 0.0, motion.sensor_height_m])
+        for sensor in map(find_sensor, arguments.sensors):
+            count = int(motion.duration_s * sensor.rate_hz)
+            simulation = Simulation(built, sensor, motion, T_body_lidar, count, arguments.seed)
+            vars(simulation)["_caster"] = caster
+            yield simulation
+
+
+def simulated(made: Sequence[Simulation], pose: str, turned: str, starts: int) -> Iterator[tuple[str, Guess, float]]:
+    """The guesses from starts over the whole route, with the tilts after them."""
+    for upright in made:
+        for start in np.linspace(0, len(upright) - LOOK, starts + 1, dtype=int)[:-1].tolist():
+            looks = range(start, start + LOOK, STEP)
+            scans = [upright.scan(index).scan.points for index in looks] if turned == "axes" else []
+            for angles in POSES[pose]:
+                R = matrix(angles)
+                if turned == "axes":
+                    up = upright.ground_truth_at(upright.stamps[start : start + 1]).T_world_lidar[0, 2, :3]
+                    result = guessed(scans, R, up)
+                else:
+                    result = guessed(*mounted(upright, R, looks))
+                yield f"{upright.name} {start} {angles}", *result
+
+
+def mounted(upright: Simulation, R: FloatArray, looks: range) -> tuple[Iterator[FloatArray], FloatArray, FloatArray]:
+    """The scans of a sensor that is mounted so, no more turn, and upwards (3,) as recorded."""
+    T = upright.T_body_lidar @ make_transform(R.T, np.zeros(3))
+    simulation = replace(upright, T_body_lidar=T)
+    vars(simulation)["_caster"] = upright._caster  # building one takes longer than the scans
+    up = simulation.ground_truth_at(simulation.stamps[looks.start : looks.start + 1]).T_world_lidar[0, 2, :3]
+    return (simulation.scan(index).scan.points for index in looks), np.eye(3), up
+
+
+def guessed(scans: Iterable[FloatArray], R: FloatArray, up: FloatArray) -> tuple[Guess, float]:
+    """The guess from scans turned by R, with the tilt after it; upwards (3,) is before the turn."""
+    guess = guess_mounting(points @ R.T for points in scans)
+    after = transform_of(guess.mounting)[:3, :3] @ R @ up
+    return guess, float(np.rad2deg(np.arccos(np.clip(after[2], -1.0, 1.0))))
+
+
+def matrix(angles: Sequence[float]) -> FloatArray:
+    """The rotation by roll, pitch and yaw."""
+    return np.asarray(Rotation.from_euler("xyz", angles, degrees=True).as_matrix())
+
+
+if __name__ == "__main__":
+    main()
