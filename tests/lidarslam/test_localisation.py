@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -204,3 +205,17 @@ def test_a_restored_localiser_goes_on_as_the_one_that_was_saved(
         first, second = whole.localise(estimated, None), resumed.localise(estimated, None)
         np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
         np.testing.assert_array_equal(first.T_odom_lidar, second.T_odom_lidar)
+
+
+def test_scans_may_be_thinned_ahead_of_their_poses(room_scans: list[Scan], room_truth: Trajectory) -> None:
+    """As many ahead as the pipeline has scans under way."""
+    motions = [np.eye(4), *room_truth.relative_motions()]
+    estimates = [Estimated(scan, Motion(T, 100), 0.1) for scan, T in zip(room_scans[:8], motions, strict=False)]
+    in_turn, ahead = make_localiser(Config()), make_localiser(Config())
+    sampled = [replace(one, sampled=ahead.sample(one.scan)) for one in estimates]
+    for one, other in zip(estimates, sampled, strict=True):
+        first, second = in_turn.localise(one, None), ahead.localise(other, None)
+        assert second.status is Status.OK
+        np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
+    for method in ("loam", "off"):
+        assert make_localiser(Config(mapping=MappingConfig(method=method))).sample(room_scans[0]) is None

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lidarslam.config.settings import load_config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.scan import Scan
@@ -20,7 +21,7 @@ from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.pipeline.localisation import ScanToMap
+from lidarslam.pipeline.localisation import ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 
 CONFIG = MappingConfig(radius_m=30.0, keypoints=800)
@@ -145,3 +146,17 @@ def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
     assert mapper.redraw(drawn, 4)
     assert mapper.local_map is drawn
     assert mapper.process(room_scans[6], Prior()).registered  # to the last four scans, which are in it
+
+
+@pytest.mark.parametrize(
+    ("settings", "kept_scans"),
+    [
+        (["pose_graph.enabled=true"], SCANS_LATER),
+        (["pose_graph.enabled=true", "pose_graph.corrects_local_map=false"], 0),
+        ([], 0),
+    ],
+)
+def test_runs_with_a_graph_correct_their_map_unless_told_otherwise(settings: list[str], kept_scans: int) -> None:
+    mapper = make_localiser(load_config(None, settings)).surfel_mapper
+    assert mapper is not None
+    assert mapper.kept_scans == kept_scans
