@@ -16,12 +16,17 @@ def bounds_of(field: FieldInfo) -> tuple[float, float] | None:
 
 
 def bounds_text(field: FieldInfo) -> str | None:
-    """The bounds in words, such as `0.01 to 10`, with the words that may stand instead; None of no number."""
+    """The bounds in words, such as `0.01 to 10` or `[3 numbers, 0 to 1]`, with the words that may stand instead.
+
+    None of no number.
+    """
     bounds = bounds_of(field)
     if bounds is None:
         return None
     words = [word for kind in get_args(field.annotation) if get_origin(kind) is Literal for word in get_args(kind)]
-    return " or ".join([" to ".join(f"{b:,.0f}" if b == int(b) else f"{b:g}" for b in bounds), *words])
+    numbers = " to ".join(f"{b:,.0f}" if b == int(b) else f"{b:g}" for b in bounds)
+    length = next((len(get_args(kind)) for kind in get_args(field.annotation) if get_origin(kind) is tuple), None)
+    return " or ".join([numbers if length is None else f"[{length} numbers, {numbers}]", *words])
 
 
 def _marks(metadata: list[Any], annotation: Any) -> Iterator[Any]:

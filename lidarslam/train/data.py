@@ -167,8 +167,12 @@ def prepared_piece(piece: Stretch, config: TrainingConfig, cache: Path, count: C
     """One of the pieces of a stretch, as `prepared`."""
     key, path = _key(piece, config), file_of(piece, config, cache)
     try:
-        kept = PreparedRecording(**read_tensor_file(path, _KIND)[0])
-    except (InputError, TypeError):  # not there yet, or damaged: made anew
+        tensors, content = read_tensor_file(path, _KIND)
+        kept = PreparedRecording(**tensors)
+        kept.require(len(piece), config.images)
+        if _digest({**content, "name": ""}) != _digest({**key, "name": ""}):
+            raise InputError(f"{path}: is of another recording")
+    except (InputError, TypeError, ValueError):  # not there yet, damaged, or of another recording: made anew
         made = _prepare(piece, config, count)
         write_tensor_file(path, _KIND, vars(made), {"name": piece.name, **key})
         return made

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.state.stateful import ANY_NUMBER, Shape
+from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Within
 from lidarslam.mapping.global_map import kernels
 from lidarslam.mapping.global_map.voxel_rows import COUNT, Layout
 from lidarslam.mapping.surfels.cell_kernels import BITS, OFFSET
@@ -19,7 +19,7 @@ _MASK = (1 << BITS) - 1
 class Voxels:
     """Sums over points of one voxel each: keys (M,) int64, sums (M, width); once reduced, sorted and unique."""
 
-    keys: Annotated[NDArray[np.int64], Shape(None)]
+    keys: Annotated[NDArray[np.int64], Shape(None), Within(low=0)]
     sums: Annotated[NDArray[np.float32], Shape(None, None), ANY_NUMBER]  # the earliest point of none is at infinity
     layout: Layout
 

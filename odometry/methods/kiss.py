@@ -92,8 +92,9 @@ class KissOdometry:
 
     def estimate(self, scan: Scan) -> Motion:
         """Register one scan; one that KISS-ICP cannot take gives a prediction by the last velocity, and the reason."""
-        if len(scan) < _MIN_POINTS:
-            return self._predict(scan.stamp, f"{len(scan)} points are too few to register")
+        count = self._points_in_range(scan)
+        if count < _MIN_POINTS:
+            return self._predict(scan.stamp, f"{count} points from min_range_m to max_range_m are too few to register")
         offsets = self._usable_offsets(scan)
         try:
             if self._worker is None:
@@ -120,6 +121,11 @@ class KissOdometry:
         if self._worker is not None:
             self._worker.close()
             self._worker = None
+
+    def _points_in_range(self, scan: Scan) -> int:
+        """How many points the library uses."""
+        ranges = np.linalg.norm(scan.points, axis=1)
+        return int(((ranges > self._config.min_range_m) & (ranges < self._config.max_range_m)).sum())
 
     def _usable_offsets(self, scan: Scan) -> FloatArray:
         """The scan's times if the library can divide by their span, else none (it then does not deskew)."""

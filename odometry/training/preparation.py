@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lidarslam.core.geometry import FloatArray, exp, log
 from lidarslam.core.scan import Scan
+from lidarslam.core.state.values import TRANSFORM, Values
 from lidarslam.odometry.alignment.alignment import Alignment, Effort, InitialEstimate
 from lidarslam.odometry.alignment.search import DOUBTFUL, align_best, try_instead
 from lidarslam.odometry.alignment.sweep_motion import SweepMotion, SweepPair
@@ -43,6 +44,22 @@ class PreparedRecording:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def require(self, scans: int, images: ImageConfig) -> None:
+        """Refuse what `prepare` does not make of so many scans, with a ValueError; some may be left out."""
+        count, size = len(self.points), (images.rows, images.columns)
+        shapes = {
+            "points": (count, 3, *size), "normals": (count, 3, *size), "offsets": (count, *size),
+            "interval_s": (count - 1,), "T_prev_curr": (count - 1, 4, 4), "valid": (count - 1,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            tensor: Tensor = getattr(self, name)
+            is_of_type = tensor.dtype == torch.bool if name == "valid" else tensor.is_floating_point()
+            if tensor.shape != shape or not is_of_type or not bool(tensor.isfinite().all()):
+                raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, expected {shape}, finite")
+        if not 2 <= count <= scans or float(self.interval_s.min()) <= 0.0:
+            raise ValueError(f"{count} images of {scans} scans, in intervals from {float(self.interval_s.min())} s")
+        Values(TRANSFORM).require(self.T_prev_curr.double().numpy())
 
 
 def prepare(scans: Iterable[Scan], config: ImageConfig) -> PreparedRecording:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.text.names import require_name, safe_name
+from lidarslam.core.text.names import require_name, safe_name, stays_below
 
 UNSAFE = ["", " ", ".", "..", "...", ".hidden", "/abs/path", "../../x", "a/b", "a\\b", "a\0b", "a\nb", "\x1b[2J",
           "\ud800", "\u202eabc", "x" * 121, "\u00e4" * 61]  # fmt: skip
@@ -30,6 +30,11 @@ def test_other_names_stay(name: str) -> None:
 def test_reserved_names_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"'recordings': .*another file"):
         require_name("recordings", "recording", {"recordings"})
+
+
+def test_a_path_that_stays_below_its_folder() -> None:
+    assert [path for path in ("a", "a/b.bin", "./a", "a..b/..c") if not stays_below(path)] == []
+    assert [path for path in ("..", "../a", "a/../../b", "/a", "//a", "a/..") if stays_below(path)] == []
 
 
 @given(st.text(max_size=300))

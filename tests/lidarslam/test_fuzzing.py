@@ -1,6 +1,7 @@
 """Files damaged at random: every command ends with a status and at most one line of error, and writes nothing else."""
 
 import contextlib
+import json
 import os
 import re
 import resource
@@ -9,10 +10,11 @@ import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from lidarslam.cli import main
@@ -27,6 +29,8 @@ from lidarslam.simulation.writers.interface import Rig
 from lidarslam.simulation.writers.kitti import write_kitti
 from lidarslam.simulation.writers.ply import write_ply_scans
 from lidarslam.simulation.writers.rosbag import write_mcap, write_rosbag1, write_rosbag2
+from lidarslam.storage.finished_run import load_map
+from lidarslam.storage.unfinished import Unfinished
 
 pytestmark = pytest.mark.slow
 
@@ -44,8 +48,9 @@ MOST_MEMORY_KB = 1 << 20
 NUMBERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**63 - 1, 2**64 - 1)
 TEXTS = (b"-1", b"nan", b"inf", b"1e999", b"99999999999999999999", b"1e-320", b"x", b"", b"0x10", b"1 2")
 
-# How a file is changed, where (more often near its beginning), and with what.
-changes = st.lists(
+# How a file is changed, where (more often near its beginning), and with what: a number, or all of the new content.
+Change = tuple[str, float, int | bytes]
+changes: st.SearchStrategy[list[Change]] = st.lists(
     st.tuples(
         st.sampled_from(["flip", "cut", "number", "u4", "u8", "f4", "insert", "repeat", "zero"]),
         st.floats(0.0, 1.0, exclude_max=True),
@@ -56,10 +61,12 @@ changes = st.lists(
 )
 
 
-def changed(content: bytes, changes: list[tuple[str, float, int]]) -> bytes:
+def changed(content: bytes, changes: list[Change]) -> bytes:
     for how, share, value in changes:
         at = int(share * share * len(content))
-        if how == "cut":
+        if isinstance(value, bytes):
+            content = value
+        elif how == "cut":
             content = content[:at]
         elif how == "number":
             content = _with_number(content, share, value)
@@ -71,6 +78,11 @@ def changed(content: bytes, changes: list[tuple[str, float, int]]) -> bytes:
             new = _new_bytes(how, value, content[at : at + 1])
             content = content[:at] + new + content[at + len(new) :]
     return content
+
+
+def seed(content: str | bytes) -> list[Change]:
+    """Content that was once a fault, for `example`."""
+    return [("all", 0.0, content if isinstance(content, bytes) else content.encode())]
 
 
 def _new_bytes(how: str, value: int, old: bytes) -> bytes:
@@ -225,11 +237,32 @@ def ends_well(*arguments: object) -> int:
     return result.exit_code
 
 
-def damage(folder: Path, patterns: tuple[str, ...], which: float, made: list[tuple[str, float, int]]) -> None:
+def damage(folder: Path, patterns: tuple[str, ...], which: float, made: list[Change]) -> None:
     pattern = patterns[int(which * len(patterns))]
     files = sorted(path for path in folder.glob(pattern) if path.is_file())
     path = files[int(which * len(patterns) % 1.0 * len(files))]
     path.write_bytes(changed(path.read_bytes(), made))
+
+
+DEEP = "[" * 100_000
+_PLY = (
+    "ply\nformat {} 1.0\nelement face {}\nproperty int a\nelement vertex 1\nproperty float x\nend_header\n1\n2\n3.0\n"
+)
+_PCD = (
+    "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n1 2 3\n"
+)
+_NPY = b"\x93NUMPY\1\0v\0{'descr': '<f8', 'fortran_order': False, 'shape': (%d, 4), }"
+# Faults of earlier days: the pattern of the file, as a share of them, and its content.
+SEEDS: dict[str, list[tuple[float, list[Change]]]] = {
+    "ply": [
+        *[(0.0, seed(_PLY.format(kind, 10**20 - 1))) for kind in ("ascii", "binary_little_endian")],
+        (0.4, seed("1e999\n" * 4)),
+    ],
+    "pcd": [(0.0, seed(_PCD.format(10**12, kind))) for kind in ("ascii", "binary", "binary_compressed")],
+    "npy": [(0.0, seed((_NPY % 10**12).ljust(127) + b"\n")), (0.4, seed(b"\xff" * 64))],
+    "rosbag2": [(0.6, seed(DEEP)), (0.6, seed("rosbag2_bagfile_information: &a [*a]\n"))],
+    "kitti": [(0.3, seed("nan\n" * 4))],
+}
 
 
 @pytest.mark.parametrize("kind", RECORDINGS)
@@ -238,9 +271,7 @@ def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pyte
         pytest.importorskip("velodyne_decoder", reason="needs the extra velodyne")
     _, source, patterns = RECORDINGS[kind]
 
-    @fuzzed
-    @given(st.floats(0.0, 1.0, exclude_max=True), changes)
-    def check(which: float, made: list[tuple[str, float, int]]) -> None:
+    def check(which: float, made: list[Change]) -> None:
         folder = tmp_path / kind
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(recordings / kind, folder)
@@ -249,7 +280,9 @@ def test_a_damaged_recording(tmp_path: Path, recordings: Path, monkeypatch: pyte
             ends_well("info", folder / source)
             ends_well("run", folder / source, "--out", tmp_path / "out", "--overwrite", *FAST)
 
-    check()
+    for which, made in SEEDS.get(kind, []):
+        check = example(which, made)(check)
+    fuzzed(given(st.floats(0.0, 1.0, exclude_max=True), changes)(check))()
 
 
 RUN_FILES = (
@@ -264,6 +297,11 @@ RUN_FILES = (
 
 @fuzzed
 @given(st.sampled_from(RUN_FILES), changes)
+@example("run/summary.json", seed(DEEP))
+@example("run/summary.json", seed('{"scans": 1e999}'))
+@example("run/summary.json", seed('{"localisation": {"map": "\\u0000"}}'))
+@example("run/config.yaml", seed("run: " + DEEP))
+@example("run/map.ply", seed(_PLY.format("ascii", 10**20 - 1)))
 def test_a_damaged_run(
     tmp_path: Path, small_recording: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch, name: str, made: list
 ) -> None:
@@ -278,6 +316,86 @@ def test_a_damaged_run(
         ends_well("run", small_recording, "--out", tmp_path / "out", "--overwrite", "--config", path, *FAST)
     ends_well("evaluate", tmp_path / "run", "--reference-map", whole_run / "map.ply")
     assert {path.name for path in tmp_path.iterdir()} <= {"run", "out", "here"}
+
+
+@pytest.fixture(scope="session")
+def killed_run(tmp_path_factory: pytest.TempPathFactory, small_recording: Path) -> Path:
+    """A run with a checkpoint after its fourth scan, as a kill before its end leaves it, not to be written to."""
+    out = tmp_path_factory.mktemp("runs") / "killed"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Unfinished, "end", lambda *_, **__: None)
+        assert ends_well("run", small_recording, "--out", out, *RESUMED, "--set", "checkpoints.every_scans=2") == 0
+    return out
+
+
+RESUMED = (*FAST, "--pose-graph", "--set", "global_map.most_points=2000")
+CHECKPOINT = ("run.json", "state.npz", "submaps.bin", "tiles.bin")
+
+
+@fuzzed
+@given(st.sampled_from(CHECKPOINT), changes)
+@example("run.json", seed(DEEP))
+@example("run.json", seed('{"standing": "at work", "description": {}, "resumed_after": [1e999]}'))
+@example("run.json", seed('{"standing": "at work", "description": {"merge": "all", "sources": 5}}'))
+@example("run.json", seed('{"standing": "stopped", "description": {}, "resumed_after": [' + "9" * 5_000 + "]}"))
+def test_a_damaged_checkpoint(
+    tmp_path: Path, small_recording: Path, killed_run: Path, monkeypatch: pytest.MonkeyPatch, name: str, made: list
+) -> None:
+    """A run that is resumed all the same comes to its results."""
+    out = tmp_path / "out"
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(killed_run, out)
+    path = out / "unfinished" / name
+    path.write_bytes(changed(path.read_bytes(), made))
+    with nothing_else_changes(tmp_path, monkeypatch):
+        ends_well("info", out)
+        ends_well("evaluate", out / "trajectory.tum", "--reference", small_recording / "ground_truth.tum")
+        ends_well("evaluate", out)
+        ends_well("view", out, "--picture", out / "picture.png")
+        ends_well("merge", small_recording, killed_run, "--out", out)
+        if ends_well("run", small_recording, "--out", out, *RESUMED, "--resume") == 0:
+            assert (out / "trajectory.tum").read_bytes() == (killed_run / "trajectory.tum").read_bytes()
+            assert (out / "map" / "index.json").read_bytes() == (killed_run / "map" / "index.json").read_bytes()
+
+
+@fuzzed
+@given(changes)
+@example(seed(DEEP))
+@example(seed('{"methods": {"a": {"run": "../../x"}}}'))
+@example(seed('{"methods": {"a": {"run": "a\\u0000"}}}'))
+def test_a_damaged_comparison(tmp_path: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch, made: list) -> None:
+    comparison = json.dumps({"methods": {"a": {"run": "room/a"}, "b": {"run": None}}})
+    (tmp_path / "comparison.json").write_bytes(changed(comparison.encode(), made))
+    shutil.copytree(whole_run, tmp_path / "room" / "a", dirs_exist_ok=True)
+    with nothing_else_changes(tmp_path, monkeypatch):
+        ends_well("view", tmp_path, "--picture", tmp_path / "out" / "picture.png")
+
+
+@pytest.fixture(scope="session")
+def reference_maps(tmp_path_factory: pytest.TempPathFactory, whole_run: Path) -> Path:
+    """The map of the run in each format of surveyors, by one point in eight."""
+    folder = tmp_path_factory.mktemp("references")
+    cloud = load_map(whole_run)
+    cloud = PointCloud(cloud.points[::8], cloud.normals[::8])
+    for name in ("map.ply", "map.pcd", "map.laz"):
+        write_cloud(folder / name, cloud)
+    laspy.read(folder / "map.laz").write(str(folder / "map.las"))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["map.las", "map.laz", "map.ply", "map.pcd"])
+def test_a_damaged_reference_map(
+    tmp_path: Path, whole_run: Path, reference_maps: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    @fuzzed
+    @given(changes)
+    def check(made: list[Change]) -> None:
+        shutil.copytree(whole_run, tmp_path / "out", dirs_exist_ok=True)
+        (tmp_path / name).write_bytes(changed((reference_maps / name).read_bytes(), made))
+        with nothing_else_changes(tmp_path, monkeypatch):
+            ends_well("evaluate", tmp_path / "out", "--reference-map", tmp_path / name)
+
+    check()
 
 
 def keys(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
@@ -305,6 +423,8 @@ def test_settings_of_any_value(chosen: list[tuple[str, object]]) -> None:
 
 @fuzzed
 @given(changes)
-def test_a_damaged_configuration(tmp_path: Path, made: list[tuple[str, float, int]]) -> None:
+@example(seed(DEEP))
+@example(seed("a: &a [*a, *a]\n"))
+def test_a_damaged_configuration(tmp_path: Path, made: list[Change]) -> None:
     (tmp_path / "config.yaml").write_bytes(changed(dump_yaml(Config()).encode(), made))
     ends_well("config", "--config", tmp_path / "config.yaml")

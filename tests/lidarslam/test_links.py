@@ -158,3 +158,16 @@ def test_folders_of_methods_and_of_parts_are_no_links(tmp_path: Path) -> None:
     assert sorted(content(outside)) == sorted((LOG, "map.ply", "config.yaml"))
     assert not (out / "01_room").is_symlink()
     assert not (out / "room").is_symlink()
+
+
+@pytest.mark.parametrize("link", ["recordings", "recordings/a"])
+def test_a_benchmark_makes_no_recording_behind_a_link(tmp_path: Path, link: str) -> None:
+    (tmp_path / "out" / link).parent.mkdir(parents=True)
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "out" / link).symlink_to(tmp_path / "outside")
+    recordings = "[{name: a, simulate: {scans: 2}}]"
+    (tmp_path / "made.yaml").write_text(f"title: t\nmethods: [kiss-icp]\nrecordings: {recordings}\n")
+    result = lidarslam("compare", "--benchmark", tmp_path / "made.yaml", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert f"{tmp_path / 'out' / link}: is a link to another place; remove it, or name that place" in result.stderr
+    assert not any((tmp_path / "outside").iterdir())

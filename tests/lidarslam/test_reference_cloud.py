@@ -1,5 +1,7 @@
 """Clouds of every format, with the coordinates of a survey."""
 
+import resource
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -77,6 +79,34 @@ def test_a_truncated_file_gets_one_line(tmp_path: Path, survey: FloatArray, name
     with pytest.raises(InputError, match=rf"{name}: not a readable") as caught:
         read_cloud(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_laz_file_with_endless_chunks_is_refused(tmp_path: Path, survey: FloatArray, at_end: bool) -> None:
+    """In a process of its own, which lazrs ends otherwise."""
+    _write_las(tmp_path / "cloud.laz", survey)
+    content = bytearray((tmp_path / "cloud.laz").read_bytes())
+    data = int.from_bytes(content[96:100], "little")
+    table = int.from_bytes(content[data : data + 8], "little")
+    content[table + 4 : table + 8] = b"\xff" * 4
+    if at_end:
+        content[data : data + 8] = b"\xff" * 8
+        content += table.to_bytes(8, "little")
+    (tmp_path / "cloud.laz").write_bytes(content)
+    program = f"from {read_cloud.__module__} import *; read_cloud(Path({str(tmp_path / 'cloud.laz')!r}))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "cloud.laz: not a readable LAZ file (4,294,967,295 chunks)" in done.stderr
+
+
+def test_a_header_that_promises_many_points_takes_no_memory(tmp_path: Path, survey: FloatArray) -> None:
+    _write_las(tmp_path / "cloud.las", survey)
+    content = bytearray((tmp_path / "cloud.las").read_bytes())
+    content[107:111] = (1 << 25).to_bytes(4, "little")  # of 34 bytes: a gigabyte
+    (tmp_path / "cloud.las").write_bytes(content)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="not a readable LAS file"):
+        read_cloud(tmp_path / "cloud.las")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200 << 10
 
 
 def test_points_that_are_none_are_dropped(tmp_path: Path, survey: FloatArray) -> None:

@@ -46,10 +46,14 @@ BESIDE = {
     ("mapping.tracking.degraded_below", 0.0): "mapping.tracking.lost_below=0",
     ("mapping.tracking.lost_below", 1.0): "mapping.tracking.degraded_below=1",
 }
+# Lists of three numbers.
+VECTORS = ("odometry.imu_rotation_deg", "reader.mounting")
+# At one of their bounds no point of this recording is left for the map.
+MAY_EMPTY = ("global_map.max_range_m", "global_map.min_hits")
 
 
 def text_of(name: str, value: float) -> str:
-    return f"[{value!r}, 0, 0]" if name.endswith("imu_rotation_deg") else f"{value!r}"
+    return f"[{value!r}, 0, 0]" if name in VECTORS else f"{value!r}"
 
 
 def kinds(annotation: Any) -> list[Any]:
@@ -66,10 +70,11 @@ def test_a_value_beyond_the_declared_bounds_is_refused_with_them(name: str) -> N
         with pytest.raises(ConfigError, match=f"{name}.*: (input|string) (should|is)"):
             load_config(None, [f"{name}=[[]]" if name.endswith("weights") else f"{name}=''"])
         return
+    expected = re.escape(bounds_text(field) or "")
     for bound, outward in zip(bounds, (-np.inf, np.inf), strict=True):
         beyond = np.nextafter(bound, outward) if float in kinds(field.annotation) else bound + np.sign(outward)
         value = text_of(name, beyond.item())
-        said = rf"{name}='?{re.escape(repr(beyond.item()))}'?: expected {bounds_text(field)}$"
+        said = rf"{name}='?{re.escape(repr(beyond.item()))}'?: expected {expected}$"
         with pytest.raises(ConfigError, match=said):
             load_config(None, [*needed(name, bound), f"{name}={value}"])
 
@@ -114,11 +119,14 @@ def test_at_its_bounds_a_run_is_right_or_says_that_it_is_not(
     truth = inverse(room_truth.T_world_lidar[0]) @ room_truth.T_world_lidar[:8]
     assert np.abs(trajectory.T_world_lidar[:, :3, 3] - truth[:, :3, 3]).max() < 0.2
     # The map lies on the walls, at least one point in four square metres of them.
+    if "the map is empty" in result.stdout:
+        assert name in MAY_EMPTY
+        return
     cloud = read_ply(tmp_path / "run" / "map.ply")
     points = transform_points(room_truth.T_world_lidar[0], np.stack([cloud[axis] for axis in "xyz"], -1).astype(float))
     edge_m = bound if name == "global_map.voxel_size_m" else 0.2
     assert np.quantile(room.distance_to_surface(points), 0.95) < 0.2 + edge_m
-    assert len(points) > (4 if edge_m > 1.0 else 100) or "the map is empty" in result.stdout
+    assert len(points) > (4 if edge_m > 1.0 else 100)
 
 
 def test_every_number_of_a_training_has_bounds() -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,14 @@ from lidarslam.core.errors import ConfigError, InputError, OutputError
 from lidarslam.core.scan import Scan
 from lidarslam.odometry.network.checkpoint import load_checkpoint, network_of
 from lidarslam.odometry.network.networks import make_network
+from lidarslam.odometry.network.tensor_file import read_tensor_file, write_tensor_file
 from lidarslam.odometry.training.augmentation import AUGMENTATION
 from lidarslam.odometry.training.config import LossConfig, SimulatedConfig
 from lidarslam.odometry.training.pairs import Pairs
 from lidarslam.odometry.training.training import summarise, validate
 from lidarslam.simulation.recording.mixture import ingredients_of
 from lidarslam.train import data as training_data
-from lidarslam.train.data import Stretch, hold_out, prepared, recorded, simulated
+from lidarslam.train.data import Stretch, file_of, hold_out, prepared, recorded, simulated
 from lidarslam.train.directory import RESULTS, STATE, earlier_training, remove_results
 from lidarslam.train.settings import LOSSES, TrainConfig, dump_train_yaml, load_train_config
 from lidarslam.train.train import TrainRequest, execute
@@ -209,6 +211,44 @@ def test_recordings_are_prepared_once(room_folder: Path, tmp_path: Path, monkeyp
     for name, value in vars(first[0]).items():
         assert torch.equal(value, getattr(again[0], name))
         assert value.dtype == getattr(again[0], name).dtype
+
+
+FORGED: dict[str, Callable[[dict[str, torch.Tensor]], object]] = {
+    "missing": lambda tensors: tensors.pop("valid"),
+    "surplus": lambda tensors: tensors.update(more=torch.zeros(1)),
+    "shape": lambda tensors: tensors.update(offsets=tensors["offsets"][:, :-1]),
+    "other image": lambda tensors: tensors.update({n: tensors[n][..., ::2] for n in ("points", "normals", "offsets")}),
+    "type": lambda tensors: tensors.update(valid=tensors["valid"].long()),
+    "integers": lambda tensors: tensors.update(points=tensors["points"].long()),
+    "short": lambda tensors: tensors.update(interval_s=tensors["interval_s"][:-1]),
+    "long": lambda tensors: tensors.update({name: torch.cat([one, one]) for name, one in tensors.items()}),
+    "nan": lambda tensors: tensors["points"].view(-1)[0].fill_(torch.nan),
+    "interval": lambda tensors: tensors["interval_s"][0].fill_(0.0),
+    "not rigid": lambda tensors: tensors["T_prev_curr"][0].mul_(2.0),
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_prepared_recordings_that_do_not_fit_are_made_anew(room_folder: Path, tmp_path: Path, name: str) -> None:
+    config = load_train_config(None, TINY)
+    stretch = replace(recorded(room_folder, config.reader), stop=4)
+    (first,) = prepared([stretch], config.training, tmp_path, lambda _: None)
+    (file,) = tmp_path.iterdir()
+    tensors, content = read_tensor_file(file, training_data._KIND)
+    FORGED[name](tensors)
+    write_tensor_file(file, training_data._KIND, tensors, content)
+    (again,) = prepared([stretch], config.training, tmp_path, lambda _: None)
+    assert all(torch.equal(value, getattr(again, key)) for key, value in vars(first).items())
+
+
+def test_a_prepared_recording_under_the_name_of_another_is_made_anew(room_folder: Path, tmp_path: Path) -> None:
+    config = load_train_config(None, TINY)
+    one, other = (replace(recorded(room_folder, config.reader), first=first, stop=first + 3) for first in (0, 3))
+    prepared([one], config.training, tmp_path, lambda _: None)
+    (expected,) = prepared([other], config.training, tmp_path, lambda _: None)
+    shutil.copy(file_of(one, config.training, tmp_path), file_of(other, config.training, tmp_path))
+    (again,) = prepared([other], config.training, tmp_path, lambda _: None)
+    assert torch.equal(again.points, expected.points)
 
 
 def test_long_recordings_become_pieces() -> None:

@@ -92,6 +92,15 @@ def test_too_few_points_give_a_prediction_and_the_next_scan_catches_up(
     assert np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3]) < 0.03
 
 
+def test_points_out_of_range_are_none_to_register(room_scans: list[Scan]) -> None:
+    odometry = KissOdometry(KissConfig(max_range_m=1.0))
+    motions = [odometry.estimate(scan) for scan in room_scans[:3]]
+    odometry.close()
+    assert [motion.failure for motion in motions] == [
+        "0 points from min_range_m to max_range_m are too few to register"
+    ] * 3
+
+
 def test_an_abort_of_the_library_does_not_take_us_along(
     kiss: KissOdometry, room_scans: list[Scan], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,7 @@
 """Point clouds on disk, as scanners, surveyors and mapping programs write them."""
 
+import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +15,12 @@ from lidarslam.datasets.folders.point_table import coordinates
 
 # Surveys end well within this; squares of much more overflow.
 _FARTHEST_M = 1e9
+# Of LAS: where the points begin, and their format, in which two bits mark LAZ. There: the place of the table of chunks,
+# which begins with its version and their number.
+_LAS_HEADER, _IS_LAZ = struct.Struct("<96xI4xB"), 0xC0
+_PLACE, _CHUNK_TABLE = struct.Struct("<q"), struct.Struct("<II")
+# Read at a time: a damaged header may promise any number of points.
+_PIECE_BYTES = 1 << 26
 
 
 def read_cloud(path: Path) -> FloatArray:
@@ -49,11 +57,32 @@ def read_cloud(path: Path) -> FloatArray:
 def _read_las(path: Path) -> FloatArray:
     import laspy
 
+    _require_chunks(path)
     with laspy.open(path) as file:
-        cloud = file.read()
-        if len(cloud) != file.header.point_count:
-            raise ValueError(f"{len(cloud):,} of {file.header.point_count:,} points")
-        return np.asarray(cloud.xyz, dtype=np.float64)
+        at_a_time = max(1, _PIECE_BYTES // file.header.point_format.size)
+        pieces = [np.stack([piece.x, piece.y, piece.z], axis=1) for piece in file.chunk_iterator(at_a_time)]
+        points = np.concatenate([np.empty((0, 3)), *pieces])
+        if len(points) != file.header.point_count:
+            raise ValueError(f"{len(points):,} of {file.header.point_count:,} points")
+        return points
+
+
+def _require_chunks(path: Path) -> None:
+    """Refuse a LAZ file that counts more chunks than it has bytes: lazrs makes room for all, and ends the program."""
+    with path.open("rb") as file:
+        header = file.read(_LAS_HEADER.size)
+        data, point_format = _LAS_HEADER.unpack(header)
+        if not point_format & _IS_LAZ:
+            return
+        file.seek(data)
+        (table,) = _PLACE.unpack(file.read(_PLACE.size))
+        if table == -1:  # written at the end by a program that could not go back
+            file.seek(-_PLACE.size, os.SEEK_END)
+            (table,) = _PLACE.unpack(file.read(_PLACE.size))
+        file.seek(table)
+        _, chunks = _CHUNK_TABLE.unpack(file.read(_CHUNK_TABLE.size))
+        if chunks > path.stat().st_size:
+            raise ValueError(f"{chunks:,} chunks")
 
 
 def _read_e57(path: Path) -> FloatArray:

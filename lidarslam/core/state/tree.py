@@ -131,12 +131,11 @@ def _decode_plain(kind: Any, values: Values, tree: Any, saved: Saved) -> Any:
         if not isinstance(tree, str) or tree not in kind.__members__:
             raise saved.unfit(f"one of {', '.join(kind.__members__)}", tree)
         return kind[tree]
-    tree = float(tree) if kind is float and type(tree) is int else tree
-    if type(tree) is not kind:  # a bool is an int otherwise
+    if type(tree) is not kind and not (kind is float and type(tree) is int):  # a bool is an int otherwise
         raise saved.unfit(kind.__name__, tree)
     if kind in (int, float):
         checked(saved, lambda: values.require(np.asarray(tree)))
-    return tree
+    return kind(tree)
 
 
 def _decode_array(dtype: Any, values: Values, tree: Any, saved: Saved, of_list: bool = False) -> Any:

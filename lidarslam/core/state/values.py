@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 # Rounding of transforms that were chained over hours stays far below.
 _RIGID = 1e-3
+# Squares of floats are finite, and sums of counts fit into 64 bits.
+_LARGEST_FLOAT, _LARGEST_COUNT = 1e100, float(1 << 53)
 
 
 class Shape:
@@ -36,12 +38,13 @@ TRANSFORM = Transforms()
 
 @dataclass(frozen=True)
 class Within:
-    """Bounds of numbers, both included. Without them floats are finite, and integers are not negative."""
+    """Bounds of numbers, both included. Without them integers are counts, from 0 to 2^53, and floats up to 1e100."""
 
     low: float = -math.inf
     high: float = math.inf
 
 
+_FLOATS, _COUNTS = Within(-_LARGEST_FLOAT, _LARGEST_FLOAT), Within(0.0, _LARGEST_COUNT)
 ANY_NUMBER = Within(math.nan, math.nan)
 
 
@@ -54,10 +57,12 @@ class Values:
 
     def require(self, values: NDArray[Any]) -> None:
         """Refuse numbers out of bounds, and transforms that are not rigid; a ValueError has the first of them."""
+        if values.dtype.kind == "O":
+            raise ValueError("an integer has more than 64 bits")
         if values.dtype.kind not in "iuf" or self.within is ANY_NUMBER or not values.size:
             return
-        bounds = self.within or (Within() if values.dtype.kind == "f" else Within(low=0))
-        least, most = values.min(), values.max()  # NaN where any of the numbers is
+        bounds = self.within or (_FLOATS if values.dtype.kind == "f" else _COUNTS)
+        least, most = values.min().item(), values.max().item()  # NaN where any of the numbers is
         if not (np.isfinite(least) and np.isfinite(most) and bounds.low <= least and most <= bounds.high):
             raise ValueError(f"numbers from {least} to {most}, expected from {bounds.low} to {bounds.high}, finite")
         if isinstance(self.shape, Transforms):

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection
+from pathlib import PurePosixPath
 
 from lidarslam.core.errors import ConfigError
 from lidarslam.core.text.plain_text import one_line
@@ -34,6 +35,12 @@ def safe_name(text: str, default: str = "recording") -> str:
     name = one_line(_SEPARATORS.sub("_", text)).replace("\\", "_").lstrip(".")
     name = name.encode()[:_LONGEST].decode(errors="ignore")
     return name if name.strip() else default
+
+
+def stays_below(path: str) -> bool:
+    """Whether a relative path, with / between its parts, leads to no place outside the folder that it is joined to."""
+    parts = PurePosixPath(path)
+    return not parts.is_absolute() and ".." not in parts.parts
 
 
 def _fault(name: str, reserved: Collection[str]) -> str | None:

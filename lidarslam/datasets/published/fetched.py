@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from lidarslam.core.errors import InputError
-from lidarslam.core.text.names import safe_name
+from lidarslam.core.text.names import safe_name, stays_below
 
 logger = logging.getLogger(__name__)
 
@@ -101,7 +101,7 @@ def _download(url: str, place: Path) -> None:
     if not names:
         raise InputError(f"{url}: is not there")
     for name in names:  # not get(recursive=True), which takes a folder of a web page for a file, too
-        if ".." in Path(name).parts or Path(name).is_absolute():
+        if not stays_below(name):
             raise InputError(f"{url}: lists a file elsewhere, {name}")
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         storage.get_file(f"{root}{name}", str(place / name))

@@ -17,6 +17,7 @@ from typing_extensions import TypedDict
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.text.json_text import parse_json, read_json
+from lidarslam.core.text.names import stays_below
 from lidarslam.datasets.published.poses import poses_wxyz
 
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
@@ -83,6 +84,10 @@ def read_sweeps(version: Path, scene: str) -> Sweeps:
     sweeps = sorted((one for one in data if one["sample_token"] in samples), key=lambda one: one["timestamp"])
     if not sweeps:
         raise InputError(f"{version / 'sample_data.json'}: has no sweep of LIDAR_TOP for the scene; download it again")
+    if outside := next((one["filename"] for one in sweeps if not stays_below(one["filename"])), None):
+        raise InputError(
+            f"{version / 'sample_data.json'}: names a sweep outside the data set, {outside}; download it again"
+        )
     wanted = {one["ego_pose_token"].encode() for one in sweeps}
     ego_poses = _select(version / "ego_pose.json", _TOKEN, lambda match: match[1] in wanted, _POSE)
     T_world_ego = _poses(version, list(ego_poses), [one["ego_pose_token"] for one in sweeps])

@@ -129,6 +129,14 @@ def test_a_sweep_that_is_not_there_is_left_out(nuscenes: SimpleNamespace) -> Non
     assert (sum(counts), faults.left_out) == (11, 1)
 
 
+@pytest.mark.parametrize("place", ["../../outside", "/outside", "samples/../../outside"])
+def test_a_sweep_outside_the_data_set_is_not_read(nuscenes: SimpleNamespace, place: str) -> None:
+    path = nuscenes.tables / "sample_data.json"
+    path.write_text(path.read_text().replace('"filename": "sweeps/', f'"filename": "{place}/'))
+    with pytest.raises(InputError, match=r"sample_data\.json: names a sweep outside .*, .*outside/LIDAR_TOP/"):
+        open_recording(nuscenes.root, ReaderConfig(sequence="61"))
+
+
 @pytest.mark.parametrize("table", ["scene", "sample", "sample_data", "ego_pose", "calibrated_sensor"])
 def test_a_missing_or_damaged_table_is_named(nuscenes: SimpleNamespace, table: str) -> None:
     path = nuscenes.tables / f"{table}.json"
