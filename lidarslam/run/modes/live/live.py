@@ -107,10 +107,14 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
 
 
 def bounded(config: Config) -> Config:
-    """The configuration with a budget of a scan's mapping, which follows the rate of the sensor unless one is given."""
-    if config.mapping.budget_ms is not None:
-        return config
-    return config.model_copy(update={"mapping": config.mapping.model_copy(update={"budget_ms": "auto"})})
+    """The configuration in which scans wait for nothing.
+
+    A scan's mapping has a budget, which follows the rate of the sensor unless one is given. The local map is not
+    corrected: tracking would wait for the pose graph to draw it.
+    """
+    mapping = config.mapping.model_copy(update={"budget_ms": config.mapping.budget_ms or "auto"})
+    graph = config.pose_graph.model_copy(update={"corrects_local_map": False})
+    return config.model_copy(update={"mapping": mapping, "pose_graph": graph})
 
 
 def _follower(request: LiveRequest, node: "DdsNode", session: LiveSession, decoder: CloudDecoder) -> "Follower":
