@@ -48,7 +48,7 @@ from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.loam.mapper import LoamMapper
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels import sampling
-from lidarslam.mapping.tracking import attempts, surfel_mapper
+from lidarslam.mapping.tracking import attempts
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.pipeline.scan_stream import in_order
 
@@ -59,7 +59,7 @@ _STAGES: dict[str, dict[str, tuple[Any, str]]] = {
         "thin": (sampling.Sampler, "sample"),
         "registration": (attempts, "register"),
         "fit": (attempts, "measure_fit"),
-        "map update": (surfel_mapper, "_insert"),
+        "map update": (SurfelMapper, "_insert"),
         "rest": (SurfelMapper, "process"),
     },
     "loam": {
