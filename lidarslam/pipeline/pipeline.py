@@ -1,8 +1,8 @@
 """The way of a scan: odometry, scan-to-map registration, global map, pose graph. No files, no printing, no window.
 
-Four threads: odometry on the caller's, as one scan's motion is needed for the next; registration on a second, one scan
-behind, because deskewing needs the motion after the stamp as well; the global map on a third, the pose graph on a
-fourth.
+Four threads: odometry and thinning on the caller's, as one scan's motion is needed for the next; registration on a
+second, one scan behind, because deskewing needs the motion after the stamp as well; the global map on a third, the pose
+graph on a fourth.
 """
 
 import time
