@@ -17,8 +17,27 @@ from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 
 
+class Files(dict[str, Any]):
+    """The contents of files by their names; where they are not equal, those that differ are shown in short."""
+
+
+def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
+    """Pytest's own comparison of whole maps takes longer than all tests."""
+    if op != "==" or not (isinstance(left, Files) and isinstance(right, Files)):
+        return None
+    names = [name for name in sorted({*left, *right}) if left.get(name) != right.get(name)]
+    return ["equal files", *(f"{name}: {_differing(left.get(name), right.get(name))}" for name in names)]
+
+
+def _differing(left: object, right: object) -> str:
+    if isinstance(left, dict) and isinstance(right, dict):
+        names = [name for name in sorted({*left, *right}) if left.get(name) != right.get(name)]
+        return "; ".join(f"{name}: {_differing(left.get(name), right.get(name))}" for name in names)
+    return f"{str(left)[:200]} != {str(right)[:200]}"
+
+
 @pytest.fixture(scope="session")
-def timeless() -> Callable[[Path], dict[str, Any]]:
+def timeless() -> Callable[[Path], Files]:
     """Reads every file of a merge; without times, memory, and how often it was resumed."""
 
     def read(path: Path) -> Any:
@@ -30,7 +49,7 @@ def timeless() -> Callable[[Path], dict[str, Any]]:
             return [[cell for column, cell in enumerate(row) if column not in timed] for row in rows]
         return path.read_bytes()
 
-    return lambda out: {str(path.relative_to(out)): read(path) for path in out.rglob("*") if path.is_file()}
+    return lambda out: Files((str(path.relative_to(out)), read(path)) for path in out.rglob("*") if path.is_file())
 
 
 def _timeless(tree: Any) -> Any:
