@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.files import cannot_write, replacing
+from lidarslam.core.state.npy import ONE_READER
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.text.json_text import ANY_OBJECT, parse_json
 
@@ -46,7 +47,7 @@ def read_state(path: Path) -> Saved:
         InputError: there is no such file, or it is damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with ONE_READER, np.load(path, allow_pickle=False) as file:
             values = _decoded(parse_json(file[_TREE].tobytes(), ANY_OBJECT, any_number=True), file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

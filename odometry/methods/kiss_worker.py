@@ -16,6 +16,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarslam.core.state.npy import read_array
+
 _LENGTH = struct.Struct("<q")
 
 
@@ -48,7 +50,7 @@ def receive(stream: IO[bytes]) -> NDArray[Any]:
     content = stream.read(length)
     if len(content) < length:
         raise EOFError
-    return np.asarray(np.load(BytesIO(content), allow_pickle=False))
+    return read_array(BytesIO(content))
 
 
 def main() -> None:

@@ -397,6 +397,7 @@ def test_a_killed_merge_is_refused_and_resumed_or_made_again(
     rooms = rooms[:2]
     whole = tmp_path / "whole" / "1000000"
     things = int(killed_merges(whole.parent, [1_000_000], rooms).splitlines()[-1])
+    assert (whole / "map.ply").is_file(), "the merge that was not killed ended before its results"
     kills = [round(share * things) for share in (0.2, 0.5, 0.75)]
     killed_merges(tmp_path / "killed", kills, rooms)
     for kill_at in kills:

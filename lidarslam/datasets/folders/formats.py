@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.state.npy import read_array
 from lidarslam.datasets.folders.pcd import read_pcd
 from lidarslam.datasets.folders.ply import read_ply
 from lidarslam.datasets.folders.scan_files import KITTI_FIELDS, read_bin, read_bytes
@@ -68,7 +69,7 @@ def read_npy(path: Path) -> NDArray[np.void]:
     """
     data = read_bytes(path)
     try:
-        array = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
+        array = read_array(BytesIO(data))
     except Exception as error:  # NumPy parses the header as Python, which fails in many ways
         reason = " ".join(str(error).split())[:200]
         raise InputError(
