@@ -16,7 +16,11 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+from llvmlite import ir
+from numba.core import cgutils, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
+from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
 
@@ -56,6 +60,29 @@ def compiled_part(function: Function) -> Function:
 def compiled_sums(function: Function) -> Function:
     """As `compiled_part`, with sums in any order, which a processor takes several numbers at once of."""
     return _part(function, fastmath={"reassoc", "contract", "nsz"})
+
+
+@cast(Any, intrinsic)
+def _prefetch(_: Any, array: Any, row: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        first = context.make_array(signature.args[0])(context, builder, values[0])
+        (width, *_) = cgutils.unpack_tuple(builder, first.strides, signature.args[0].ndim)
+        address = builder.add(builder.ptrtoint(first.data, width.type), builder.mul(width, values[1]))
+        pointer, flag = cgutils.voidptr_t, ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, flag, flag, flag])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", (pointer,), kind)
+        # For reading, into the caches of all levels, data.
+        builder.call(fetch, [builder.inttoptr(address, pointer), *(flag(value) for value in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
+
+
+prefetch: Callable[[NDArray[Any], int], None] = (lambda array, row: None) if _config.DISABLE_JIT else _prefetch
+"""Begin to load a row of an array into the processor's cache, for compiled functions that will read it soon.
+
+Loops over rows in no order wait for one row at a time otherwise, as what they do depends on what they find there.
+"""
 
 
 def is_compiled(module: ModuleType) -> bool:

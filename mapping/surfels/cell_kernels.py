@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled, compiled_part
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
 
 Keys = NDArray[np.int64]
@@ -36,6 +36,8 @@ OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
 # Column of the link to a cell's other side: its row plus one, exact to 16 million cells; zero where there is none.
 OTHER = 15
 
+# How many elements ahead loops prefetch.
+PREFETCHED = 16
 # A cell with so many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
@@ -70,7 +72,7 @@ def neighbour_key(key: int, i: int, j: int, k: int) -> int:
 
 
 @compiled_part
-def _home(key: int, bits: int) -> int:
+def home(key: int, bits: int) -> int:
     """First slot of a key; cells above one another share a cache line."""
     column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
     return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
@@ -78,7 +80,7 @@ def _home(key: int, bits: int) -> int:
 
 @compiled_part
 def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
-    slot = _home(key, bits)
+    slot = home(key, bits)
     while table_keys[slot] != EMPTY:
         if table_keys[slot] == key:
             return int(table_rows[slot])
@@ -103,7 +105,10 @@ def insert(
         Number of keys done, and of rows.
     """
     for n in range(begin, len(keys)):
-        slot = _home(keys[n], bits)
+        ahead = home(keys[min(n + PREFETCHED, len(keys) - 1)], bits)
+        prefetch(table_keys, ahead)
+        prefetch(table_rows, ahead)
+        slot = home(keys[n], bits)
         while table_keys[slot] != EMPTY and table_keys[slot] != keys[n]:
             slot = (slot + 1) & ((1 << bits) - 1)
         if table_keys[slot] == EMPTY:

@@ -9,10 +9,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled, compiled_part
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import ABSENT, Cells, other_side
-from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one
+from lidarslam.mapping.surfels.cell_kernels import ABSENT, PREFETCHED, Cells, other_side
+from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one, scratch
 
 # Least squared cosine between the view of a point and those of its cell for one side.
 _SAME_VIEW = 0.5
@@ -27,16 +27,17 @@ def belong_to_others(
 
     Outdated surfels (M, 15) are computed on the way.
     """
-    scratch = np.empty(15), np.empty(6), np.empty(3)
+    work = scratch()
     for n in range(len(rows)):
+        prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
         row, chosen[n] = rows[n], False
         x, y, z = float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
         other = other_side(row, cells.sums)
         if other >= 0:
             if outdated(row, cells.sums, counts):
-                refresh_one(row, cells, surfels, counts, scratch)
+                refresh_one(row, cells, surfels, counts, work)
             if outdated(other, cells.sums, counts):
-                refresh_one(other, cells, surfels, counts, scratch)
+                refresh_one(other, cells, surfels, counts, work)
             chosen[n] = _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels)
             continue
         u, v, w = float(cells.sums[row, 12]), float(cells.sums[row, 13]), float(cells.sums[row, 14])
@@ -44,7 +45,7 @@ def belong_to_others(
         if along < 0.0 or along * along < _SAME_VIEW * squared * (u * u + v * v + w * w):
             # An outdated plane is still the same plane; a cell without a plane may have one by now.
             if not surfels[row, 14] > 0.0 and outdated(row, cells.sums, counts):
-                refresh_one(row, cells, surfels, counts, scratch)
+                refresh_one(row, cells, surfels, counts, work)
             p = surfels[row]
             chosen[n] = p[14] > 0.0 and is_steep(-(x * p[3] + y * p[4] + z * p[5]), math.sqrt(squared))
 
@@ -58,16 +59,17 @@ def turn_to_sensor(
 
     The sensor at (3,) measured points (N, 3).
     """
-    scratch = np.empty(15), np.empty(6), np.empty(3)
+    work = scratch()
     for n in range(len(rows)):
+        prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
         row = rows[n]
         other = other_side(row, cells.sums) if row >= 0 else ABSENT
         if other == ABSENT:
             continue
         if outdated(row, cells.sums, counts):
-            refresh_one(row, cells, surfels, counts, scratch)
+            refresh_one(row, cells, surfels, counts, work)
         if outdated(other, cells.sums, counts):
-            refresh_one(other, cells, surfels, counts, scratch)
+            refresh_one(other, cells, surfels, counts, work)
         x, y, z = sensor[0] - points[n, 0], sensor[1] - points[n, 1], sensor[2] - points[n, 2]
         if _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels):
             rows[n] = other

@@ -8,11 +8,22 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled, compiled_part
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, find_one, middle_of, neighbour_key, other_side
+from lidarslam.mapping.surfels.cell_kernels import (
+    OTHER,
+    PREFETCHED,
+    Cells,
+    find_one,
+    home,
+    middle_of,
+    neighbour_key,
+    other_side,
+)
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
+# Surfels that are computed together: what one needs is prefetched while another is computed.
+_TOGETHER = 16
 # A surfel is computed again when its cell has grown by this factor.
 _GROWTH = np.float32(1.5)
 # By how much less a neighbouring cell's points weigh, for each coordinate in which it differs.
@@ -25,6 +36,9 @@ _LEAST_SINE = 0.17
 _MOST_THICKNESS = 0.4
 _LEAST_WIDTH = 0.15
 
+Scratch = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
+"""Room for the rows (27,) of cells around one, and for 15, 6 and 3 numbers."""
+
 
 @compiled
 def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: NDArray[np.float32]) -> None:
@@ -32,11 +46,26 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
 
     `counts` (M,) has the numbers of points at the last computation.
     """
-    scratch = np.empty(15), np.empty(6), np.empty(3)
+    work = scratch()
+    waiting, around = np.empty(_TOGETHER, dtype=np.int32), np.empty((_TOGETHER, 27), dtype=np.int32)
+    count = 0
     for n in range(len(rows)):
+        ahead = rows[min(n + PREFETCHED, len(rows) - 1)]
+        prefetch(cells.sums, ahead)
+        prefetch(counts, ahead)
         row = rows[n]
         if row >= 0 and outdated(row, cells.sums, counts):
-            refresh_one(row, cells, surfels, counts, scratch)
+            counts[row] = cells.sums[row, 0]
+            _prefetch_around(row, cells)
+            waiting[count] = row
+            count += 1
+        if count == _TOGETHER or n == len(rows) - 1:
+            for i in range(count):
+                prefetch(surfels, waiting[i])
+                _find_around(waiting[i], cells, around[i])
+            for i in range(count):
+                _compute(waiting[i], around[i], cells, surfels, work)
+            count = 0
 
 
 @compiled_part
@@ -52,14 +81,50 @@ def outdated(row: int, sums: NDArray[np.float32], counts: NDArray[np.float32]) -
 
 
 @compiled_part
+def scratch() -> Scratch:
+    """Room for `refresh_one`."""
+    return np.empty(27, dtype=np.int32), np.empty(15), np.empty(6), np.empty(3)
+
+
+@compiled_part
 def refresh_one(
-    row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32],
-    scratch: tuple[FloatArray, FloatArray, FloatArray],
+    row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32], work: Scratch
 ) -> None:  # fmt: skip
-    """Compute the surfel of one cell, with scratch arrays of 15, 6 and 3 numbers."""
-    total, covariance, values = scratch
+    """Compute the surfel of one cell."""
     counts[row] = cells.sums[row, 0]
-    _gather(row, cells, total)
+    _prefetch_around(row, cells)
+    _find_around(row, cells, work[0])
+    _compute(row, work[0], cells, surfels, work)
+
+
+@compiled_part
+def _prefetch_around(row: int, cells: Cells) -> None:
+    """Prefetch what `_find_around` reads; the three cells above one another are nearly always in one place."""
+    key = cells.keys[row]
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            slot = home(neighbour_key(key, a, b, 0), cells.bits)
+            prefetch(cells.table_keys, slot)
+            prefetch(cells.table_rows, slot)
+
+
+@compiled_part
+def _find_around(row: int, cells: Cells, around: NDArray[np.int32]) -> None:
+    """Write the rows (27,) of a cell and its neighbours, or -1, and prefetch their sums."""
+    key, n = cells.keys[row], 0
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            for c in range(-1, 2):
+                around[n] = find_one(neighbour_key(key, a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                prefetch(cells.sums, around[n])
+                n += 1
+
+
+@compiled_part
+def _compute(row: int, around: NDArray[np.int32], cells: Cells, surfels: FloatArray, work: Scratch) -> None:
+    """Compute the surfel of a cell, with the rows (27,) of the cells around it."""
+    _, total, covariance, values = work
+    _gather(row, around, cells, total)
     count, x, y, z = total[0], total[1] / total[0], total[2] / total[0], total[3] / total[0]
     covariance[0], covariance[1], covariance[2] = -x * x, -x * y, -x * z
     covariance[3], covariance[4], covariance[5] = -y * y, -y * z, -z * z
@@ -84,18 +149,19 @@ def refresh_one(
 
 
 @compiled_part
-def _gather(row: int, cells: Cells, total: FloatArray) -> None:
+def _gather(row: int, around: NDArray[np.int32], cells: Cells, total: FloatArray) -> None:
     """Write the weighted sums (15,) of a cell and its 26 neighbours, about its own centre.
 
     Neighbours seen from the other side are another surface: a thin wall has two.
     """
-    own, key = cells.sums[row], cells.keys[row]
+    own, at = cells.sums[row], -1
     # Sums in variables of their own stay in registers.
     n = x = y = z = xx = xy = xz = yy = yz = zz = elevation = squared = u = v = w = 0.0
     for a in range(-1, 2):
         for b in range(-1, 2):
             for c in range(-1, 2):
-                other = find_one(neighbour_key(key, a, b, c), cells.bits, cells.table_keys, cells.table_rows)
+                at += 1
+                other = around[at]
                 if other < 0:
                     continue
                 if cells.sums[other, OTHER] > 0.0:
