@@ -121,12 +121,18 @@ def insert(
     return len(keys), count
 
 
+@compiled_part
+def _key_at(point: FloatArray, scale: float) -> int:
+    """Key of the cell of a point (3,), of so many cells a metre."""
+    return key_of(cell_of(point[0] * scale), cell_of(point[1] * scale), cell_of(point[2] * scale))
+
+
 @compiled
 def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
     """Write the keys (N,) of the cells that points (N, 3) lie in."""
     scale = 1.0 / cell_m
     for n in range(len(points)):
-        keys[n] = key_of(cell_of(points[n, 0] * scale), cell_of(points[n, 1] * scale), cell_of(points[n, 2] * scale))
+        keys[n] = _key_at(points[n], scale)
 
 
 @compiled_part
@@ -199,8 +205,11 @@ def add_moments(
 @compiled
 def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     """Write the rows (N,) of the cells of points (N, 3), else of the nearest around; or `ABSENT`."""
-    scale = 1.0 / cells.cell_m
+    scale, last = 1.0 / cells.cell_m, len(points) - 1
     for n in range(len(points)):
+        ahead = home(_key_at(points[min(n + PREFETCHED, last)], scale), cells.bits)
+        prefetch(cells.table_keys, ahead)
+        prefetch(cells.table_rows, ahead)
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         i, j, k = cell_of(x), cell_of(y), cell_of(z)
         row = find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
@@ -211,6 +220,11 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
 def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
     """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells."""
     nearest, least = ABSENT, np.inf
+    for a in range(i - 1, i + 2):
+        for b in range(j - 1, j + 2):
+            slot = home(key_of(a, b, k), cells.bits)
+            prefetch(cells.table_keys, slot)
+            prefetch(cells.table_rows, slot)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):
