@@ -9,9 +9,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled, compiled_part
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import EMPTY, cell_of, key_of
+from lidarslam.mapping.surfels.cell_kernels import EMPTY, PREFETCHED, cell_of, key_of
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 Keys = NDArray[np.int64]
@@ -59,6 +59,9 @@ def add_up(order: NDArray[np.intp], keys: Keys, sums: Sums, summed: int, unique:
     """
     count, columns = 0, sums.shape[1]
     for n in range(len(order)):
+        ahead = order[min(n + PREFETCHED, len(order) - 1)]
+        prefetch(keys, ahead)
+        prefetch(sums, ahead)
         row = order[n]
         if count == 0 or keys[row] != unique[count - 1]:
             unique[count] = keys[row]

@@ -173,6 +173,9 @@ def add_moments(
     scale, w = 1.0 / cell_m, np.float32(weight)
     is_growing = np.empty(len(rows), dtype=np.bool_)
     for n in range(len(rows)):
+        ahead = rows[min(n + PREFETCHED, len(rows) - 1)]
+        prefetch(sums, ahead)
+        prefetch(grid_keys, ahead)
         is_growing[n] = sums[rows[n], 0] < _MOST_POINTS
         grid_keys[rows[n]] = keys[n]
     for n in range(len(rows)):

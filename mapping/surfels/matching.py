@@ -34,13 +34,6 @@ class Correspondences:
         """Signed distances (M,) of the matched points, at (M, 3) of the world, from their surfaces."""
         return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
 
-    def first_of_each_point(self) -> "Correspondences":
-        """One residual for each point, the one across its surface."""
-        first = np.flatnonzero(np.diff(self.index, prepend=-1))
-        return Correspondences(
-            self.index[first], self.points[first], self.normals[first], self.thickness_m[first], self.tilt[first]
-        )
-
 
 class Matcher:
     """Finds the surfaces that N points correspond to, at one pose after another.
@@ -77,6 +70,18 @@ class Matcher:
             unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, self.surfaces)]
         assert finest is not None
         match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
+
+    def first_correspondences(self) -> Correspondences:
+        """One residual for each point that has a surface, the one across it."""
+        found = self.surfaces
+        index = np.flatnonzero(found.counts)
+        return Correspondences(
+            index,
+            found.points.take(index, axis=0),
+            found.normals[index, 0],
+            found.thickness_m[index, 0],
+            found.tilt[index, 0],
+        )
 
     def correspondences(self) -> Correspondences:
         """A residual a row, in the order of the points."""

@@ -151,7 +151,9 @@ class _System:
         if count < MIN_CORRESPONDENCES:
             return None
         rows, total = rows[:count], np.zeros((13, 13))
-        scale = max(_SCALE_PER_MEDIAN * float(np.median(np.abs(rows[:, RESIDUAL]))), _LEAST_SCALE * cell_m)
+        middle = count // 2
+        median_m = float(np.partition(np.abs(rows[:, RESIDUAL]), middle)[middle])
+        scale = max(_SCALE_PER_MEDIAN * median_m, _LEAST_SCALE * cell_m)
         weight, tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, total)
         degeneracy = degenerate_directions(total[:6, :6], tilt, weight, float(np.sqrt(squared / count)))
         return cls(total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION, degeneracy, squared_time)

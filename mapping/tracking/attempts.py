@@ -204,7 +204,7 @@ def measure_fit(
     """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4), with the matcher of a pose nearby."""
     matcher, world = matcher or surfel_map.matcher(len(points)), transform_points(T_world_lidar, points)
     matcher.match(world, T_world_lidar)
-    matches = matcher.correspondences().first_of_each_point()
+    matches = matcher.first_correspondences()
     distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
     ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
     return Fit.of(distances, matches.normals, ranges, len(points), surfel_map.cell_m)

@@ -53,12 +53,13 @@ class Fit:
         nearest_m = max(_GATE_MIN_M, _GATE_CELLS * cell_m)
         inlier = distances < np.maximum(nearest_m, _GATE_RATIO * ranges)
         facing = np.abs(normals).argmax(axis=1)
-        ratios = [float(inlier[facing == axis].mean()) for axis in range(3) if (facing == axis).sum() >= _FEWEST_FACING]
+        counts, inliers = np.bincount(facing), np.bincount(facing, weights=inlier)
+        ratios = (inliers / np.maximum(counts, 1))[counts >= _FEWEST_FACING]
         return cls(
             matched=len(distances),
             overlap=len(distances) / points,
             residual_m=float(np.median(distances)),
-            inlier_ratio=min(ratios, default=float(inlier.mean())),
+            inlier_ratio=float(ratios.min() if len(ratios) else inlier.mean()),
             support=directional_support(normals, distances / (_HALF_CELLS * cell_m)),
         )
 

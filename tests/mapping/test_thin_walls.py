@@ -37,7 +37,7 @@ def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float
 def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int) -> tuple[float, FloatArray]:
     """The share of points on a face that are matched from one side, and how far these are off."""
     asked = face(rng, x, 4.0 * local_map.cell_m, 500)
-    matches = local_map.match(asked, make_transform(np.eye(3), SENSORS[side])).first_of_each_point()
+    matches = first_matches(local_map, asked, side)
     return len(matches) / len(asked), np.abs(matches.residuals(asked[matches.index]))
 
 
@@ -66,7 +66,7 @@ def test_both_sides_stay_when_cells_change_their_size(rng: np.random.Generator, 
     resized = seen_wall(rng, cell_m, faces, ONE_AFTER_THE_OTHER).resized(cell_m * factor)
     for side in (0, 1):
         asked = face(rng, faces[side], 2.0 * cell_m, 500)
-        matches = resized.match(asked, make_transform(np.eye(3), SENSORS[side])).first_of_each_point()
+        matches = first_matches(resized, asked, side)
         assert len(matches) > 0.95 * len(asked)
         assert np.abs(matches.residuals(asked[matches.index])).mean() < 0.005
 
