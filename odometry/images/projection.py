@@ -29,6 +29,9 @@ _WHOLE, _FAR = np.float32(_TURN), np.float32(np.inf)
 # which are floats until they are stored.
 _OUTSIDE, _UNSURE = -1, -2
 _ABOVE_OR_BELOW, _NOT_SURE = np.float32(_OUTSIDE), np.float32(_UNSURE)
+# The nearest point of a pixel as one number: the bits of its range above those of its index.
+_INDEX_BITS, _NONE = 32, np.int64((1 << 63) - 1)
+_INDEX_MASK = np.int64((1 << _INDEX_BITS) - 1)
 # Points that are worked on together.
 _BLOCK = 1024
 _STEEP, _LEAST = np.float32(math.sqrt(2.0) - 1.0), np.float32(1e-30)
@@ -98,12 +101,11 @@ def project(points: Points, grids: Sequence[ImageGrid]) -> list[Projection]:
     write_angles(x, y, z, elevations, azimuths)
     projections = []
     for grid in grids:
-        index = np.full(grid.rows * grid.columns, -1)
-        nearest = np.full(len(index), np.inf, dtype=np.float32)
+        nearest = np.full(grid.rows * grid.columns, _NONE)
         low, per_radian = grid.elevation_low, grid.rows_per_radian
-        _keep_nearest(x, y, z, ranges, elevations, azimuths, grid.rows, grid.columns, low, per_radian, index, nearest)
-        image = np.empty((4, len(index)), dtype=np.float32)
-        _write_pixels(x, y, z, ranges, index, image)
+        _keep_nearest(x, y, z, ranges, elevations, azimuths, grid.rows, grid.columns, low, per_radian, nearest)
+        index, image = np.empty(len(nearest), dtype=np.int64), np.empty((4, len(nearest)), dtype=np.float32)
+        _write_pixels(x, y, z, ranges, nearest, index, image)
         shape = (grid.rows, grid.columns)
         projections.append(Projection(image.reshape(4, *shape), index.reshape(shape)))
     return projections
@@ -121,13 +123,13 @@ def _write_coordinates(points: FloatArray, x: Floats, y: Floats, z: Floats, rang
 @compiled
 def _keep_nearest(
     x: Floats, y: Floats, z: Floats, ranges: Floats, elevations: Floats, azimuths: Floats,
-    height: int, width: int, low: float, per_radian: float, index: NDArray[np.int64], nearest: Floats,
+    height: int, width: int, low: float, per_radian: float, nearest: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Write the index of the nearest point (H * W,) of each pixel, and its range.
+    """Write the nearest point (H * W,) of each pixel: the bits of its range, which ascend with it, and its index.
 
     Angles of single precision decide the pixel of all points but those next to its border, whose angles are taken anew.
     """
-    pixels = np.empty(_BLOCK, dtype=np.int32)
+    pixels, bits = np.empty(_BLOCK, dtype=np.int32), ranges.view(np.int32)
     for begin in range(0, len(ranges), _BLOCK):
         end = min(begin + _BLOCK, len(ranges))
         _find_pixels(
@@ -140,8 +142,9 @@ def _keep_nearest(
                 row = row_of(math.atan2(pz, math.sqrt(px * px + py * py)), low, per_radian)
                 inside = row >= 0.0 and row < height
                 pixel = int(row) * width + int(column_of(math.atan2(py, px), width)) if inside else _OUTSIDE
-            if pixel != _OUTSIDE and ranges[i] < nearest[pixel]:
-                index[pixel], nearest[pixel] = i, ranges[i]
+            if pixel != _OUTSIDE:
+                # Without a branch on which is nearer, which no processor would predict.
+                nearest[pixel] = min(nearest[pixel], (np.int64(bits[i]) << _INDEX_BITS) | i)
 
 
 @compiled_part
@@ -164,10 +167,12 @@ def _find_pixels(
 
 
 @compiled
-def _write_pixels(x: Floats, y: Floats, z: Floats, ranges: Floats, index: NDArray[np.int64], image: Floats) -> None:
-    """Write the points of an image (4, H * W)."""
+def _write_pixels(
+    x: Floats, y: Floats, z: Floats, ranges: Floats, nearest: NDArray[np.int64], index: NDArray[np.int64], image: Floats
+) -> None:
+    """Write the indices (H * W,) and the points of an image (4, H * W) from the nearest points of `_keep_nearest`."""
     for pixel in range(len(index)):
-        n = index[pixel]
+        n = index[pixel] = nearest[pixel] & _INDEX_MASK if nearest[pixel] != _NONE else -1
         if n >= 0:
             image[0, pixel], image[1, pixel], image[2, pixel], image[3, pixel] = x[n], y[n], z[n], ranges[n]
         else:
