@@ -16,10 +16,10 @@ from types import ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
+import numba.extending
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
@@ -28,6 +28,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 _njit: Any = numba.njit
 _config: Any = numba.config
+_intrinsic: Any = numba.extending.intrinsic
+_unpacked: Any = cgutils.unpack_tuple
 # Nothing calls these loops by their addresses: an entry less to compile.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
@@ -62,11 +64,10 @@ def compiled_sums(function: Function) -> Function:
     return _part(function, fastmath={"reassoc", "contract", "nsz"})
 
 
-@cast(Any, intrinsic)
-def _prefetch(_: Any, array: Any, row: Any) -> Any:
+def _prefetch(_context: Any, array: Any, _row: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         first = context.make_array(signature.args[0])(context, builder, values[0])
-        (width, *_) = cgutils.unpack_tuple(builder, first.strides, signature.args[0].ndim)
+        (width, *_) = _unpacked(builder, first.strides, signature.args[0].ndim)
         address = builder.add(builder.ptrtoint(first.data, width.type), builder.mul(width, values[1]))
         pointer, flag = cgutils.voidptr_t, ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [pointer, flag, flag, flag])
@@ -78,7 +79,9 @@ def _prefetch(_: Any, array: Any, row: Any) -> Any:
     return types.void(array, types.intp), generate
 
 
-prefetch: Callable[[NDArray[Any], int], None] = (lambda array, row: None) if _config.DISABLE_JIT else _prefetch
+prefetch: Callable[[NDArray[Any], int], None] = (
+    (lambda _array, _row: None) if _config.DISABLE_JIT else _intrinsic(_prefetch)
+)
 """Begin to load a row of an array into the processor's cache, for compiled functions that will read it soon.
 
 Loops over rows in no order wait for one row at a time otherwise, as what they do depends on what they find there.

@@ -9,6 +9,7 @@ from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state.stateful import Saved
 from lidarslam.mapping.surfels.cell_kernels import OTHER_SIDE
 from lidarslam.mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.matching import Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
 
@@ -32,6 +33,12 @@ def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float
         points[:, 0] += rng.normal(0.0, NOISE_M, len(points))
         local_map.insert(points, rng.uniform(-0.3, 0.3, len(points)), SENSORS[side])
     return local_map
+
+
+def first_matches(local_map: SurfelMap, points: FloatArray, side: int) -> Correspondences:
+    matcher = local_map.matcher(len(points))
+    matcher.match(points, make_transform(np.eye(3), SENSORS[side]))
+    return matcher.first_correspondences()
 
 
 def matched(rng: np.random.Generator, local_map: SurfelMap, x: float, side: int) -> tuple[float, FloatArray]:
