@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 from typing_extensions import Self
 
+from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.values import ANY_NUMBER, Shape, Within
 from lidarslam.core.trajectory import Trajectory
@@ -126,10 +127,8 @@ class Scan:
         with np.errstate(over="ignore", invalid="ignore"):  # damaged bytes may be any number
             brightness = _column("intensities", intensities, len(xyz), np.float32)
         rgb = None if colours is None else _colours(colours, len(xyz))
-        # NaN and infinity fail the comparisons too, so one pass finds every invalid point.
-        size = np.abs(xyz)
-        largest = np.maximum(np.maximum(size[:, 0], size[:, 1]), size[:, 2])  # ten times as fast as max(axis=1)
-        valid = (largest > 0.0) & (largest < _MAX_RANGE_M)
+        xyz, valid = np.ascontiguousarray(xyz), np.empty(len(xyz), dtype=np.bool_)
+        dropped = _find_valid(xyz, valid)
         untimed = 0
         if offsets is not None:
             timed = valid & np.isfinite(offsets)
@@ -138,7 +137,6 @@ class Scan:
                 offsets, untimed = None, 0
             elif untimed:
                 offsets = _interpolated(offsets, timed, valid & ~timed)
-        dropped = int(len(xyz) - np.count_nonzero(valid))
         if dropped:
             kept = np.flatnonzero(valid)
             xyz = xyz.take(kept, axis=0)  # four times as fast as indexing with the mask
@@ -163,6 +161,18 @@ class Scan:
             untimed=self.untimed,
             **{name: None if values is None else values.take(chosen, axis=0) for name, values in columns.items()},
         )
+
+
+@compiled
+def _find_valid(points: FloatArray, valid: NDArray[np.bool_]) -> int:
+    """Write which points (N,) are neither at the origin, nor too far, nor no number; return how many are none of it."""
+    dropped = 0
+    for n in range(len(points)):
+        x, y, z = abs(points[n, 0]), abs(points[n, 1]), abs(points[n, 2])
+        is_near = x < _MAX_RANGE_M and y < _MAX_RANGE_M and z < _MAX_RANGE_M  # not NaN
+        valid[n] = is_near and x + y + z > 0.0
+        dropped += not valid[n]
+    return dropped
 
 
 def _interpolated(offsets: FloatArray, timed: NDArray[np.bool_], untimed: NDArray[np.bool_]) -> FloatArray:

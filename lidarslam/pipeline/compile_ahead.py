@@ -26,7 +26,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 def parts_of(config: Config) -> list[str]:
     """The names of the parts whose loops a run needs."""
-    needed = {"map", "checks"} | ({"images", "alignment"} if config.odometry.is_learned else set())
+    needed = {"reading", "map", "checks"} | ({"images", "alignment"} if config.odometry.is_learned else set())
     if config.mapping.enabled:
         needed.add(config.mapping.method)
     return [name for name in PARTS if name in needed]

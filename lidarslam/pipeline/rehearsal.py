@@ -35,6 +35,13 @@ def made_up_scans() -> tuple[Scan, ...]:
     return tuple(scans)
 
 
+def _reading() -> None:
+    from lidarslam.datasets.kitti.correction import correct_elevation
+
+    as_stored = np.ones((1, 4), dtype=np.float32)
+    Scan.from_raw(correct_elevation(as_stored[:, :3], 0.0), 0.0)
+
+
 def _images() -> None:
     from lidarslam.odometry.config import ImageConfig
     from lidarslam.odometry.images.bird_eye import bird_eye
@@ -121,9 +128,10 @@ PARTS = {
     ),
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
     "alignment": Part(
-        _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("residuals", "point_to_plane", "steps"))
+        _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("descent", "residuals", "point_to_plane", "steps"))
     ),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
+    "reading": Part(_reading, ("core.scan", "datasets.kitti.correction")),
     "map": Part(_map, ("mapping.motion.deskew", "mapping.global_map.kernels")),
     "checks": Part(_checks, ("mapping.global_map.visibility_kernels", "mapping.slides.kernels"), is_late=True),
 }

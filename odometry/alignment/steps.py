@@ -16,7 +16,7 @@ UNKNOWNS = 12
 _coefficients = compiled_part(coefficients)
 
 
-@compiled
+@compiled_part
 def take_step(
     T: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, T_curr_prev: FloatArray,
     information: FloatArray, expected: FloatArray,
