@@ -163,6 +163,20 @@ class Scan:
         )
 
 
+def squared_ranges(points: FloatArray) -> FloatArray:
+    """Squared distances (N,) of points (N, 3) from the origin."""
+    squared = np.empty(len(points))
+    _write_squared_ranges(np.ascontiguousarray(points), squared)
+    return squared
+
+
+@compiled
+def _write_squared_ranges(points: FloatArray, squared: FloatArray) -> None:
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        squared[n] = x * x + y * y + z * z
+
+
 @compiled
 def _find_valid(points: FloatArray, valid: NDArray[np.bool_]) -> int:
     """Write which points (N,) are neither at the origin, nor too far, nor no number; return how many are none of it."""

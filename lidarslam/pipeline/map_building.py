@@ -4,10 +4,8 @@ import logging
 from dataclasses import dataclass
 from typing import Annotated
 
-import numpy as np
-
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import PointAttributes, Scan
+from lidarslam.core.scan import PointAttributes, Scan, squared_ranges
 from lidarslam.core.state.stateful import TRANSFORM, Saved, Shape, Stateful
 from lidarslam.core.thinning import one_per_cell
 from lidarslam.mapping.config import GlobalMapConfig
@@ -98,7 +96,7 @@ class MapBuilder(Stateful):
                 "voxels of the map: %.3g m, 1/50 of the first scan's median range, from 5 to 25 cm", self.voxel_size_m
             )
         thinned = scan.select(one_per_cell(scan.points, self.voxel_size_m))
-        squared = np.einsum("ij,ij->i", thinned.points, thinned.points)
+        squared = squared_ranges(thinned.points)
         return thinned.select((squared >= self._config.min_range_m**2) & (squared <= self._config.max_range_m**2))
 
     def add(self, thinned: Scan, points: FloatArray, localised: Localised) -> None:

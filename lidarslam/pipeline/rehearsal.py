@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 
 from lidarslam.core.geometry import make_transform
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import Scan, squared_ranges
 
 _RINGS, _COLUMNS, _SWEEP_S = 16, 900, 0.1
 _HALF_ROOM_M = np.array([8.0, 6.0, 2.0])
@@ -39,7 +39,7 @@ def _reading() -> None:
     from lidarslam.datasets.kitti.correction import correct_elevation
 
     as_stored = np.ones((1, 4), dtype=np.float32)
-    Scan.from_raw(correct_elevation(as_stored[:, :3], 0.0), 0.0)
+    squared_ranges(Scan.from_raw(correct_elevation(as_stored[:, :3], 0.0), 0.0).points)
 
 
 def _images() -> None:

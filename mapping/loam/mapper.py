@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidarslam.core.geometry import adjoint, exp, inverse, transform_points
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import Scan, squared_ranges
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
@@ -50,7 +50,7 @@ class LoamMapper(Stateful):
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan to the map, and insert it."""
-        cell_m = self._scale.update(np.einsum("ij,ij->i", scan.points, scan.points))
+        cell_m = self._scale.update(squared_ranges(scan.points))
         spacing_m = self._config.cell_m or min(cell_m, _MOST_SPACING_M)
         features = extract_features(scan, self._config.min_range_m, self._config.max_range_m, spacing_m)
         last = self._last or MotionState(scan.stamp, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)

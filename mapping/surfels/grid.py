@@ -171,10 +171,9 @@ class SurfelGrid(Stateful):
 
     def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
         """Drop the cells farther than `radius_m` from `centre` (3,)."""
-        count = len(self)
-        offsets = (key_cells(self._keys[:count]) + 0.5) * self.cell_m - centre
-        kept = np.flatnonzero(np.einsum("ij,ij->i", offsets, offsets) <= radius_m**2)
-        self._keep(kept)
+        kept = np.empty(len(self), dtype=np.intp)
+        count = kernels.within(self._keys[: len(self)], self.cell_m, np.ascontiguousarray(centre), radius_m, kept)
+        self._keep(kept[:count])
 
     def tidy(self) -> None:
         """Compute all surfels anew, and drop stray cells.

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import Scan
+from lidarslam.core.scan import Scan, squared_ranges
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.mapping.config import MappingConfig
@@ -72,7 +72,7 @@ class Sampler(Stateful):
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
-        squared = np.einsum("ij,ij->i", scan.points, scan.points)
+        squared = squared_ranges(scan.points)
         cell_m = self._scale.update(squared)
         kept = one_per_cell(scan.points, _MAP_SPACING * cell_m)
         near, far = self._config.min_range_m**2, self._config.max_range_m**2
