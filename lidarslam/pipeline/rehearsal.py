@@ -128,7 +128,7 @@ PARTS = {
     ),
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
     "alignment": Part(
-        _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("descent", "residuals", "point_to_plane", "steps"))
+        _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("residuals", "point_to_plane", "steps"))
     ),
     "images": Part(_images, ("odometry.images.projection", "odometry.images.normals", "odometry.images.bird_eye")),
     "reading": Part(_reading, ("core.scan", "datasets.kitti.correction")),

@@ -10,21 +10,25 @@ the change is expected to go on as between the motions before.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.odometry.alignment.correspondences import Motion
-from lidarslam.odometry.alignment.descent import INFORMATION_PER_M2, Expectation
 from lidarslam.odometry.alignment.point_to_plane import FINE_M, Fit, PointToPlane
-from lidarslam.odometry.alignment.steps import write_velocities
+from lidarslam.odometry.alignment.steps import take_step, write_velocities
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 
 # Scale of the robust weights in the first step; it shrinks to the finest over this part of the steps.
 _COARSE_M = 0.5
 _ANNEALED = 0.5
+# A motion that changes by less than this in a step has converged: radians and metres.
+_CONVERGED = 1e-4
+# Standard deviation of points about their planes, and the share of points with independent errors: neighbours share
+# theirs. Together the information of one point, 1/m^2.
+_RESIDUAL_M, _INDEPENDENT = 0.03, 0.05
+INFORMATION_PER_M2 = _INDEPENDENT / _RESIDUAL_M**2
 # Standard deviations of the change of velocity within a pair of sweeps about the expected one, rad/s and m/s.
 INNOVATION_RAD_S, INNOVATION_M_S = 0.3, 0.5
 # Part of the largest information that counts as none.
@@ -93,45 +97,31 @@ def align_each(starts: Sequence[InitialEstimate], sweeps: SweepPair, effort: Eff
 
 def _align(start: InitialEstimate, sweeps: SweepPair, cost: PointToPlane, iterations: int) -> Alignment:
     T_prev_curr, innovation = np.array(start.T_prev_curr, dtype=np.float64), np.zeros(6)
-    information = np.zeros((6, 6)) if start.information is None else start.information
-    expectation = _expectation(start, information, sweeps)
-    scales, coarse = _scales(iterations)
-    if start.information is None:
-        cost.descend(T_prev_curr, innovation, expectation, scales, coarse)
-    else:
-        cost.descend(T_prev_curr, innovation, expectation, scales[:coarse], coarse)
-        H, _ = cost.normal_equations(_motion(T_prev_curr, innovation, expectation), scales[coarse])
-        information = _where_unseen(information, _marginal(INFORMATION_PER_M2 * H, INFORMATION_PER_M2))
-        expectation = expectation._replace(information=information)
-        cost.descend(T_prev_curr, innovation, expectation, scales[coarse:], 0)
-    motion = _motion(T_prev_curr, innovation, expectation)
+    T_curr_prev, prior, is_seen = inverse(start.T_prev_curr), start.information, start.information is None
+    information, expected = np.zeros((6, 6)) if prior is None else prior, _innovation_information()
+    if start.change_information is not None:
+        expected = expected + start.change_information
+    # Arrays of another layout would be compiled for anew.
+    information, expected = np.ascontiguousarray(information), np.ascontiguousarray(expected)
+    for done in np.linspace(0.0, 1.0, iterations).tolist():
+        scale_m = _COARSE_M * (FINE_M / _COARSE_M) ** min(1.0, done / _ANNEALED)
+        H, g = cost.normal_equations(_motion(T_prev_curr, innovation, sweeps), scale_m)
+        H, g = INFORMATION_PER_M2 * H, INFORMATION_PER_M2 * g
+        if done >= _ANNEALED and not is_seen:
+            information, is_seen = _where_unseen(information, _marginal(H, INFORMATION_PER_M2)), True
+        largest = take_step(T_prev_curr, innovation, H, g, T_curr_prev, information, expected)
+        if done >= _ANNEALED and largest < _CONVERGED:
+            break
+    motion = _motion(T_prev_curr, innovation, sweeps)
     return _alignment(T_prev_curr, 0.5 * (motion.late - motion.early), cost.fit(motion), information)
 
 
-@lru_cache
-def _scales(iterations: int) -> tuple[FloatArray, int]:
-    """The scales of the robust weights of so many steps, and how many of them come before the finest."""
-    done = np.linspace(0.0, 1.0, iterations) / _ANNEALED
-    return _COARSE_M * (FINE_M / _COARSE_M) ** np.minimum(1.0, done), int(np.count_nonzero(done < 1.0))
-
-
-def _expectation(start: InitialEstimate, information: FloatArray, sweeps: SweepPair) -> Expectation:
-    held, last = _innovation_information(), sweeps.last
-    if start.change_information is not None:
-        held = held + start.change_information
-    share = 0.0 if last is None else sweeps.interval_s / (sweeps.interval_s + last.interval_s)
-    velocity = np.zeros(6) if last is None else last.velocity
-    # Arrays of another layout would be compiled for anew.
-    T_curr_prev, information, held, velocity = map(
-        np.ascontiguousarray, (inverse(start.T_prev_curr), information, held, velocity)
-    )
-    return Expectation(T_curr_prev, information, held, sweeps.interval_s, share, velocity)
-
-
-def _motion(T_prev_curr: FloatArray, innovation: FloatArray, expected: Expectation) -> Motion:
+def _motion(T_prev_curr: FloatArray, innovation: FloatArray, sweeps: SweepPair) -> Motion:
     """The motion, whose change of velocity goes on as before but for the innovation."""
-    early, late = np.empty(6), np.empty(6)
-    write_velocities(T_prev_curr, innovation, expected.interval_s, expected.share, expected.velocity, early, late)
+    early, late, last, share = np.empty(6), np.empty(6), innovation, 0.0
+    if sweeps.last is not None:
+        last, share = sweeps.last.velocity, sweeps.interval_s / (sweeps.interval_s + sweeps.last.interval_s)
+    write_velocities(T_prev_curr, innovation, sweeps.interval_s, share, last, early, late)
     return Motion(T_prev_curr, early, late)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from lidarslam.core.compiled import compiled
 from lidarslam.core.geometry import FloatArray
 from lidarslam.odometry.alignment.correspondences import Motion, Planes
-from lidarslam.odometry.alignment.descent import Expectation, descend
 from lidarslam.odometry.alignment.residuals import accumulate
 from lidarslam.odometry.alignment.sweep_motion import SweepPair
 from lidarslam.odometry.images.projection import Floats
@@ -48,14 +47,6 @@ class PointToPlane:
     def __init__(self, sweeps: SweepPair, column_step: int) -> None:
         self._points, self._count = _points(sweeps.current, column_step)
         self._planes = _planes(sweeps.previous)
-
-    def descend(
-        self, T_prev_curr: FloatArray, innovation: FloatArray, expectation: Expectation, scales: FloatArray,
-        patience: int,
-    ) -> None:  # fmt: skip
-        """Minimise over the motion (4, 4) and the innovation (6,), in place; arguments as of `descend`."""
-        points, count, planes = self._points, self._count, self._planes
-        descend(points, count, planes, expectation, scales, patience, T_prev_curr, innovation)
 
     def normal_equations(self, motion: Motion, scale_m: float) -> tuple[FloatArray, FloatArray]:
         """H (12, 12) and g (12,) of squared residuals with Geman and McClure's weights of this scale.

@@ -11,12 +11,12 @@ from lidarslam.core.geometry import SMALL_ANGLE, FloatArray, coefficients
 _DAMPING = 1e-3
 # No step of the motion is larger: radians and metres.
 _LARGEST_STEP = 0.3
-UNKNOWNS = 12
+_UNKNOWNS = 12
 
 _coefficients = compiled_part(coefficients)
 
 
-@compiled_part
+@compiled
 def take_step(
     T: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, T_curr_prev: FloatArray,
     information: FloatArray, expected: FloatArray,
@@ -32,7 +32,7 @@ def take_step(
     Returns:
         The largest part of the step of the motion, radians or metres.
     """
-    away, step, moved = np.empty(6), np.empty(UNKNOWNS), np.empty((4, 4))
+    away, step, moved = np.empty(6), np.empty(_UNKNOWNS), np.empty((4, 4))
     _multiply(T, T_curr_prev, moved)
     _log(moved, away)
     for i in range(6):
@@ -41,7 +41,7 @@ def take_step(
             H[6 + i, 6 + j] += expected[i, j]
             g[i] += information[i, j] * away[j]
             g[6 + i] += expected[i, j] * innovation[j]
-    for i in range(UNKNOWNS):
+    for i in range(_UNKNOWNS):
         H[i, i] += _DAMPING
     _solve(H, g, step)
     largest = 0.0
@@ -78,20 +78,20 @@ def write_velocities(
 @compiled_part
 def _solve(H: FloatArray, g: FloatArray, x: FloatArray) -> None:
     """Write the solution of a positive definite system by Cholesky's factor, which overwrites half of H."""
-    for i in range(UNKNOWNS):
+    for i in range(_UNKNOWNS):
         for j in range(i + 1):
             rest = H[i, j]
             for k in range(j):
                 rest -= H[i, k] * H[j, k]
             H[i, j] = math.sqrt(rest) if i == j else rest / H[j, j]
-    for i in range(UNKNOWNS):
+    for i in range(_UNKNOWNS):
         rest = g[i]
         for k in range(i):
             rest -= H[i, k] * x[k]
         x[i] = rest / H[i, i]
-    for i in range(UNKNOWNS - 1, -1, -1):
+    for i in range(_UNKNOWNS - 1, -1, -1):
         rest = x[i]
-        for k in range(i + 1, UNKNOWNS):
+        for k in range(i + 1, _UNKNOWNS):
             rest -= H[k, i] * x[k]
         x[i] = rest / H[i, i]
 

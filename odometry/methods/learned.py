@@ -14,9 +14,8 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
-from lidarslam.odometry.alignment.alignment import InitialEstimate, align
+from lidarslam.odometry.alignment.alignment import INFORMATION_PER_M2, InitialEstimate, align
 from lidarslam.odometry.alignment.degeneracy import find_degeneracy, joined_information, replaced_along
-from lidarslam.odometry.alignment.descent import INFORMATION_PER_M2
 from lidarslam.odometry.alignment.search import align_best
 from lidarslam.odometry.alignment.sweep_motion import StampInterpolator, SweepPair
 from lidarslam.odometry.config import ImageConfig

@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 
 from lidarslam.core.compiled import compiled, compiled_sums
-from lidarslam.core.geometry import FloatArray, exp, inverse, log
+from lidarslam.core.geometry import exp, inverse, log
 from lidarslam.odometry.alignment.steps import take_step, write_velocities
-
-
-@compiled
-def taken(
-    T: FloatArray, innovation: FloatArray, H: FloatArray, g: FloatArray, T_curr_prev: FloatArray,
-    information: FloatArray, expected: FloatArray,
-) -> float:  # fmt: skip
-    return take_step(T, innovation, H, g, T_curr_prev, information, expected)
 
 
 def positive(rng: np.random.Generator, size: int, weakest: float = 1.0) -> np.ndarray:
@@ -35,7 +27,7 @@ def test_a_step_solves_the_normal_equations_with_both_priors(weakest: float, siz
     delta = -np.linalg.solve(whole, g + np.concatenate([information @ away, expected @ innovation]))
     step = delta[:6] * min(1.0, 0.3 / np.abs(delta[:6]).max())
     moved, changed = T.copy(), innovation.copy()
-    largest = taken(moved, changed, H, g, inverse(T_prior), information, expected)
+    largest = take_step(moved, changed, H, g, inverse(T_prior), information, expected)
     np.testing.assert_allclose(moved, exp(step) @ T, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(changed, innovation + delta[6:], rtol=1e-8, atol=1e-10)
     assert largest == pytest.approx(np.abs(step).max(), rel=1e-8)
@@ -43,7 +35,7 @@ def test_a_step_solves_the_normal_equations_with_both_priors(weakest: float, siz
 
 def test_what_is_no_number_stays_none() -> None:
     T, nothing = np.eye(4), np.zeros((6, 6))
-    taken(T, np.zeros(6), np.full((12, 12), np.nan), np.zeros(12), np.eye(4), nothing, nothing)
+    take_step(T, np.zeros(6), np.full((12, 12), np.nan), np.zeros(12), np.eye(4), nothing, nothing)
     assert np.isnan(T).any()
 
 
