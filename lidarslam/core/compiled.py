@@ -17,7 +17,6 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numba.extending
-from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _njit: Any = numba.njit
 _config: Any = numba.config
 _intrinsic: Any = numba.extending.intrinsic
-_unpacked: Any = cgutils.unpack_tuple
+_tools: Any = cgutils
 # Nothing calls these loops by their addresses: an entry less to compile.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
@@ -67,10 +66,10 @@ def compiled_sums(function: Function) -> Function:
 def _prefetch(_context: Any, array: Any, _row: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         first = context.make_array(signature.args[0])(context, builder, values[0])
-        (width, *_) = _unpacked(builder, first.strides, signature.args[0].ndim)
+        (width, *_) = _tools.unpack_tuple(builder, first.strides, signature.args[0].ndim)
         address = builder.add(builder.ptrtoint(first.data, width.type), builder.mul(width, values[1]))
-        pointer, flag = cgutils.voidptr_t, ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, flag, flag, flag])
+        pointer, flag = _tools.voidptr_t, _tools.ir.IntType(32)
+        kind = _tools.ir.FunctionType(_tools.ir.VoidType(), [pointer, flag, flag, flag])
         fetch = builder.module.declare_intrinsic("llvm.prefetch", (pointer,), kind)
         # For reading, into the caches of all levels, data.
         builder.call(fetch, [builder.inttoptr(address, pointer), *(flag(value) for value in (0, 3, 1))])

@@ -124,7 +124,9 @@ class Part:
 PARTS = {
     "surfels": Part(
         _surfels,
-        tuple(f"mapping.surfels.{kind}_kernels" for kind in ("cell", "correspondence", "linear", "side", "surfel")),
+        tuple(
+            f"mapping.surfels.{kind}_kernels" for kind in ("hash", "cell", "correspondence", "linear", "side", "surfel")
+        ),
     ),
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
     "alignment": Part(

@@ -14,7 +14,7 @@ from lidarslam.mapping.global_map.normals import estimate_normals
 from lidarslam.mapping.global_map.tile_store import Tile, TileStore, Tiling
 from lidarslam.mapping.global_map.voxel_rows import COUNT, POSITION, VIEW, Layout, Rows
 from lidarslam.mapping.global_map.voxels import Voxels, column_cells, row_cells
-from lidarslam.mapping.surfels.cell_kernels import EMPTY
+from lidarslam.mapping.surfels.hash_kernels import EMPTY
 from lidarslam.mapping.surfels.voxel_hash import key_cells, point_keys, reach_m
 
 # Points waiting to be merged, at least; merging fewer at a time would cost more than it saves.

@@ -1,7 +1,7 @@
 """Compiled loops over points and voxels behind `GlobalMap`.
 
 Rows are float32, their columns those of `mapping.global_map.voxel_rows`; positions are within the voxel. Keys are those
-of `mapping.surfels.cell_kernels`.
+of `mapping.surfels.hash_kernels`.
 """
 
 import math
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import EMPTY, PREFETCHED, cell_of, key_of
+from lidarslam.mapping.surfels.hash_kernels import EMPTY, PREFETCHED, cell_of, key_of
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 
 Keys = NDArray[np.int64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Within
 from lidarslam.mapping.global_map import kernels
 from lidarslam.mapping.global_map.voxel_rows import COUNT, Layout
-from lidarslam.mapping.surfels.cell_kernels import BITS, OFFSET
+from lidarslam.mapping.surfels.hash_kernels import BITS, OFFSET
 
 _MASK = (1 << BITS) - 1
 

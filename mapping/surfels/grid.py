@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import ANY_NUMBER, Shape, State, Stateful
 from lidarslam.mapping.surfels import cell_kernels as kernels
+from lidarslam.mapping.surfels.hash_kernels import FIRST_SIDE, OFFSET, OTHER_SIDE
 from lidarslam.mapping.surfels.side_kernels import belong_to_others, turn_to_sensor
 from lidarslam.mapping.surfels.surfel_kernels import refresh
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC
@@ -72,7 +73,7 @@ class SurfelGrid(Stateful):
         if not len(self._keys) == len(self._sums) == len(self._surfels) == len(self._surfel_counts):
             raise ValueError("the arrays of a surfel grid differ in length")
         # Of the last cell along an axis none is made: its key would be that of no cell.
-        is_cell = (key_cells(self._keys) < kernels.OFFSET - 1).all() and len(np.unique(self._keys)) == len(self._keys)
+        is_cell = (key_cells(self._keys) < OFFSET - 1).all() and len(np.unique(self._keys)) == len(self._keys)
         if not (is_cell and self.cell_m > 0.0 and (self._sums[:, _COUNT] > 0.0).all()):
             raise ValueError("the cells of a surfel grid are no cells, or empty")
         self._hash = VoxelHash()
@@ -101,7 +102,7 @@ class SurfelGrid(Stateful):
         belong_to_others(views, rows, self._cells(), self._surfels, self._surfel_counts, behind)
         turned = np.flatnonzero(behind)
         if len(turned):
-            keys[turned] |= kernels.OTHER_SIDE
+            keys[turned] |= OTHER_SIDE
             rows[turned] = self._hash.insert(keys[turned])
             self._reserve(len(self))
             kernels.link_sides(keys[turned], rows[turned], *self._hash.slots, self._sums)
@@ -204,7 +205,7 @@ class SurfelGrid(Stateful):
         keys = self._keys[:count]
         self._hash.rebuild(keys)
         others = np.flatnonzero(keys < 0)
-        first = keys[others] & kernels.FIRST_SIDE
+        first = keys[others] & FIRST_SIDE
         is_lone = self._hash.find(first) == ABSENT
         if is_lone.any():
             keys[others[is_lone]] = first[is_lone]

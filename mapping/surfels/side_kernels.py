@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import ABSENT, PREFETCHED, Cells, other_side
+from lidarslam.mapping.surfels.cell_kernels import Cells, other_side
+from lidarslam.mapping.surfels.hash_kernels import ABSENT, PREFETCHED
 from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh_one, scratch
 
 # Least squared cosine between the view of a point and those of its cell for one side.

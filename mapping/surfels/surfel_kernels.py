@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.cell_kernels import (
-    OTHER,
-    PREFETCHED,
-    Cells,
-    find_one,
-    home,
-    middle_of,
-    neighbour_key,
-    other_side,
-)
+from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, other_side
+from lidarslam.mapping.surfels.hash_kernels import PREFETCHED, find_one, home, middle_of, neighbour_key
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # Surfels that are computed together: what one needs is prefetched while another is computed.

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels import cell_kernels as kernels
-from lidarslam.mapping.surfels.cell_kernels import ABSENT, Keys, Rows
+from lidarslam.mapping.surfels import hash_kernels as kernels
+from lidarslam.mapping.surfels.hash_kernels import ABSENT, Keys, Rows
 
 __all__ = [
     "ABSENT", "Keys", "Rows", "VoxelHash", "beyond_reach", "cell_keys", "key_cells", "key_steps", "point_keys",

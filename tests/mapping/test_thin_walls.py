@@ -7,8 +7,8 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state.stateful import Saved
-from lidarslam.mapping.surfels.cell_kernels import OTHER_SIDE
 from lidarslam.mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
+from lidarslam.mapping.surfels.hash_kernels import OTHER_SIDE
 from lidarslam.mapping.surfels.matching import Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys

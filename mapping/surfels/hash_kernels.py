@@ -1,0 +1,120 @@
+"""Hash of voxels: the compiled loops of `VoxelHash`.
+
+Open addressing with linear probing: `table_keys` (2^bits,) int64, -1 where free, and `table_rows` (2^bits,) int32.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
+from lidarslam.core.geometry import FloatArray
+
+Keys = NDArray[np.int64]
+Rows = NDArray[np.int32]
+
+ABSENT = -1
+EMPTY = -1
+# A key holds three signed cell coordinates in 63 bits and is linear in them, so that a neighbour's key is the cell's
+# plus a constant. 21 bits reach 52 km at cells of 5 cm; farther points are clipped. The sign bit marks a cell's other
+# side, with the points of a thin wall that were seen from behind.
+BITS = 21
+OFFSET = 1 << (BITS - 1)
+STRIDE_X, STRIDE_Y = 1 << (2 * BITS), 1 << BITS
+ORIGIN = OFFSET * (STRIDE_X + STRIDE_Y + 1)
+# Fibonacci hashing: the multiplier is 2^64 over the golden ratio.
+_MULTIPLIER = np.uint64(11_400_714_819_323_198_485)
+_ABOVE_BITS = 3
+OTHER_SIDE, FIRST_SIDE = np.int64(-(1 << 63)), np.int64((1 << 63) - 1)
+# How many elements ahead loops prefetch.
+PREFETCHED = 16
+
+
+@compiled_part
+def cell_of(coordinate: float) -> int:
+    """Cell along one axis; never the last one, so that no key is `EMPTY`."""
+    return int(min(max(math.floor(coordinate), -OFFSET), OFFSET - 2))
+
+
+@compiled_part
+def key_of(i: int, j: int, k: int) -> int:
+    return i * STRIDE_X + j * STRIDE_Y + k + ORIGIN
+
+
+@compiled_part
+def neighbour_key(key: int, i: int, j: int, k: int) -> int:
+    """Key of the cell at an offset of (i, j, k) cells from a cell or from its other side."""
+    return int((key & FIRST_SIDE) + i * STRIDE_X + j * STRIDE_Y + k)
+
+
+@compiled_part
+def home(key: int, bits: int) -> int:
+    """First slot of a key; cells above one another share a cache line."""
+    column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
+    return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
+
+
+@compiled_part
+def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
+    slot = home(key, bits)
+    while table_keys[slot] != EMPTY:
+        if table_keys[slot] == key:
+            return int(table_rows[slot])
+        slot = (slot + 1) & ((1 << bits) - 1)
+    return ABSENT
+
+
+@compiled
+def find(keys: Keys, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows) -> None:
+    """Write the rows (N,) of keys (N,), `ABSENT` where there is none."""
+    for n in range(len(keys)):
+        rows[n] = find_one(keys[n], bits, table_keys, table_rows)
+
+
+@compiled
+def insert(
+    keys: Keys, begin: int, count: int, most: int, bits: int, table_keys: Keys, table_rows: Rows, rows: Rows
+) -> tuple[int, int]:
+    """Write the rows of keys (N,) from `begin` on, the next ones for new keys, until the hash holds `most`.
+
+    Returns:
+        Number of keys done, and of rows.
+    """
+    for n in range(begin, len(keys)):
+        ahead = home(keys[min(n + PREFETCHED, len(keys) - 1)], bits)
+        prefetch(table_keys, ahead)
+        prefetch(table_rows, ahead)
+        slot = home(keys[n], bits)
+        while table_keys[slot] != EMPTY and table_keys[slot] != keys[n]:
+            slot = (slot + 1) & ((1 << bits) - 1)
+        if table_keys[slot] == EMPTY:
+            if count >= most:
+                return n, count
+            table_keys[slot] = keys[n]
+            table_rows[slot] = count
+            count += 1
+        rows[n] = table_rows[slot]
+    return len(keys), count
+
+
+@compiled_part
+def key_at(point: FloatArray, scale: float) -> int:
+    """Key of the cell of a point (3,), of so many cells a metre."""
+    return key_of(cell_of(point[0] * scale), cell_of(point[1] * scale), cell_of(point[2] * scale))
+
+
+@compiled
+def point_keys(points: FloatArray, cell_m: float, keys: Keys) -> None:
+    """Write the keys (N,) of the cells that points (N, 3) lie in."""
+    scale = 1.0 / cell_m
+    for n in range(len(points)):
+        keys[n] = key_at(points[n], scale)
+
+
+@compiled_part
+def middle_of(key: int) -> tuple[float, float, float]:
+    """Centre of a cell, in units of cells."""
+    mask = (1 << BITS) - 1
+    i, j, k = (key >> (2 * BITS)) & mask, (key >> BITS) & mask, key & mask
+    return i - OFFSET + 0.5, j - OFFSET + 0.5, k - OFFSET + 0.5
