@@ -17,6 +17,8 @@ from lidarslam.mapping.surfels.surfel_kernels import is_steep, outdated, refresh
 
 # Least squared cosine between the view of a point and those of its cell for one side.
 _SAME_VIEW = 0.5
+# Columns of surfels: where the normal begins, and whether it is one of a plane.
+_NORMAL, _IS_PLANE = 3, 14
 
 
 @compiled
@@ -28,11 +30,19 @@ def belong_to_others(
 
     Outdated surfels (M, 15) are computed on the way.
     """
-    work = scratch()
+    work, asked = scratch(), np.empty(len(rows), dtype=np.int32)
+    count = 0
     for n in range(len(rows)):
         prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
-        row, chosen[n] = rows[n], False
-        x, y, z = float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
+        chosen[n] = False
+        asked[count] = n
+        count += other_side(rows[n], cells.sums) >= 0 or not _looks_alike(views[n], cells.sums[rows[n]])
+    for k in range(count):
+        ahead = rows[asked[min(k + PREFETCHED, count - 1)]]
+        prefetch(surfels[:, _IS_PLANE:], ahead)
+        prefetch(surfels[:, _NORMAL:], ahead)
+        n = asked[k]
+        row, x, y, z = rows[n], float(views[n, 0]), float(views[n, 1]), float(views[n, 2])
         other = other_side(row, cells.sums)
         if other >= 0:
             if outdated(row, cells.sums, counts):
@@ -41,14 +51,21 @@ def belong_to_others(
                 refresh_one(other, cells, surfels, counts, work)
             chosen[n] = _facing(other, x, y, z, cells, surfels) > _facing(row, x, y, z, cells, surfels)
             continue
-        u, v, w = float(cells.sums[row, 12]), float(cells.sums[row, 13]), float(cells.sums[row, 14])
-        along, squared = x * u + y * v + z * w, x * x + y * y + z * z
-        if along < 0.0 or along * along < _SAME_VIEW * squared * (u * u + v * v + w * w):
-            # An outdated plane is still the same plane; a cell without a plane may have one by now.
-            if not surfels[row, 14] > 0.0 and outdated(row, cells.sums, counts):
-                refresh_one(row, cells, surfels, counts, work)
-            p = surfels[row]
-            chosen[n] = p[14] > 0.0 and is_steep(-(x * p[3] + y * p[4] + z * p[5]), math.sqrt(squared))
+        # An outdated plane is still the same plane; a cell without a plane may have one by now.
+        if not surfels[row, _IS_PLANE] > 0.0 and outdated(row, cells.sums, counts):
+            refresh_one(row, cells, surfels, counts, work)
+        p = surfels[row]
+        behind = -(x * p[_NORMAL] + y * p[_NORMAL + 1] + z * p[_NORMAL + 2])
+        chosen[n] = p[_IS_PLANE] > 0.0 and is_steep(behind, math.sqrt(x * x + y * y + z * z))
+
+
+@compiled_part
+def _looks_alike(view: NDArray[np.float32], sums: NDArray[np.float32]) -> bool:
+    """Whether a point's view (3,) is near the mean view of its cell, so that both are of one side."""
+    x, y, z = float(view[0]), float(view[1]), float(view[2])
+    u, v, w = float(sums[12]), float(sums[13]), float(sums[14])
+    along, squared = x * u + y * v + z * w, x * x + y * y + z * z
+    return not (along < 0.0 or along * along < _SAME_VIEW * squared * (u * u + v * v + w * w))
 
 
 @compiled

@@ -117,7 +117,7 @@ def test_where_no_folder_will_do_nothing_is_kept() -> None:
 
 
 def test_numba_may_be_switched_off() -> None:
-    code = "from lidarslam.core.thinning import central_per_cell; import numpy as np; print(central_per_cell(np.eye(3), 9.0))"
+    code = "from lidarslam.core.thinning import central_per_cell as f; import numpy as np; print(f(np.eye(3), 9.0))"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[2]", done.stderr
