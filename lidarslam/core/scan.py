@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Annotated, Any, Protocol
 
 import numpy as np
@@ -81,7 +82,7 @@ class Scan:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def middle_offset_s(self) -> float:
         """Seconds from the stamp to the middle of the sweep; 0 where points have no times."""
         if self.time_offsets is None or not len(self):

@@ -1,6 +1,7 @@
 """Sampling of a scan: points that are inserted into the map, and keypoints that are registered to it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -43,13 +44,13 @@ class SampledScan:
         """Whether there are too few keypoints for a registration: a covered sensor, or open country."""
         return len(self.keypoints) < MIN_CORRESPONDENCES
 
-    @property
+    @cached_property
     def seen_until_s(self) -> float:
         """Time from the stamp to the last point; 0 when the scan is compensated already."""
         times = self.sweep.times
         return 0.0 if times is None or not len(times) else max(0.0, float(times.max()))
 
-    @property
+    @cached_property
     def seen_from_s(self) -> float:
         """Time from the first point to the stamp; 0 when the scan is compensated already."""
         times = self.sweep.times

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -60,12 +61,12 @@ class Attempt:
         """(4, 4) the registered pose; the predicted one without a registration."""
         return (self.registration or self.prediction).T_world_lidar
 
-    @property
+    @cached_property
     def correction(self) -> FloatArray:
         """(6,) from the predicted pose to the registered one."""
         return log(inverse(self.prediction.T_world_lidar) @ self.T_world_lidar)
 
-    @property
+    @cached_property
     def has_jumped(self) -> bool:
         """Whether the correction exceeds every motion that the prediction allows for."""
         sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])

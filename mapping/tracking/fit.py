@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
@@ -106,7 +105,9 @@ def directional_support(normals: FloatArray, distances: FloatArray) -> float:
     information, supported, share = translation_information(normals, distances)
     ridge = _RIDGE * float(np.trace(information)) * np.eye(3)
     # The ridge is supported as well as the whole.
-    return float(eigh(supported + share * ridge, information + ridge, eigvals_only=True)[0])
+    root = np.linalg.cholesky(information + ridge)
+    half = np.linalg.solve(root, supported + share * ridge)
+    return float(np.linalg.eigvalsh(np.linalg.solve(root, half.T))[0])
 
 
 def translation_information(normals: FloatArray, distances: FloatArray) -> tuple[FloatArray, FloatArray, float]:
