@@ -180,7 +180,7 @@ def _write_squared_ranges(points: FloatArray, squared: FloatArray) -> None:
 
 @compiled
 def _find_valid(points: FloatArray, valid: NDArray[np.bool_]) -> int:
-    """Write which points (N,) are neither at the origin, nor too far, nor no number; return how many are none of it."""
+    """Write which points (N, 3) are valid: finite, not at the origin, within 10 km; return how many are not."""
     dropped = 0
     for n in range(len(points)):
         x, y, z = abs(points[n, 0]), abs(points[n, 1]), abs(points[n, 2])

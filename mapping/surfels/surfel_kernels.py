@@ -79,9 +79,7 @@ def scratch() -> Scratch:
 
 
 @compiled_part
-def refresh_one(
-    row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32], work: Scratch
-) -> None:  # fmt: skip
+def refresh_one(row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32], work: Scratch) -> None:
     """Compute the surfel of one cell."""
     counts[row] = cells.sums[row, 0]
     _prefetch_around(row, cells)
@@ -91,7 +89,7 @@ def refresh_one(
 
 @compiled_part
 def _prefetch_around(row: int, cells: Cells) -> None:
-    """Prefetch what `_find_around` reads; the three cells above one another are nearly always in one place."""
+    """Prefetch the slots that `_find_around` reads; those of cells above one another mostly share a cache line."""
     key = cells.keys[row]
     for a in range(-1, 2):
         for b in range(-1, 2):

@@ -12,9 +12,10 @@ import numba
 import numpy as np
 import pytest
 from numba.core.caching import InTreeCacheLocator, UserWideCacheLocator
+from numpy.typing import NDArray
 
 from lidarslam.core import compiled as compiled_module
-from lidarslam.core.compiled import compiled, is_compiled
+from lidarslam.core.compiled import compiled, is_compiled, prefetch
 
 SOURCE = """
 from lidarslam.core.compiled import compiled
@@ -121,6 +122,24 @@ def test_numba_may_be_switched_off() -> None:
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "[0]", done.stderr
+
+
+@compiled
+def prefetched(values: NDArray[np.float64], rows: NDArray[np.int64]) -> float:
+    total = 0.0
+    for row in rows:
+        prefetch(values, row)
+        if 0 <= row < len(values):
+            total += values[row, 1]
+    return total
+
+
+@pytest.mark.parametrize("step", [1, 2, -1])
+def test_any_row_of_any_array_may_be_prefetched(step: int) -> None:
+    """One that is none, too: nothing is read but into the cache."""
+    values = np.arange(60.0).reshape(10, 6)[::step, 1:]
+    rows = np.array([0, 3, -1, 10, 1 << 40, -(1 << 40), 4])
+    assert prefetched(values, rows) == values[[0, 3, 4], 1].sum()
 
 
 @pytest.mark.parametrize("callee", [CALLEE, PART])
