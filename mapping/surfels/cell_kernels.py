@@ -22,10 +22,11 @@ from lidarslam.mapping.surfels.hash_kernels import (
     Rows,
     cell_of,
     find_one,
-    home,
     key_at,
     key_of,
     middle_of,
+    prefetch_around,
+    prefetch_slot,
 )
 
 Floats = NDArray[np.float32]
@@ -135,9 +136,8 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
     """Write the rows (N,) of the cells of points (N, 3), else of the nearest around; or `ABSENT`."""
     scale, last = 1.0 / cells.cell_m, len(points) - 1
     for n in range(len(points)):
-        ahead = home(key_at(points[min(n + PREFETCHED, last)], scale), cells.bits)
-        prefetch(cells.table_keys, ahead)
-        prefetch(cells.table_rows, ahead)
+        ahead = key_at(points[min(n + PREFETCHED, last)], scale)
+        prefetch_slot(ahead, cells.bits, cells.table_keys, cells.table_rows)
         x, y, z = points[n, 0] * scale, points[n, 1] * scale, points[n, 2] * scale
         i, j, k = cell_of(x), cell_of(y), cell_of(z)
         row = find_one(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
@@ -148,11 +148,7 @@ def look_up(points: FloatArray, cells: Cells, rows: Rows) -> None:
 def _nearest(i: int, j: int, k: int, x: float, y: float, z: float, cells: Cells) -> int:
     """Row of the occupied cell around an empty one whose mean is nearest to a point, all in units of cells."""
     nearest, least = ABSENT, np.inf
-    for a in range(i - 1, i + 2):
-        for b in range(j - 1, j + 2):
-            slot = home(key_of(a, b, k), cells.bits)
-            prefetch(cells.table_keys, slot)
-            prefetch(cells.table_rows, slot)
+    prefetch_around(key_of(i, j, k), cells.bits, cells.table_keys, cells.table_rows)
     for a in range(i - 1, i + 2):
         for b in range(j - 1, j + 2):
             for c in range(k - 1, k + 2):

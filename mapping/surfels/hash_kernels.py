@@ -49,7 +49,7 @@ def neighbour_key(key: int, i: int, j: int, k: int) -> int:
 
 
 @compiled_part
-def home(key: int, bits: int) -> int:
+def _home(key: int, bits: int) -> int:
     """First slot of a key; cells above one another share a cache line."""
     column = np.uint64(key >> _ABOVE_BITS) * _MULTIPLIER
     return int(column >> np.uint64(64 - bits)) ^ (key & ((1 << _ABOVE_BITS) - 1))
@@ -57,12 +57,28 @@ def home(key: int, bits: int) -> int:
 
 @compiled_part
 def find_one(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> int:
-    slot = home(key, bits)
+    slot = _home(key, bits)
     while table_keys[slot] != EMPTY:
         if table_keys[slot] == key:
             return int(table_rows[slot])
         slot = (slot + 1) & ((1 << bits) - 1)
     return ABSENT
+
+
+@compiled_part
+def prefetch_slot(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> None:
+    """Prefetch the first slot of a key."""
+    slot = _home(key, bits)
+    prefetch(table_keys, slot)
+    prefetch(table_rows, slot)
+
+
+@compiled_part
+def prefetch_around(key: int, bits: int, table_keys: Keys, table_rows: Rows) -> None:
+    """Prefetch the slots of a cell and its 26 neighbours; those of cells above one another mostly share a line."""
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            prefetch_slot(neighbour_key(key, i, j, 0), bits, table_keys, table_rows)
 
 
 @compiled
@@ -82,10 +98,8 @@ def insert(
         Number of keys done, and of rows.
     """
     for n in range(begin, len(keys)):
-        ahead = home(keys[min(n + PREFETCHED, len(keys) - 1)], bits)
-        prefetch(table_keys, ahead)
-        prefetch(table_rows, ahead)
-        slot = home(keys[n], bits)
+        prefetch_slot(keys[min(n + PREFETCHED, len(keys) - 1)], bits, table_keys, table_rows)
+        slot = _home(keys[n], bits)
         while table_keys[slot] != EMPTY and table_keys[slot] != keys[n]:
             slot = (slot + 1) & ((1 << bits) - 1)
         if table_keys[slot] == EMPTY:

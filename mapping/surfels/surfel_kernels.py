@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.cell_kernels import OTHER, Cells, other_side
-from lidarslam.mapping.surfels.hash_kernels import PREFETCHED, find_one, home, middle_of, neighbour_key
+from lidarslam.mapping.surfels.hash_kernels import PREFETCHED, find_one, middle_of, neighbour_key, prefetch_around
 from lidarslam.mapping.surfels.symmetric import write_eigenvalues, write_eigenvector
 
 # Surfels that are computed together: what one needs is prefetched while another is computed.
@@ -48,7 +48,7 @@ def refresh(rows: NDArray[np.int32], cells: Cells, surfels: FloatArray, counts: 
         row = rows[n]
         if row >= 0 and outdated(row, cells.sums, counts):
             counts[row] = cells.sums[row, 0]
-            _prefetch_around(row, cells)
+            prefetch_around(cells.keys[row], cells.bits, cells.table_keys, cells.table_rows)
             waiting[count] = row
             count += 1
         if count == _TOGETHER or n == len(rows) - 1:
@@ -82,20 +82,9 @@ def scratch() -> Scratch:
 def refresh_one(row: int, cells: Cells, surfels: FloatArray, counts: NDArray[np.float32], work: Scratch) -> None:
     """Compute the surfel of one cell."""
     counts[row] = cells.sums[row, 0]
-    _prefetch_around(row, cells)
+    prefetch_around(cells.keys[row], cells.bits, cells.table_keys, cells.table_rows)
     _find_around(row, cells, work[0])
     _compute(row, work[0], cells, surfels, work)
-
-
-@compiled_part
-def _prefetch_around(row: int, cells: Cells) -> None:
-    """Prefetch the slots that `_find_around` reads; those of cells above one another mostly share a cache line."""
-    key = cells.keys[row]
-    for a in range(-1, 2):
-        for b in range(-1, 2):
-            slot = home(neighbour_key(key, a, b, 0), cells.bits)
-            prefetch(cells.table_keys, slot)
-            prefetch(cells.table_rows, slot)
 
 
 @compiled_part
