@@ -118,10 +118,11 @@ def test_where_no_folder_will_do_nothing_is_kept() -> None:
 
 
 def test_numba_may_be_switched_off() -> None:
-    code = "from lidarslam.core.thinning import central_per_cell as f; import numpy as np; print(f(np.eye(3), 9.0))"
+    thinned = "one_per_cell(np.eye(3), 9.0), central_per_cell(np.eye(3), 9.0)"
+    code = f"from lidarslam.core.thinning import *; import numpy as np; print({thinned})"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "[0]", done.stderr
+    assert done.stdout.strip() == "[2] [0]", done.stderr
 
 
 @compiled
