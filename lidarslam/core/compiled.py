@@ -81,9 +81,9 @@ def _prefetch(_context: Any, array: Any, _row: Any) -> Any:
 prefetch: Callable[[NDArray[Any], int], None] = (
     (lambda _array, _row: None) if _config.DISABLE_JIT else _intrinsic(_prefetch)
 )
-"""Begin to load a row of an array into the processor's cache, for compiled functions that will read it soon.
+"""Prefetch a row of an array into the processor's cache: a hint, for compiled functions alone.
 
-Loops over rows in no order wait for one row at a time otherwise, as what they do depends on what they find there.
+Any row number will do, also of no row. Of random accesses that depend on what is read, the processor overlaps few.
 """
 
 

@@ -36,7 +36,7 @@ def belong_to_others(
         prefetch(cells.sums, rows[min(n + PREFETCHED, len(rows) - 1)])
         chosen[n] = False
         asked[count] = n
-        count += other_side(rows[n], cells.sums) >= 0 or not _looks_alike(views[n], cells.sums[rows[n]])
+        count += other_side(rows[n], cells.sums) >= 0 or not _is_seen_alike(views[n], cells.sums[rows[n]])
     for k in range(count):
         ahead = rows[asked[min(k + PREFETCHED, count - 1)]]
         prefetch(surfels[:, _IS_PLANE:], ahead)
@@ -60,7 +60,7 @@ def belong_to_others(
 
 
 @compiled_part
-def _looks_alike(view: NDArray[np.float32], sums: NDArray[np.float32]) -> bool:
+def _is_seen_alike(view: NDArray[np.float32], sums: NDArray[np.float32]) -> bool:
     """Whether a point's view (3,) is near the mean view of its cell, so that both are of one side."""
     x, y, z = float(view[0]), float(view[1]), float(view[2])
     u, v, w = float(sums[12]), float(sums[13]), float(sums[14])
