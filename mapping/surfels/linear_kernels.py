@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from lidarslam.core.compiled import compiled
+from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
 
@@ -52,7 +52,7 @@ def linearise(
 
 @compiled
 def accumulate(
-    rows: FloatArray, squared_scale: float, noise_m: float, gate_m: float, total: FloatArray
+    rows: FloatArray, squared_scale: float, noise_m: float, gate_m: float, unknown: FloatArray, total: FloatArray
 ) -> tuple[float, float, float]:
     """Add the weighted products of residuals (M, 10) up, with Geman and McClure's weights over the variances.
 
@@ -61,6 +61,8 @@ def accumulate(
         squared_scale: of the robust kernel, to which the variance of each surface is added.
         noise_m: standard deviation of a range.
         gate_m: residuals beyond do not count.
+        unknown: (3, 6, 6) coefficients of the pose's covariance t seconds from the stamp, a polynomial in t; the
+            variance that it propagates to a residual widens the kernel.
         total: (13, 13), zero, written: the Hessian of pose and velocity, and in the last column the gradient.
 
     Returns:
@@ -74,7 +76,7 @@ def accumulate(
         for i in range(size):
             row, out = rows[begin + i], block[i]
             r, variance, t = row[RESIDUAL], row[THICKNESS] * row[THICKNESS], row[TIME]
-            kernel = 1.0 + r * r / (squared_scale + variance)
+            kernel = 1.0 + r * r / (squared_scale + variance + _propagated(row, t, unknown))
             weight = 0.0 if abs(r) > gate_m else 1.0 / (kernel * kernel * (variance + noise_m * noise_m))
             root = math.sqrt(weight)
             for j in range(6):
@@ -86,3 +88,15 @@ def accumulate(
             times += t * t
         total += np.dot(block[:size].T, block[:size])
     return weights, tilts, times / max(len(rows), 1)
+
+
+@compiled_part
+def _propagated(row: FloatArray, t: float, unknown: FloatArray) -> float:
+    """The variance of a residual (10,) by the covariance of the pose t seconds from the stamp, as for `accumulate`."""
+    variance = 0.0
+    for i in range(6):
+        part = 0.0
+        for j in range(6):
+            part += row[j] * (unknown[0, i, j] + t * (unknown[1, i, j] + t * unknown[2, i, j]))
+        variance += row[i] * part
+    return variance

@@ -31,6 +31,8 @@ _RANGE_NOISE_M = 0.02
 _SCALE_PER_MEDIAN, _LEAST_SCALE = 1.5, 0.03
 # Residuals beyond this, in cells, are outliers.
 _GATE = 6.0
+# What the prediction leaves open widens the kernel, less at each iteration.
+_NARROWING = 0.8
 # Errors of neighbouring points are correlated: so many count as one. From true errors on simulated recordings.
 _CORRELATION = 25.0
 # A velocity that differs by less than this over the interval needs no second compensation.
@@ -68,6 +70,7 @@ def register(
     T_world_lidar, velocity, iterations = prediction.T_world_lidar, prediction.velocity, 0
     times = sweep.times if with_velocity and sweep.times is not None else np.empty(0)
     coarse, most = _PATIENT_ITERATIONS if patient else _ITERATIONS
+    unknown = prediction.covariance
     try:
         prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
@@ -75,7 +78,7 @@ def register(
             for _ in range(coarse if level else most - iterations):
                 points = sweep.compensated(velocity)
                 matcher.match(transform_points(T_world_lidar, points), T_world_lidar)
-                system = _System.of(points, times, T_world_lidar, matcher.surfaces, cell_m)
+                system = _System.of(points, times, T_world_lidar, matcher.surfaces, cell_m, unknown)
                 if system is None:
                     return None
                 away = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
@@ -83,6 +86,7 @@ def register(
                 T_world_lidar = T_world_lidar @ exp(solution.step[:6])
                 velocity = velocity + solution.step[6:]
                 iterations += 1
+                unknown = _NARROWING**iterations * solution.covariance()
                 if _has_converged(solution.step, level, cell_m, system.lever_m):
                     break
         covariance = solution.covariance()
@@ -140,11 +144,14 @@ class _System:
 
     @classmethod
     def of(
-        cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, cell_m: float
-    ) -> "_System | None":
+        cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, cell_m: float,
+        unknown: FloatArray,
+    ) -> "_System | None":  # fmt: skip
         """Of points (N, 3) with times (N,), or none to keep the velocity; None where too few have a surface.
 
-        The Jacobian with the velocity is `t` times that with the pose, to first order.
+        The Jacobian with the velocity is `t` times that with the pose, to first order. The kernel is as wide as the
+        covariance (12, 12) of what is still unknown propagates to each residual: the few points that constrain a
+        direction are no outliers while it is unknown, however well all others fit.
         """
         rows = np.empty((3 * len(points), COLUMNS))
         count, squared = linearise(points, times, np.ascontiguousarray(T_world_lidar), surfaces, rows)
@@ -154,7 +161,9 @@ class _System:
         middle = count // 2  # the upper median, in half the time of NumPy's
         median_m = float(np.partition(np.abs(rows[:, RESIDUAL]), middle)[middle])
         scale = max(_SCALE_PER_MEDIAN * median_m, _LEAST_SCALE * cell_m)
-        weight, tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, total)
+        crossed = unknown[:6, 6:]
+        of_time = np.array([unknown[:6, :6], crossed + crossed.T, unknown[6:, 6:]])
+        weight, tilt, squared_time = accumulate(rows, scale**2, _RANGE_NOISE_M, _GATE * cell_m, of_time, total)
         degeneracy = degenerate_directions(total[:6, :6], tilt, weight, float(np.sqrt(squared / count)))
         return cls(total[:12, :12] / _CORRELATION, total[:12, 12] / _CORRELATION, degeneracy, squared_time)
 

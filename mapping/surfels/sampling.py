@@ -13,12 +13,14 @@ from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
+from lidarslam.mapping.surfels.stability import constraining_points
 
 # Fewer keypoints, or correspondences of them, make no pose.
 MIN_CORRESPONDENCES = MIN_POINTS
 # Spacing of the points that go into the map, and of the keypoints, in cells.
 _MAP_SPACING = 0.5
 _KEYPOINT_SPACING = 2.5
+_MOST_CONSTRAINING = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,12 @@ class SampledScan:
         """Time from the first point to the stamp; 0 when the scan is compensated already."""
         times = self.sweep.times
         return 0.0 if times is None or not len(times) else max(0.0, -float(times.min()))
+
+    @cached_property
+    def constraining(self) -> Sweep:
+        """The points that constrain what few others do, whether they are keypoints or not."""
+        found = constraining_points(self.sweep.points, self.elevations, self.cell_m, _MOST_CONSTRAINING)
+        return self.sweep.take(found)
 
     def is_followed_by(self, following: "SampledScan") -> bool:
         """Whether another sweep begins within a sweep's duration after this one's end."""

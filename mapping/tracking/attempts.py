@@ -19,6 +19,7 @@ from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import Budget, Steps, complete
 from lidarslam.mapping.tracking.fit import NO_FIT, Fit
 from lidarslam.mapping.tracking.start_poses import (
+    SCORED_POINTS,
     best_starts,
     best_supported,
     best_velocity,
@@ -103,7 +104,9 @@ class ScanMatcher:
             T = last.T_world_lidar.copy()
             T[:3, :3] = rotation[:3, :3]
             starts.append(positions_around(T, up, radius_m, _DISPLACED_CELLS * self._map.cell_m))
-        points, attempts = self.scan.keypoints.compensated(last.velocity), []
+        even, few = self._some(SCORED_POINTS), self.scan.constraining
+        points = np.concatenate([part.compensated(last.velocity) for part in (even, few)])
+        attempts = []
         best = yield from best_supported(points, np.concatenate(starts), self._map)
         for start in {start.tobytes(): start for start in best}.values():
             yield
@@ -156,7 +159,7 @@ class ScanMatcher:
         """Attempts with status ok from the best of the poses (K, 4, 4)."""
         points, rough, attempts = self.scan.keypoints.compensated(prediction.velocity), [], []
         for start in (yield from best_starts(points, starts, self._map)):
-            rough.append(self._attempt_at(start, prediction, self._few))
+            rough.append(self._attempt_at(start, prediction, self._some(_FEW_POINTS)))
             yield
         least = _LIKELY * max((attempt.quality for attempt in rough), default=0.0)
         for attempt in rough:
@@ -165,11 +168,10 @@ class ScanMatcher:
                 yield
         return [attempt for attempt in attempts if attempt.status is Status.OK]
 
-    @property
-    def _few(self) -> Sweep:
-        """Some of the keypoints."""
+    def _some(self, count: int) -> Sweep:
+        """About as many of the keypoints."""
         keypoints = self.scan.keypoints
-        return keypoints.take(np.arange(0, len(keypoints), max(1, len(keypoints) // _FEW_POINTS)))
+        return keypoints.take(np.arange(0, len(keypoints), max(1, len(keypoints) // count)))
 
     def _attempt_at(self, T_world_lidar: FloatArray, prediction: Prediction, keypoints: Sweep | None = None) -> Attempt:
         """An attempt from a pose (4, 4) that is not the predicted one."""

@@ -9,7 +9,7 @@ from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.fit import translation_information
 
 # Points that score a start, and starts that are registered.
-_SCORED_POINTS = 600
+SCORED_POINTS = 600
 _BEST = 3
 # Distance, in finest cells, at which a point has half the weight.
 _HALF_CELLS = 2.0
@@ -31,7 +31,7 @@ def turned_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float)
 
 def best_starts(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> Steps[FloatArray]:
     """The few of the poses (K, 4, 4) at which compensated points (N, 3) of the LiDAR frame are nearest to the map."""
-    few = points[:: max(1, len(points) // _SCORED_POINTS)]
+    few = points[:: max(1, len(points) // SCORED_POINTS)]
     scores = []
     for start in starts:
         scores.append(start_score(few, start, surfel_map))
@@ -51,17 +51,16 @@ def positions_around(T_world_lidar: FloatArray, up: FloatArray, radius_m: float,
 
 
 def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> Steps[FloatArray]:
-    """The few of neighbouring poses (K, 4, 4) with the best directional support of compensated points (N, 3).
+    """The few of neighbouring poses (K, 4, 4) with the best directional support of some compensated points (N, 3).
 
     Directions of translation have equal weight, however few points constrain them: `tr(A^-1 B)` with A the mean over
     the poses of the sums of `n n^T` over the matched points, and B the sum with inlier weights.
     """
-    few = points[:: max(1, len(points) // _SCORED_POINTS)]
     # Rotations that are equal, as without an odometry, make every pose come twice.
     distinct, inverse = np.unique(starts.reshape(-1, 16), axis=0, return_inverse=True)
     sums = []
     for start in distinct.reshape(-1, 4, 4):
-        sums.append(_information(few, start, surfel_map))
+        sums.append(_information(points, start, surfel_map))
         yield
     information, supported = (np.array(parts)[inverse.reshape(-1)] for parts in zip(*sums, strict=True))
     mean = np.mean(information, axis=0)
@@ -72,7 +71,7 @@ def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap
 
 def best_velocity(sweep: Sweep, velocities: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> FloatArray:
     """The one of the velocities (K, 6) whose compensated sweep is nearest to the map."""
-    few = sweep.take(np.arange(0, len(sweep), max(1, len(sweep) // _SCORED_POINTS)))
+    few = sweep.take(np.arange(0, len(sweep), max(1, len(sweep) // SCORED_POINTS)))
     scores = [start_score(few.compensated(velocity), T_world_lidar, surfel_map) for velocity in velocities]
     return np.asarray(velocities[int(np.argmax(scores))], dtype=np.float64)
 

@@ -13,9 +13,12 @@ from lidarslam.odometry.images.sweep_images import SweepImages
 # Mean squared Jacobian of the points along a direction, from 0 to about 1. Where the end of a tunnel is in view it is
 # 0.002 and more, in an even one 0.0006 and less.
 _LEAST_SHARE = 0.001
+# Standard deviation of a normal at one metre, radians, by a centimetre of range noise over a patch; it falls with the
+# range. Along a direction with no more than this share of it, the constraint is that noise.
+_TILT_AT_1_M, _NOISE_FACTOR = 0.09, 1.25
 # Among leaves and wires most points have no normal, and a network that sees these as well knows more than alignment:
 # unless so many have one, nothing is taken for degenerate.
-_MOST = 0.8
+_MOST = 0.7
 
 
 def find_degeneracy(information: FloatArray, inliers: int, images: SweepImages) -> Degeneracy:
@@ -24,14 +27,15 @@ def find_degeneracy(information: FloatArray, inliers: int, images: SweepImages) 
     Args:
         information: (6, 6) sum over the inliers of squared Jacobians, rotation first.
         inliers: how many.
-        images: of the current sweep; its median range is the lever of rotations.
+        images: of the current sweep; its median range is the lever of rotations, its ranges the noise of normals.
     """
     if images.share_with_normal() < _MOST:
         return Degeneracy(np.empty((0, 6)), 1.0)
     lever_m = images.median_range_m()
     scale = lever_scale(lever_m)
     shares, axes = np.linalg.eigh(information / np.outer(scale, scale) / max(inliers, 1))
-    return Degeneracy(np.ascontiguousarray(axes[:, shares < _LEAST_SHARE].T), lever_m)
+    least = max(_LEAST_SHARE, _NOISE_FACTOR * _TILT_AT_1_M**2 * images.mean_inverse_square_range())
+    return Degeneracy(np.ascontiguousarray(axes[:, shares < least].T), lever_m)
 
 
 def replaced_along(T_prev_curr: FloatArray, expected: FloatArray, degeneracy: Degeneracy) -> FloatArray:

@@ -42,12 +42,18 @@ class Patch(NamedTuple):
     min_neighbours: int = 6  # points that are needed, the pixel's own included
     max_flatness: float = 0.1  # smallest eigenvalue of the scatter over the middle one, at most
     min_spread: float = 0.02  # middle eigenvalue over the largest one, at least
+    # standard deviation of the points across the patch, at least: one as narrow as the noise of ranges spans a plane of
+    # rays, which moves with the sensor
+    narrowest_m: float = 0.0
 
 
 PATCHES = (Patch(rows=1, columns=4, gate_m=0.5), Patch(rows=1, columns=8, gate_m=2.0))
 """The first and the second try in images of 16 rows."""
 # A patch wider than high takes its tilt from the noise of a ring, and ground that seems tilted holds alignment back.
-FINE_PATCHES = (Patch(rows=2, columns=1, gate_m=0.5), Patch(rows=2, columns=2, gate_m=2.0))
+FINE_PATCHES = (
+    Patch(rows=2, columns=1, gate_m=0.5, narrowest_m=0.03),
+    Patch(rows=2, columns=2, gate_m=2.0, narrowest_m=0.03),
+)
 """The same in finer images."""
 
 
@@ -184,6 +190,7 @@ def _fit(size: int, work: Floats, patch: Patch, found: Floats) -> None:
     """
     least_count, nearest_m2 = np.float32(patch.min_neighbours), np.float32(patch.nearest_m**2)
     max_flatness, min_spread = np.float32(patch.max_flatness), np.float32(patch.min_spread)
+    narrowest_m = np.float32(patch.narrowest_m)
     for k in range(size):
         x, y, z, distance = work[k], work[_STRIDE + k], work[2 * _STRIDE + k], work[3 * _STRIDE + k]
         count, sx, sy, sz = work[4 * _STRIDE + k], work[6 * _STRIDE + k], work[7 * _STRIDE + k], work[8 * _STRIDE + k]
@@ -211,6 +218,7 @@ def _fit(size: int, work: Floats, patch: Patch, found: Floats) -> None:
         largest = half + np.sqrt(left if left > _ZERO else _ZERO)
         middle = product / (largest if largest > _TINY else _ONE)
         narrowest = _NARROWEST * distance
+        narrowest = narrowest if narrowest > narrowest_m else narrowest_m
         is_plane = is_plane and s <= max_flatness * middle and middle >= min_spread * largest
         is_plane = is_plane and middle * size_m2 > count * narrowest * narrowest
         # The rows of A - s I are at right angles to the normal: the longest of their cross products is along it.

@@ -24,6 +24,8 @@ _ROWS = (64, 48, 32)
 _FILLED, _FILLED_BY_RINGS = 0.8, 0.5
 # Columns that a rotating sensor fills at least. The points of others do not lie in rows.
 _SEEN_COLUMNS = 0.5
+# Pixels nearer than this, of which fine patches are too narrow, and the difference of ranges on one surface.
+_NEAR_M, _SAME_M = 5.0, 0.2
 # Columns from one to the next that a median is taken of.
 _MEDIAN_STEP = 4
 
@@ -55,6 +57,13 @@ class SweepImages:
         squares = x * x + y * y + z * z
         seen = squares[squares > 0.0]
         return float(np.sqrt(np.partition(seen, (len(seen) - 1) // 2)[(len(seen) - 1) // 2])) if len(seen) else 0.0
+
+    def mean_inverse_square_range(self) -> float:
+        """Of the pixels of every fourth column that have a normal, 1/m^2; 0 when there are none."""
+        x, y, z = self.points[:, :, ::_MEDIAN_STEP]
+        u, v, w = self.normals[:, :, ::_MEDIAN_STEP]
+        squares = (x * x + y * y + z * z)[u * u + v * v + w * w > 0.0]
+        return float((1.0 / squares).mean()) if len(squares) else 0.0
 
     def with_normal(self) -> int:
         """How many pixels have a normal."""
@@ -122,8 +131,9 @@ class Imager(Stateful):
             return ScanImages(coarse, coarse, self._R_image_lidar)
         fine = ImageGrid(self._alignment_rows, grid.columns, grid.elevation_low, grid.elevation_high)
         shown = project(points, [grid, fine])
-        images = _images(shown[0], grid, scan), _images(shown[1], fine, scan, is_fine=True)
-        return ScanImages(*images, self._R_image_lidar)
+        network, alignment = _images(shown[0], grid, scan), _images(shown[1], fine, scan, is_fine=True)
+        _fill_near(alignment.normals, shown[1].image[3], network.normals, shown[0].image[3])
+        return ScanImages(network, alignment, self._R_image_lidar)
 
     def _grid_and_points(self, scan: Scan) -> tuple[ImageGrid, FloatArray]:
         """The grid, and the points (N, 3) of the scan in the images' axes."""
@@ -148,6 +158,19 @@ def _images(projection: Projection, grid: ImageGrid, scan: Scan, is_fine: bool =
         np.copyto(offsets, seconds, where=projection.index >= 0, casting="same_kind")
     normals = surface_normals(projection.image, FINE_PATCHES if is_fine else PATCHES)
     return SweepImages(projection.image[:3], normals, offsets, grid.elevation_low, grid.elevation_high)
+
+
+def _fill_near(normals: Floats, ranges: Floats, wider: Floats, wider_ranges: Floats) -> None:
+    """Write normals (3, H, W) of near pixels without one, from an image of fewer rows (3, h, W) with wider patches.
+
+    Ranges are (H, W) and (h, W).
+    """
+    height, rows = len(ranges), len(wider_ranges)
+    above = np.arange(height) * rows // height
+    missing = (normals[0] == 0.0) & (normals[1] == 0.0) & (normals[2] == 0.0) & (ranges > 0.0) & (ranges < _NEAR_M)
+    missing &= np.abs(wider_ranges.take(above, axis=0) - ranges) < _SAME_M
+    for normal, other in zip(normals, wider, strict=True):
+        np.copyto(normal, other.take(above, axis=0), where=missing)
 
 
 def rows_of_sensor(points: Points, rings: NDArray[np.int32] | None, grid: ImageGrid) -> int:

@@ -134,6 +134,9 @@ class LearnedOdometry(Stateful):
             start = replaced_along(best.T_prev_curr, expected, degeneracy)
             best = align(InitialEstimate(start, held, held), sweeps)
             information = joined_information(INFORMATION_PER_M2 * best.information, covariance, degeneracy)
+        elif len(degeneracy):
+            seen = INFORMATION_PER_M2 * best.information
+            information = joined_information(seen, candidates[0].covariance, degeneracy)
         else:
             information = INFORMATION_PER_M2 * best.information + best.prior_information
         if best.explained < _LEAST_EXPLAINED or best.inliers < _LEAST_INLIERS:
