@@ -19,7 +19,7 @@ from lidarslam.odometry.interface import Odometry
 from lidarslam.run.request import RunRequest, describe_run
 from lidarslam.storage import directory as files
 from lidarslam.storage.about import About
-from lidarslam.storage.summary_file import read_summary
+from lidarslam.storage.summary_file import is_unconstrained, read_summary
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +58,7 @@ def lost_when_finished(request: RunRequest) -> bool | None:
         was = Config.model_validate(tree).model_dump(exclude=WITHOUT_EFFECT)
         summary = read_summary(out)
         lost = summary["lost_scans"] > 0 or len(summary.get("map_contradictions", [])) > 0
+        lost |= is_unconstrained(summary.get("unconstrained_m", 0.0), summary.get("length_m", 0.0))
     except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
     if was_run != describe_run(request) or was != request.config.model_dump(exclude=WITHOUT_EFFECT):

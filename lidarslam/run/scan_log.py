@@ -112,6 +112,11 @@ class ScanLog(Stateful):
             self.messages[index] = message
 
     @property
+    def degenerate(self) -> list[str]:
+        """Of each scan, the names of its degenerate directions with spaces between."""
+        return list(self._degenerate)
+
+    @property
     def statuses(self) -> list[Status]:
         """Of each scan."""
         return [_STATUSES[index] for index in self._table()["status"]]

@@ -55,6 +55,8 @@ class _Summary(TypedDict, total=False):
     lost_scans: NonNegativeInt
     lost: list[_LostStretch]
     map_contradictions: list[_Stretch]
+    length_m: float
+    unconstrained_m: float
     map_voxel_size_m: _Positive | None
     map_entropy: float | None
     ms_per_scan: dict[str, dict[str, float | None]]
@@ -65,6 +67,14 @@ class _Summary(TypedDict, total=False):
 
 
 _SHAPE = TypeAdapter(_Summary)
+
+# Share of the way, of a metre at least, that may be unconstrained.
+_MOST_UNCONSTRAINED, _SHORTEST_M = 0.1, 1.0
+
+
+def is_unconstrained(unconstrained_m: float, length_m: float) -> bool:
+    """Whether so much of a way lies along directions that hardly any surface constrains that its length is unknown."""
+    return unconstrained_m > _MOST_UNCONSTRAINED * max(length_m, _SHORTEST_M)
 
 
 def read_summary(path: Path) -> dict[str, Any]:

@@ -88,7 +88,7 @@ class LoamMapper(Stateful):
         is_added = status is Status.OK
         if is_added:
             self._insert(features, state)
-            message = reservation(names, self._is_adrift)
+            message = reservation(names, names, self._is_adrift)
         return MappedScan(
             state=state,
             T_world_predicted=predicted.T_world_lidar,

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from lidarslam.core.directions.degeneracy import AXES
 from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity
@@ -60,6 +61,15 @@ class Attempt:
     def T_world_lidar(self) -> FloatArray:
         """(4, 4) the registered pose; the predicted one without a registration."""
         return (self.registration or self.prediction).T_world_lidar
+
+    @cached_property
+    def unconstrained(self) -> tuple[str, ...]:
+        """Names of the LiDAR frame's axes that nothing, or no more than the noise of normals, constrains."""
+        degenerate = () if self.registration is None else self.registration.degeneracy.names
+        if self.fit.is_constrained or self.fit.weakest is None:
+            return degenerate
+        along = np.abs(self.T_world_lidar[:3, :3].T @ np.array(self.fit.weakest))
+        return tuple(name for name in AXES if name in (*degenerate, AXES[3 + int(along.argmax())]))
 
     @cached_property
     def correction(self) -> FloatArray:

@@ -209,4 +209,5 @@ def measure_fit(
     matches = matcher.first_correspondences()
     distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
     ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
-    return Fit.of(distances, matches.normals, ranges, len(points), surfel_map.cell_m)
+    surfaces = matches.thickness_m, matches.tilt
+    return Fit.of(distances, matches.normals, ranges, len(points), surfel_map.cell_m, *surfaces)

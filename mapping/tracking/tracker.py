@@ -141,7 +141,7 @@ class Tracker(Stateful):
             status=status,
             message=message,
             fit=attempt.fit,
-            degenerate=registration.degeneracy.names,
+            degenerate=attempt.unconstrained,
             iterations=registration.iterations,
             added=attempt.status is Status.OK and not jumped and not self._state.is_unconfirmed,
             is_connected=not attempt.relocalised,

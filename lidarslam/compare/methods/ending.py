@@ -48,6 +48,8 @@ def _failed(status: int, has_result: bool, said: str) -> tuple[MethodStatus, str
 
 def _where_lost(folder: Path) -> str:
     summary = read_summary(folder)
+    if not summary["lost"] and not summary["map_contradictions"]:
+        return f"{summary['unconstrained_m']:.1f} m of its way are hardly constrained"
     if not summary["lost"]:
         slid = summary["map_contradictions"][0]
         return f"its map contradicts itself between scans {slid['first']} and {slid['last']}"

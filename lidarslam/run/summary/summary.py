@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarslam.core.geometry import inverse
 from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.slides.slides import Contradiction
@@ -18,6 +19,7 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.timing import Milliseconds, SlowestScan
 from lidarslam.run.summary.written_map import WrittenMap
 from lidarslam.storage.directory import SCANS_CSV
+from lidarslam.storage.summary_file import is_unconstrained
 
 # An interval between scans is a gap when it exceeds the median by this many times and seconds.
 _GAP_INTERVALS, _SHORTEST_GAP_S = 2.0, 0.3
@@ -82,6 +84,8 @@ class RunSummary:
     peak_rss_mb: float
     lost: tuple[LostStretch, ...]
     degraded_scans: int
+    # way along axes of the sensor that the scans did not, or hardly, constrain: it is a prediction
+    unconstrained_m: float
     graph: GraphSummary | None
     map: WrittenMap
     warnings: tuple[str, ...]
@@ -90,8 +94,13 @@ class RunSummary:
 
     @property
     def went_astray(self) -> bool:
-        """Whether tracking was lost: a scan is lost, or the map contradicts itself."""
-        return bool(self.lost_scans or self.contradictions)
+        """Whether a scan is lost, the map contradicts itself, or much of the way is a prediction."""
+        return bool(self.lost_scans or self.contradictions or self.is_unconstrained)
+
+    @property
+    def is_unconstrained(self) -> bool:
+        """Whether the length is uncertain for want of structure along the way."""
+        return is_unconstrained(self.unconstrained_m, self.length_m)
 
     @property
     def lost_scans(self) -> int:
@@ -112,6 +121,7 @@ class RunSummary:
             "lost_scans": self.lost_scans,
             "lost": [vars(stretch) for stretch in self.lost],
             "degraded_scans": self.degraded_scans,
+            "unconstrained_m": self.unconstrained_m,
             "map_contradictions": [vars(found) for found in self.contradictions],
             **graph_and_map_json(self.graph, self.map, self.warnings),
         }
@@ -145,7 +155,7 @@ def summarise(
     """
     trajectory, total_ms = log.trajectory, log.total_ms
     stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
-    elapsed_s = float(total_ms.sum()) / 1e3
+    elapsed_s, unconstrained_m = float(total_ms.sum()) / 1e3, _unconstrained_m(log)
     return RunSummary(
         scans=len(log),
         length_m=trajectory.length_m,
@@ -156,9 +166,10 @@ def summarise(
         peak_rss_mb=peak_rss_mb(),
         lost=tuple(_lost_stretches(log)),
         degraded_scans=log.statuses.count(Status.DEGRADED),
+        unconstrained_m=unconstrained_m,
         graph=None if closed is None else GraphSummary.of(closed),
         map=written,
-        warnings=(*log.warnings, *_warnings(log, skipped, contradictions)),
+        warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m)),
         contradictions=contradictions,
         slowest=SlowestScan.of(log.stage_ms),
     )
@@ -173,7 +184,17 @@ def _lost_stretches(log: ScanLog) -> Iterator[LostStretch]:
             yield LostStretch(first, last, stamps[first], stamps[last], log.messages[first])
 
 
-def _warnings(log: ScanLog, skipped: int, contradictions: Sequence[Contradiction]) -> Iterator[str]:
+def _unconstrained_m(log: ScanLog) -> float:
+    """The way along axes of translation that are named as degenerate directions of the scans that reached them."""
+    poses = log.trajectory.T_world_lidar
+    moved = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
+    open_axes = np.array([[axis in names.split() for axis in "xyz"] for names in log.degenerate[1:]]).reshape(-1, 3)
+    return float(np.linalg.norm(moved * open_axes, axis=1).sum())
+
+
+def _warnings(
+    log: ScanLog, skipped: int, contradictions: Sequence[Contradiction], unconstrained_m: float
+) -> Iterator[str]:
     if skipped:
         yield f"{count(skipped, 'scan')} of those asked for missing"
     steps = np.diff(log.stamps)
@@ -191,6 +212,12 @@ def _warnings(log: ScanLog, skipped: int, contradictions: Sequence[Contradiction
         yield f"{points} dropped (NaN, at the origin or out of range), {share:.0f} a scan"
     if degraded := log.statuses.count(Status.DEGRADED):
         yield f"tracking was degraded on {count(degraded, 'scan')}; {SCANS_CSV} gives the reasons"
+    length_m = log.trajectory.length_m
+    if is_unconstrained(unconstrained_m, length_m):
+        yield (
+            f"{unconstrained_m:.1f} m of the way of {length_m:.1f} m lie along directions that hardly any surface"
+            " constrains: the length is uncertain, as in an even corridor"
+        )
     if contradictions:
         clearest = max(contradictions, key=lambda found: found.votes - found.votes_at_pose)
         more = f"; {len(contradictions) - 1} more such stretches" if len(contradictions) > 1 else ""
