@@ -11,6 +11,8 @@ from lidarslam.core.state.stateful import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.pipeline.estimates import ScanResult, SweepMotion
 from lidarslam.run.scan_log import ScanLog
+from lidarslam.run.summary.summary import summarise
+from lidarslam.run.summary.written_map import WrittenMap
 
 
 def result(stamp: float, status: Status = Status.OK, **values: Any) -> ScanResult:
@@ -101,3 +103,29 @@ def test_an_empty_log(log: ScanLog) -> None:
     restored = ScanLog()
     restored.restore(Saved(empty.state()))
     assert restored.format_csv() == empty.format_csv()
+
+
+def corridor_log(open_scans: int) -> ScanLog:
+    """Eleven scans a metre apart along x, the last of which hardly constrain it."""
+    log = ScanLog()
+    for scan in range(11):
+        pose = exp([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]) @ exp([0.0, 0.0, 0.0, float(scan), 0.0, 0.0])
+        degenerate = ("roll", "x") if scan > 10 - open_scans else ("yaw", "z")
+        log.add(result(0.1 * scan, T_world_lidar=pose, degenerate=degenerate))
+    return log
+
+
+@pytest.mark.parametrize(("open_scans", "unknown"), [(0, False), (1, False), (4, True)])
+def test_the_way_that_nothing_constrains_is_measured_and_too_much_of_it_is_no_success(
+    open_scans: int, unknown: bool
+) -> None:
+    summary = summarise(corridor_log(open_scans), WrittenMap(0, None, 0), skipped=0)
+    assert summary.to_json()["unconstrained_m"] == pytest.approx(open_scans, abs=1e-9)
+    assert summary.went_astray == unknown
+    assert any("the length is uncertain" in warning for warning in summary.warnings) == unknown
+
+
+def test_a_single_scan_has_no_way() -> None:
+    log = ScanLog()
+    log.add(result(1.0, degenerate=("x",)))
+    assert summarise(log, WrittenMap(0, None, 0), skipped=0).unconstrained_m == 0.0

@@ -16,7 +16,10 @@ def information(normals: FloatArray, points: FloatArray) -> FloatArray:
 
 
 class Images:
-    """All points have a normal, 4 m away."""
+    """All points have a normal, by default 4 m away."""
+
+    def __init__(self, per_m2: float = 1.0 / 16.0) -> None:
+        self._per_m2 = per_m2
 
     def share_with_normal(self) -> float:
         return 1.0
@@ -25,10 +28,7 @@ class Images:
         return 4.0
 
     def mean_inverse_square_range(self) -> float:
-        return self.per_m2
-
-    def __init__(self, per_m2: float = 1.0 / 16.0) -> None:
-        self.per_m2 = per_m2
+        return self._per_m2
 
 
 ALL: Any = Images()
@@ -54,6 +54,13 @@ def test_a_corridor_is_open_along_it(corridor):
 def test_a_wall_at_the_end_closes_it_when_enough_points_lie_on_it(corridor, share, count):
     end = information(np.tile([1.0, 0.0, 0.0], (1000, 1)), np.tile([8.0, 0.0, 0.0], (1000, 1))) * (share * 4000 / 1000)
     assert len(find_degeneracy(corridor + end, 4000, ALL)) == count
+
+
+@pytest.mark.parametrize(("range_m", "count"), [(1.0, 1), (5.0, 0)])
+def test_what_the_noise_of_near_normals_feigns_closes_nothing(corridor, range_m, count):
+    end = information(np.tile([1.0, 0.0, 0.0], (1000, 1)), np.tile([8.0, 0.0, 0.0], (1000, 1))) * (0.004 * 4000 / 1000)
+    images: Any = Images(per_m2=range_m**-2.0)
+    assert len(find_degeneracy(corridor + end, 4000, images)) == count
 
 
 def test_it_is_the_share_of_the_points_that_counts(corridor):

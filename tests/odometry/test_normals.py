@@ -283,3 +283,15 @@ def test_the_compiled_loops_find_what_lapack_finds(config: Sequence[Patch], nois
     cosine = (found * expected).sum(axis=-1)[there & also]
     assert (cosine < 1.0 - 1e-4).mean() < 1e-3
     assert not found[image[0, 3].numpy() == 0.0].any()
+
+
+@pytest.mark.parametrize(("distance_m", "share"), [(1.0, 0.0), (8.0, 0.8)])
+def test_a_patch_as_narrow_as_the_noise_of_ranges_is_no_surface(distance_m, share):
+    """A wall beside a sensor with 64 rings: at 1 m, pixels lie 1 cm apart and scatter by as much along their rays."""
+    directions = rays(64, 720, 0.5)
+    wall = torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64)
+    image = image_of(directions, plane_ranges(directions, wall, distance_m), noise_m=0.01)
+    there = surface_normals(image, FINE_PATCHES).norm(dim=1) > 0.0
+    ahead = (image[0, 3] > 0.0) & (image[0, 3] < 1.2 * distance_m)
+    found = float(there[0][ahead].float().mean())
+    assert found == 0.0 if share == 0.0 else found > share

@@ -1,0 +1,111 @@
+"""A corridor whose length only the faces of a few boxes show."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.surfels.registration import register
+from lidarslam.mapping.surfels.stability import constraining_points
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.attempts import measure_fit
+from lidarslam.mapping.tracking.fit import Fit
+
+CELL = 0.1
+NOISE_M = 0.008
+# x, and side of the corridor.
+FACES = ((2.0, 1.0), (-2.5, -1.0), (3.5, -1.0), (-4.0, 1.0))
+T_TRUE = exp([0.0, 0.01, 0.05, 0.3, 0.1, -0.05])
+
+
+def walls(rng: np.random.Generator, count: int) -> FloatArray:
+    """Points on the walls, the floor and the ceiling of 12 m, 2.4 m wide and high."""
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * [6.0, 1.2, 1.2]
+    points[np.arange(count), rng.integers(1, 3, count)] = rng.choice([-1.2, 1.2], count)
+    return points
+
+
+def faces(rng: np.random.Generator, count: int) -> FloatArray:
+    """As many points on each face of 0.4 x 0.6 m."""
+    parts = []
+    for x, side in FACES:
+        y, z = rng.uniform(0.8, 1.2, count) * side, rng.uniform(-1.2, -0.6, count)
+        parts.append(np.column_stack([np.full(count, x), y, z]))
+    return np.concatenate(parts)
+
+
+def scene(rng: np.random.Generator, on_walls: int, on_each_face: int) -> FloatArray:
+    points = np.concatenate([walls(rng, on_walls), faces(rng, on_each_face)])
+    return points + rng.normal(scale=NOISE_M, size=points.shape)
+
+
+def elevations(points: FloatArray) -> FloatArray:
+    return np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))
+
+
+def map_of(points: FloatArray) -> SurfelMap:
+    surfel_map = SurfelMap(CELL, 100.0)
+    surfel_map.insert(points, elevations(points), np.zeros(3))
+    return surfel_map
+
+
+@pytest.fixture
+def corridor(rng: np.random.Generator) -> SurfelMap:
+    return map_of(scene(rng, 120_000, 1_000))
+
+
+@pytest.fixture
+def keypoints(rng: np.random.Generator) -> FloatArray:
+    """In the LiDAR frame at `T_TRUE`; one in a hundred is on a face."""
+    return transform_points(inverse(T_TRUE), scene(rng, 3_000, 8))
+
+
+def test_the_points_on_the_faces_have_the_leverage(rng: np.random.Generator) -> None:
+    points = scene(rng, 40_000, 60)
+    chosen = constraining_points(points, elevations(points), 0.5 * CELL, 1_000)
+    on_face = chosen >= 40_000
+    assert on_face.sum() > 0.25 * 60 * len(FACES)
+    assert on_face.mean() > 0.6
+    assert len(constraining_points(points, elevations(points), 0.5 * CELL, 50)) == 50
+
+
+def test_where_everything_constrains_no_point_does_more_than_others(rng: np.random.Generator) -> None:
+    points = rng.uniform(-3.0, 3.0, (40_000, 3))
+    points[np.arange(40_000), rng.integers(0, 3, 40_000)] = rng.choice([-3.0, 3.0], 40_000)
+    assert len(constraining_points(points, elevations(points), 0.5 * CELL, 1_000)) < 40
+
+
+def test_points_without_planes_have_none(rng: np.random.Generator) -> None:
+    points = rng.uniform(-3.0, 3.0, (200, 3))
+    assert not len(constraining_points(points, elevations(points), 0.5 * CELL, 1_000))
+
+
+@pytest.mark.parametrize("off_m", [-0.2, -0.12, 0.12, 0.2])
+def test_faces_hold_the_length_although_walls_fit_anywhere(
+    corridor: SurfelMap, keypoints: FloatArray, off_m: float
+) -> None:
+    """The few residuals along the corridor are no outliers while the prediction leaves its length open."""
+    sigmas = np.array([0.02] * 3 + [0.3, 0.03, 0.03] + [0.1] * 6)
+    start = Prediction(0.0, T_TRUE @ exp([0.0, 0.0, 0.0, off_m, 0.0, 0.0]), np.zeros(6), np.diag(sigmas**2))
+    found = register(Sweep(keypoints), start, corridor, with_velocity=False)
+    assert found is not None
+    assert np.linalg.norm(log(inverse(T_TRUE) @ found.T_world_lidar)[3:]) < 0.015
+
+
+def fit_at(off_m: float, keypoints: FloatArray, surfel_map: SurfelMap) -> Fit:
+    return measure_fit(keypoints, T_TRUE @ exp([0.0, 0.0, 0.0, off_m, 0.0, 0.0]), surfel_map)
+
+
+def test_a_scan_that_slid_has_no_evidence_of_the_length(corridor: SurfelMap, keypoints: FloatArray) -> None:
+    held, slid = (fit_at(off_m, keypoints, corridor) for off_m in (0.0, 0.5))
+    assert held.is_constrained
+    assert held.weakest is not None
+    assert abs(held.weakest[0]) > 0.99
+    assert not slid.is_constrained
+    assert slid.inlier_ratio == pytest.approx(held.inlier_ratio, abs=0.2)
+
+
+def test_without_faces_no_pose_has(rng: np.random.Generator) -> None:
+    fit = fit_at(0.0, transform_points(inverse(T_TRUE), scene(rng, 3_000, 0)), map_of(scene(rng, 120_000, 0)))
+    assert not fit.is_constrained
