@@ -21,6 +21,10 @@ MIN_CORRESPONDENCES = MIN_POINTS
 _MAP_SPACING = 0.5
 _KEYPOINT_SPACING = 2.5
 _MOST_CONSTRAINING = 600
+# Instants that a sweep is divided into, of so many points at least; and the share of the view's height that those of
+# one instant span if they form a column. It is 0.6 to 0.9 of spinning sensors, 0.07 of a Mid-360.
+_INSTANTS, _LEAST_OF_INSTANT = 1000, 16
+_COLUMN_SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +35,8 @@ class SampledScan:
     cell_m: float  # size of the map's cells for the scene
     range_m: float  # smoothed median range of the scene
     sweep: Sweep  # N points for the map
-    elevations: Annotated[FloatArray, Shape(None)]  # (N,) their angles above the sensor's equator, radians
+    # (N,) their angles above the sensor's equator, radians; all zero where points do not lie in rings
+    elevations: Annotated[FloatArray, Shape(None)]
     keypoints: Sweep  # the subset that is registered
 
     def __post_init__(self) -> None:
@@ -74,10 +79,12 @@ class Sampler(Stateful):
     """Thins scans by the scale of the scene, the smoothed median range."""
 
     _scale: SceneScale
+    _has_rings: bool | None  # of the first scan of enough points; None before
 
     def __init__(self, config: MappingConfig) -> None:
         self._config = config
         self._scale = SceneScale(config)
+        self._has_rings = None
 
     def sample(self, scan: Scan) -> SampledScan:
         """Choose the points of a scan."""
@@ -93,5 +100,25 @@ class Sampler(Stateful):
         keys = central_per_cell(points, _KEYPOINT_SPACING * cell_m)
         if len(keys) > self._config.keypoints:
             keys = keys[np.linspace(0, len(keys) - 1, self._config.keypoints).astype(np.intp)]
-        elevations = np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
+        if self._has_rings is None and len(scan) >= _INSTANTS:
+            self._has_rings = has_rings(scan)
+        # A stroke of points that do not lie in rings spans a plane of its rays as a ring does, with any spread of
+        # elevations; without one, no plane seen at a grazing angle counts.
+        rings = 0.0 if self._has_rings is False else 1.0
+        elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
         return SampledScan(scan.stamp, cell_m, self._scale.range_m, sweep, elevations, sweep.take(keys))
+
+
+def has_rings(scan: Scan) -> bool:
+    """Whether the points of one instant form a column of the view, as those of a spinning sensor; true if unknown.
+
+    The points of a rosette or a raster, which draw strokes, are near one another.
+    """
+    if scan.rings is not None or scan.time_offsets is None:
+        return True
+    points = scan.points.take(np.argsort(scan.time_offsets, kind="stable"), axis=0)
+    elevations = np.arcsin(points[:, 2] / np.maximum(np.sqrt(squared_ranges(points)), 1e-9))
+    size = max(_LEAST_OF_INSTANT, len(points) // _INSTANTS)
+    instants = elevations[: len(points) // size * size].reshape(-1, size)
+    low, high = np.quantile(instants, (0.1, 0.9), axis=1)
+    return bool(np.median(high - low) > _COLUMN_SHARE * np.subtract(*np.quantile(elevations, (0.95, 0.05))))

@@ -24,9 +24,11 @@ _LESS_PER_AXIS = 0.2
 _FEWEST_POINTS = 6
 # Sine of the least angle to a plane at which one of its sides is seen.
 _LEAST_SINE = 0.17
-# Largest ratio of thickness to width, and least ratio of width to length, of a plane (standard deviations).
+# Largest ratio of thickness to width, least ratio of width to length, and least width in cells, of a plane (standard
+# deviations): a narrow strip has the tilt of its noise.
 _MOST_THICKNESS = 0.4
 _LEAST_WIDTH = 0.15
+_LEAST_WIDTH_CELLS = 0.2
 
 Scratch = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
 """Room for the rows (27,) of cells around one, and for 15, 6 and 3 numbers."""
@@ -124,7 +126,8 @@ def _compute(row: int, around: NDArray[np.int32], cells: Cells, surfels: FloatAr
     surfel[13] = count
     thickness, width, length = surfel[9], surfel[10], surfel[11]
     enough = surfel[13] >= _FEWEST_POINTS
-    surfel[14] = enough and thickness < _MOST_THICKNESS * width and width > _LEAST_WIDTH * length
+    is_wide = width > _LEAST_WIDTH * length and width > _LEAST_WIDTH_CELLS * cells.cell_m
+    surfel[14] = enough and thickness < _MOST_THICKNESS * width and is_wide
 
 
 @compiled_part
