@@ -70,15 +70,19 @@ def _cover(scan: Scan, cover: Cover, rng: np.random.Generator) -> Scan:
     return replace(few, points=rng.uniform(-_STRAY_M, _STRAY_M, (_STRAY_POINTS, 3)))
 
 
+# Longer than a sensor that was tracked is within reach of its motion.
+CARRYING_S = 1.2
+
+
 def carried_off(simulation: Simulation, at: int, goes_on_at: int, turned_deg: float = 0.0) -> Faulty:
     """Lifted after scan `at` - 1, and set down where the simulation is at scan `goes_on_at`, turned about its z axis.
 
-    The recording jumps from one scan to the next, and goes on from there with noise of its own.
+    Carrying takes a while, in which nothing is recorded; the recording goes on from there with noise of its own.
     """
     T_lidar_turned = exp(np.array([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0]))
     later = replace(simulation, T_body_lidar=simulation.T_body_lidar @ T_lidar_turned, seed=simulation.seed + 1)
     count = min(len(simulation) - at, len(simulation) - goes_on_at)
-    stamps = simulation.stamps[: at + count]
+    stamps = simulation.stamps[: at + count] + CARRYING_S * (np.arange(at + count) >= at)
     there = [replace(later.scan(goes_on_at + k).scan, stamp=float(stamps[at + k])) for k in range(count)]
     poses = [simulation.ground_truth.T_world_lidar[:at], later.ground_truth.T_world_lidar[goes_on_at:][:count]]
     scans = (*simulation.scans(0, at), *there)

@@ -79,11 +79,12 @@ class Inertial(Stateful):
         if prior.T_prev_curr is None:
             rotation = log(make_transform(turn, np.zeros(3)))[:3]
             moved = exp(np.concatenate([rotation, self._velocity * (scan.stamp - last.stamp)]))
-            return Prior(moved, velocity, _without_translation(covariance) / self._config.prior_caution**2, gravity)
+            unmoved = _without_translation(covariance) / self._config.prior_caution**2
+            return Prior(moved, velocity, unmoved, gravity, turn_is_measured=True)
         # The mapper's caution is meant for the odometry, whose errors repeat; the filter follows the gyroscope's.
         own = prior.motion_covariance(self._config)
         fused, covariance = fuse_turn(prior.T_prev_curr, own, turn, covariance)
-        return Prior(fused, velocity, covariance / self._config.prior_caution**2, gravity)
+        return Prior(fused, velocity, covariance / self._config.prior_caution**2, gravity, turn_is_measured=True)
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
         """Take the result of a scan: bias, velocity and gravity follow it."""

@@ -55,6 +55,7 @@ class Prior:
     # deviations
     covariance: FloatArray | None = None
     gravity: GravityDirection | None = None  # at the scan's stamp
+    turn_is_measured: bool = False  # whether a gyroscope measured the motion's rotation
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
         """(6, 6) of the motion: the odometry's own, inflated for errors correlated in time, or the configured one."""

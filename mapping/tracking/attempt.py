@@ -19,6 +19,11 @@ from lidarslam.mapping.tracking.fit import Fit
 # A correction beyond so many standard deviations of the prediction, and beyond degrees and metres, is a jump.
 _MOST_SIGMAS = 5.0
 _LEAST_JUMP = np.array([np.deg2rad(10.0)] * 3 + [0.5] * 3)
+# How much faster than predicted a sensor may move and turn, m/s and rad/s, and for how long after it was tracked; then
+# it may have been carried anywhere.
+_MORE_SPEED_M_S, _MORE_TURN_RAD_S, _REACH_S = 3.0, np.deg2rad(200.0), 1.0
+# A turn that a gyroscope measured is known to this.
+_MEASURED_TURN = np.deg2rad(5.0)
 # Share of inliers that a scan needs at its prediction after a lost one.
 _PLAUSIBLE_SHARE = 0.5
 # A scan that may be anywhere needs a much better fit, and a clearly better one than at the next best place so many
@@ -81,6 +86,15 @@ class Attempt:
         """Whether the correction exceeds every motion that the prediction allows for."""
         sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
         return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
+
+    def is_reachable(self, since_s: float, turn_is_measured: bool) -> bool:
+        """Whether the sensor can have moved here since it was tracked; the correction is that of the motion since."""
+        if since_s > _REACH_S:
+            return True
+        angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))
+        speed = float(np.linalg.norm(self.prediction.velocity[3:]))
+        most = _MEASURED_TURN if turn_is_measured else _LEAST_JUMP[0] + _MORE_TURN_RAD_S * since_s
+        return bool(angle < most and distance_m < _LEAST_JUMP[3] + (_MORE_SPEED_M_S + speed) * since_s)
 
     def uncertain_velocity(self, scan: SampledScan, last: MotionState, continuous_time: bool) -> FloatArray:
         """Velocity (6,) after a jump or a relocalisation from the last scan's state.

@@ -89,7 +89,7 @@ class Tracker(Stateful):
         """Register a scan near its prediction, else relocalise it; the status is lost where neither is reliable."""
         matcher = ScanMatcher(scan, last, surfel_map, self._config, self._budget)
         if self._state.is_lost and self.is_searching:  # which has all the time of a lost scan
-            found = self._found(matcher, prediction)
+            found = self._found(matcher, prediction, prior)
             self._in_vain = found is None and not self.is_searching
             return found or matcher.none(prediction)
         uncertain = self._state.is_uncertain(scan.stamp - last.stamp)
@@ -98,9 +98,9 @@ class Tracker(Stateful):
             near = self._improve(matcher, prior, prediction, near)
         unconfirmed = self._state.is_unconfirmed
         if near.status is Status.LOST or ((uncertain or unconfirmed) and not near.is_reliable):
-            best = self._relocalise(matcher, near)
+            best = self._relocalise(matcher, near, prior)
         elif near.status is Status.DEGRADED and self._state.searches_nearby:
-            best = best_of(filter(None, (near, self._found(matcher, near.prediction, nearby=True))))
+            best = best_of(filter(None, (near, self._found(matcher, near.prediction, prior, nearby=True))))
         elif near.status is Status.OK and not unconfirmed:
             best = self._archive.relocalise(matcher, near.prediction, self._budget) or near
         else:
@@ -214,7 +214,7 @@ class Tracker(Stateful):
             return best
         return replace(best, ambiguous=best.has_rivals(others))
 
-    def _relocalise(self, matcher: ScanMatcher, near: Attempt) -> Attempt | None:
+    def _relocalise(self, matcher: ScanMatcher, near: Attempt, prior: Prior) -> Attempt | None:
         """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none.
 
         The nearby attempt does not count before a search is done.
@@ -224,16 +224,24 @@ class Tracker(Stateful):
         self._in_vain = False
         if counts and in_vain:
             return near
-        found = self._found(matcher, near.prediction)
+        found = self._found(matcher, near.prediction, prior)
         return best_of(filter(None, (near if counts and not self.is_searching else None, found)))
 
-    def _found(self, matcher: ScanMatcher, prediction: Prediction, nearby: bool = False) -> Attempt | None:
-        """The scan, relocalised by the search that is under way or a new one; None where that is not done or fails."""
+    def _found(
+        self, matcher: ScanMatcher, prediction: Prediction, prior: Prior, nearby: bool = False
+    ) -> Attempt | None:
+        """The scan, relocalised by the search that is under way or a new one; None where that is not done or fails.
+
+        A place out of reach of the motion since the sensor was tracked looks alike, and is not taken for this one.
+        """
         self._map_is_due |= self._state.searches_map and not nearby
         if not self._search.is_under_way:
             self._search.begin(matcher.search(prediction, self._map_is_due), prediction)
             self._map_is_due = False
-        return self._search.go_on(matcher, prediction, self._budget)
+        found, since = self._search.go_on(matcher, prediction, self._budget), self._state.tracked_s
+        if found is None or since is None or found.is_reachable(prediction.stamp - since, prior.turn_is_measured):
+            return found
+        return None
 
     def _end_search(self) -> None:
         self._search.drop()

@@ -24,6 +24,7 @@ class TrackingState(Stateful):
     lost_in_a_row: int  # scans with points that could not be registered
     is_lost: bool  # whether the pose of the last scan is unknown
     velocity_known: bool  # whether the velocity of the last scan was estimated
+    tracked_s: float | None  # stamp of the last scan whose pose followed from the one before
     _was_degraded: bool
     _to_confirm: Annotated[int, ANY_NUMBER]
     _relocalised_s: float | None
@@ -32,6 +33,7 @@ class TrackingState(Stateful):
     def __init__(self) -> None:
         self.lost_in_a_row = 0
         self.is_lost = self.velocity_known = False
+        self.tracked_s = None
         self._was_degraded = False
         self._to_confirm = 0
         self._relocalised_s = None  # stamp of a relocalisation until it is confirmed
@@ -73,7 +75,7 @@ class TrackingState(Stateful):
 
     def map_restarted(self) -> None:
         """Update with a new map."""
-        self.lost_in_a_row, self._usual_quality = 0, 0.0
+        self.lost_in_a_row, self._usual_quality, self.tracked_s = 0, 0.0, None
 
     def registered(self, status: Status, relocalised: bool, quality: float, stamp: float) -> None:
         """Update with a registered scan."""
@@ -87,3 +89,5 @@ class TrackingState(Stateful):
             self._to_confirm -= 1
             if self._to_confirm <= 0 and stamp - self._relocalised_s >= _CONFIRMED_AFTER_S - _ROUNDING_S:
                 self._relocalised_s = None
+        if not self.is_unconfirmed:
+            self.tracked_s = stamp

@@ -266,13 +266,27 @@ def test_turned_on_the_spot_it_finds_its_way_back(
     settled: SurfelMapper, room: Any, rest_truth: Trajectory, turned_deg: float
 ) -> None:
     T_turned = rest_truth.T_world_lidar[14] @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
-    found = settled.process(snapshot(room, T_turned, float(rest_truth.stamps[15]), 7), NOTHING)
+    found = settled.process(snapshot(room, T_turned, float(rest_truth.stamps[15]) + 1.0, 7), NOTHING)
     truth = inverse(rest_truth.T_world_lidar[0]) @ T_turned
     error = inverse(truth) @ found.state.T_world_lidar
     assert np.linalg.norm(error[:3, 3]) < 0.01
     assert np.rad2deg(rotation_angle(error)) < 0.1
     assert found.status is Status.DEGRADED
     assert "from the prediction" in found.message
+
+
+@pytest.mark.parametrize("turned_deg", [100.0, 180.0])
+def test_a_place_that_no_motion_leads_to_is_not_taken_until_driving_decides(
+    settled: SurfelMapper, room: Any, rest_truth: Trajectory, turned_deg: float
+) -> None:
+    """Turned within a tenth of a second: another room that looks alike is as probable, for a second."""
+    T_turned = rest_truth.T_world_lidar[14] @ exp([0.0, 0.0, np.deg2rad(turned_deg), 0.0, 0.0, 0.0])
+    stamps = rest_truth.stamps[14] + 0.1 * np.arange(1, 26)
+    found = [settled.process(snapshot(room, T_turned, float(stamp), 7 + k), NOTHING) for k, stamp in enumerate(stamps)]
+    assert [one.status for one in found[:4]] == [Status.LOST] * 4
+    assert found[-1].status is Status.OK
+    truth = inverse(rest_truth.T_world_lidar[0]) @ T_turned
+    assert np.rad2deg(rotation_angle(inverse(truth) @ found[-1].state.T_world_lidar)) < 0.1
 
 
 def test_a_new_map_is_begun_after_so_many_lost_scans(rest_scans: list[Scan], monkeypatch: pytest.MonkeyPatch) -> None:
