@@ -180,7 +180,8 @@ class Tracker(Stateful):
     def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""
         best = self._or_turning(matcher, prior, prediction, near)
-        if prediction.contradicted and self._state.velocity_known and not self._budget.is_spent:
+        doubtful = prediction.contradicted or (prior.T_prev_curr is not None and best.status is not Status.OK)
+        if doubtful and self._state.velocity_known and not self._budget.is_spent:
             alone = self.predict(matcher.scan, Prior(), matcher.last)
             other = matcher.register(alone, self._begins_coarse(matcher.scan))
             other = self._or_turning(matcher, Prior(), alone, other)
