@@ -31,10 +31,11 @@ from pathlib import Path
 import numpy as np
 from click.testing import CliRunner
 from mapping_accuracy import print_row
-from peers import NAMES, run_peer
+from peers import run_peer
 
 from lidarslam.cli import main as lidarslam
 from lidarslam.compare.peers.interface import PeerError
+from lidarslam.compare.peers.registry import PEERS
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.recording import Recording
@@ -48,10 +49,11 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     "learned+map": (),
     "learned+loam": ("--mapping", "loam"),
     "constant-velocity+map": ("--odometry", "constant-velocity"),
+    "learned+imu+map": ("--odometry", "learned+imu"),
     "constant-velocity+loam": ("--odometry", "constant-velocity", "--mapping", "loam"),
     "KISS-ICP": ("--odometry", "kiss-icp", "--no-mapping"),
 }
-METHODS = (*OPTIONS, *NAMES)
+METHODS = (*OPTIONS, *PEERS)
 DEFAULT_METHODS = ("learned+map", "constant-velocity+map", "KISS-ICP", "ct-icp")
 REFERENCE = "KISS-ICP"
 
@@ -117,7 +119,7 @@ def run_ours(method: str, source: Path, scans: range) -> Ended:
 def run_other(method: str, recording: Recording, scans: range) -> Ended:
     """A run of a peer."""
     try:
-        trajectory = run_peer(method, in_order(recording.scans(scans.start, scans.stop, scans.step)))
+        trajectory = run_peer(method, in_order(recording.scans(scans.start, scans.stop, scans.step)), recording.imu)
     except PeerError as error:
         return Ended(None, None, None, 1, str(error))
     return Ended(trajectory, None, None, 0)
