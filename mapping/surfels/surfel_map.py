@@ -22,6 +22,8 @@ _TIDIED_AFTER = 500
 _LEVEL_COSINE = 0.7
 # Spread of the elevations of points that were seen from many places.
 _ANY_HEIGHT_RAD = 0.2
+# Surfels of fewer scans are of few points: their normals are uncertain.
+_YOUNG_SCANS = 5
 # A direction that few walls are parallel to.
 _UNEVEN = np.array([0.46, 0.29, 0.84])
 
@@ -69,6 +71,11 @@ class SurfelMap(Stateful):
     def __len__(self) -> int:
         """Number of cells in all grids."""
         return sum(len(grid) for grid in self._grids)
+
+    @property
+    def is_young(self) -> bool:
+        """Whether so few scans were inserted that normals are uncertain; a map that was given has none."""
+        return 0 < self.scans < _YOUNG_SCANS
 
     def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
         """Insert a scan.

@@ -87,8 +87,9 @@ class Attempt:
         sigmas = np.sqrt(np.diag(self.prediction.covariance)[:6])
         return bool((np.abs(self.correction) > np.maximum(_MOST_SIGMAS * sigmas, _LEAST_JUMP)).any())
 
-    def is_reachable(self, since_s: float, turn_is_measured: bool) -> bool:
-        """Whether the sensor can have moved here since it was tracked; the correction is that of the motion since."""
+    def is_reachable(self, tracked_s: float | None, turn_is_measured: bool) -> bool:
+        """Whether the sensor can have moved here since the time at which it was tracked; anywhere if it never was."""
+        since_s = np.inf if tracked_s is None else self.prediction.stamp - tracked_s
         if since_s > _REACH_S:
             return True
         angle, distance_m = (float(np.linalg.norm(part)) for part in (self.correction[:3], self.correction[3:]))

@@ -197,7 +197,8 @@ class ScanMatcher:
             return self.none(prediction)
         points = keypoints.compensated(registration.velocity)
         fit = measure_fit(points, registration.T_world_lidar, self._map, registration.matcher)
-        return Attempt(prediction, self._map, registration, fit, fit.status(self._config.tracking))
+        status = fit.status(self._config.tracking, self._map.is_young)
+        return Attempt(prediction, self._map, registration, fit, status)
 
 
 def measure_fit(

@@ -20,6 +20,7 @@ from lidarslam.mapping.motion.prediction import (
     ProcessNoise,
     predict,
 )
+from lidarslam.mapping.surfels.registration import Registration
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.archived_maps import ArchivedMaps
@@ -34,8 +35,7 @@ from lidarslam.mapping.tracking.tracking_state import TrackingState
 # Registration begins on coarse cells unless the predictions were off by less than this share of a cell lately; their
 # error is forgotten by a factor a scan.
 _FINE_ERROR_CELLS, _ERROR_DECAY, _UNKNOWN_ERROR_M = 0.5, 0.8, 10.0
-# Factors on the quality by which a result that is less consistent with the prediction must be better: with any
-# acceleration, and with any displacement.
+# Factors by which the quality of a result with any acceleration, and with any displacement, must be better.
 _BETTER, _CLEARLY_BETTER = 1.05, 1.1
 
 
@@ -121,18 +121,18 @@ class Tracker(Stateful):
         if attempt.status is Status.OK or attempt.relocalised:
             self._end_search()
         if not attempt.relocalised:
-            self._update_noise(attempt, prior, last, interval_s)
+            self._update_noise(registration, prior, last, interval_s)
         error_m = displacement_m(attempt.correction, scan.range_m)
         self._prediction_error_m = max(_ERROR_DECAY * self._prediction_error_m, error_m)
         self._state.velocity_known = not (jumped or attempt.relocalised)
-        T_world_lidar, velocity = registration.T_world_lidar, registration.velocity
-        if self._state.velocity_known:
-            covariance = registration.covariance
-            state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
-        else:
+        velocity, covariance, seen_until_s = registration.velocity, registration.covariance, scan.seen_until_s
+        if not self._state.velocity_known:
             velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
-            state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
+            covariance, seen_until_s = LOST_MOTION, 0.0
+        state = MotionState(scan.stamp, registration.T_world_lidar, velocity, covariance, seen_until_s)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
+        # A young map that is not added to would stay one.
+        fits = attempt.status is Status.OK or attempt.surfel_map.is_young
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
             state=state,
@@ -143,7 +143,7 @@ class Tracker(Stateful):
             fit=attempt.fit,
             degenerate=attempt.unconstrained,
             iterations=registration.iterations,
-            added=attempt.status is Status.OK and not jumped and not self._state.is_unconfirmed,
+            added=fits and not jumped and not self._state.is_unconfirmed,
             is_connected=not attempt.relocalised,
         )
 
@@ -179,15 +179,14 @@ class Tracker(Stateful):
 
     def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""
-        best = self._or_turning(matcher, prior, prediction, near)
-        doubtful = prediction.contradicted or (prior.T_prev_curr is not None and best.status is not Status.OK)
-        if doubtful and self._state.velocity_known and not self._budget.is_spent:
+        best, has_odometry = self._or_turning(matcher, prior, prediction, near), prior.T_prev_curr is not None
+        is_poor = has_odometry and best.status is not Status.OK
+        if (prediction.contradicted or is_poor) and self._state.velocity_known and not self._budget.is_spent:
             alone = self.predict(matcher.scan, Prior(), matcher.last)
             other = matcher.register(alone, self._begins_coarse(matcher.scan))
-            other = self._or_turning(matcher, Prior(), alone, other)
-            best = max(best, other, key=lambda attempt: attempt.quality)
-        misled = prior.T_prev_curr is not None and best.status is not Status.OK
-        if (misled or not self._state.velocity_known) and not self._budget.is_spent:
+            best = max(best, self._or_turning(matcher, Prior(), alone, other), key=lambda attempt: attempt.quality)
+            is_poor = has_odometry and best.status is not Status.OK
+        if (is_poor or not self._state.velocity_known) and not self._budget.is_spent:
             rotations = prediction.T_world_lidar, matcher.last.T_world_lidar
             displaced = self._budget.run(matcher.register_displaced(rotations))
             best = best if displaced is None else self._or_displaced(best, displaced[0])
@@ -201,19 +200,15 @@ class Tracker(Stateful):
         if not self._state.fits_poorly(near.status, near.quality) or self._budget.is_spent:
             return near
         turning = matcher.register_turning(self.predict(matcher.scan, prior, matcher.last, LARGEST_PROCESS_NOISE))
-        if turning.is_reliable and turning.quality > _BETTER * near.quality:
-            return replace(turning, prediction=prediction)
-        return near
+        is_better = turning.is_reliable and turning.quality > _BETTER * near.quality
+        return replace(turning, prediction=prediction) if is_better else near
 
     def _or_displaced(self, best: Attempt, others: Sequence[Attempt]) -> Attempt:
         """The best of an attempt and those from displacements, marked as ambiguous where another fits as well."""
-        for other in others:
-            eligible = other.is_reliable or not self._state.velocity_known
-            if eligible and other.quality > _CLEARLY_BETTER * best.quality:
-                best = other
-        if best.registration is None or self._state.velocity_known:
-            return best
-        return replace(best, ambiguous=best.has_rivals(others))
+        for other in filter(lambda other: other.is_reliable or not self._state.velocity_known, others):
+            best = other if other.quality > _CLEARLY_BETTER * best.quality else best
+        is_settled = best.registration is None or self._state.velocity_known
+        return best if is_settled else replace(best, ambiguous=best.has_rivals(others))
 
     def _relocalise(self, matcher: ScanMatcher, near: Attempt, prior: Prior) -> Attempt | None:
         """The best of the nearby attempt, a yaw search and, where it is due, a search of the map; None of none.
@@ -239,20 +234,17 @@ class Tracker(Stateful):
         if not self._search.is_under_way:
             self._search.begin(matcher.search(prediction, self._map_is_due), prediction)
             self._map_is_due = False
-        found, since = self._search.go_on(matcher, prediction, self._budget), self._state.tracked_s
-        if found is None or since is None or found.is_reachable(prediction.stamp - since, prior.turn_is_measured):
-            return found
-        return None
+        found, tracked_s = self._search.go_on(matcher, prediction, self._budget), self._state.tracked_s
+        return found if found and found.is_reachable(tracked_s, prior.turn_is_measured) else None
 
     def _end_search(self) -> None:
         self._search.drop()
         self._map_is_due = self._in_vain = False
 
-    def _update_noise(self, attempt: Attempt, prior: Prior, last: MotionState, interval_s: float) -> None:
-        assert attempt.registration is not None
+    def _update_noise(self, registration: Registration, prior: Prior, last: MotionState, interval_s: float) -> None:
         if interval_s > 0.0 and self._state.velocity_known:
-            variance = np.diag(attempt.registration.covariance + last.covariance)[6:]
-            change = attempt.registration.velocity - last.velocity
+            variance = np.diag(registration.covariance + last.covariance)[6:]
+            change = registration.velocity - last.velocity
             self._process_noise = self._process_noise.updated(change, interval_s, variance)
-        motion = inverse(last.T_world_lidar) @ attempt.T_world_lidar
+        motion = inverse(last.T_world_lidar) @ registration.T_world_lidar
         self._odometry_noise = self._odometry_noise.updated(prior, motion, self._config)

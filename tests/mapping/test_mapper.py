@@ -237,18 +237,23 @@ def test_a_scan_of_another_place_is_lost_and_stays_out_of_the_map(
     assert size(settled) == held
 
 
-def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_the_map(rest_scans: list[Scan]) -> None:
+@pytest.mark.parametrize(("earlier", "is_inserted"), [(1, True), (6, False)])
+def test_a_scan_that_fits_badly_has_a_pose_but_stays_out_of_a_map_that_is_not_young(
+    rest_scans: list[Scan], earlier: int, is_inserted: bool
+) -> None:
     mapper = SurfelMapper(MappingConfig(tracking=TrackingConfig(degraded_below=1.0)))
     mapper.process(rest_scans[0], Prior(velocity=np.zeros(6)))
+    for scan in rest_scans[1:earlier]:
+        mapper.process(scan, NOTHING)
     held = size(mapper)
     # A quarter of its points stand before the walls, as people do.
-    crowded = rest_scans[1].points.copy()
+    crowded = rest_scans[earlier].points.copy()
     crowded[::4] *= 0.8
-    placed = mapper.process(replace(rest_scans[1], points=crowded), NOTHING)
+    placed = mapper.process(replace(rest_scans[earlier], points=crowded), NOTHING)
     assert placed.registered
     assert placed.status is Status.DEGRADED
     assert "fits the map" in placed.message
-    assert size(mapper) == held
+    assert (size(mapper) > held) == is_inserted
 
 
 def test_the_way_goes_on_after_a_scan_of_another_place(
