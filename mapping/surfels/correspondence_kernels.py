@@ -18,6 +18,8 @@ from lidarslam.mapping.surfels.surfel_kernels import is_steep
 # only when its points differ so much in height across the rings.
 _LEAST_HEIGHT_M = 0.05
 _FEWEST_POINTS = 6
+# The plane of a surfel is as uncertain as if so many of its points counted as one: neighbours share their errors.
+_SHARED = 120.0
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5
 
@@ -28,7 +30,7 @@ class Surfaces(NamedTuple):
     counts: NDArray[np.int32]  # (N,) residuals of the point: 1 with a plane, up to 3 with a compact object, or none
     points: FloatArray  # (N, 3) on the surface, in the world
     normals: FloatArray  # (N, 3, 3) unit, in the world, one for each residual
-    thickness_m: FloatArray  # (N, 3) standard deviation of the surface along each
+    thickness_m: FloatArray  # (N, 3) standard deviation of the surface along each, with that of its plane
     tilt: FloatArray  # (N, 3) standard deviation of each normal, radians
 
     @classmethod
@@ -126,5 +128,5 @@ def _write(
         found.points[n, axis] = surfel[axis]
     normal = found.normals[n, residual]
     normal[0], normal[1], normal[2] = u, v, w
-    found.thickness_m[n, residual], found.tilt[n, residual] = thickness_m, tilt
+    found.thickness_m[n, residual], found.tilt[n, residual] = thickness_m * math.sqrt(1.0 + _SHARED / surfel[13]), tilt
     found.counts[n] += 1

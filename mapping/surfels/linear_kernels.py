@@ -17,11 +17,13 @@ _BLOCK = 256
 
 @compiled
 def linearise(
-    points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, rows: FloatArray
-) -> tuple[int, float]:
+    points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, inflation: FloatArray,
+    rows: FloatArray,
+) -> tuple[int, float]:  # fmt: skip
     """Write a row (10,) for every residual of points (N, 3) of the LiDAR frame at a pose (4, 4).
 
-    The Jacobian is for a motion from the right, rotation first. `times` (N,) are seconds from the stamp, or empty.
+    The Jacobian is for a motion from the right, rotation first. `times` (N,) are seconds from the stamp, or empty;
+    `inflation` (N,) are factors on the standard deviation of each point's surface.
 
     Returns:
         Number of residuals, and the sum of the squared ranges of their points.
@@ -43,7 +45,7 @@ def linearise(
             row[0], row[1], row[2] = y * w - z * v, z * u - x * w, x * v - y * u
             row[3], row[4], row[5] = u, v, w
             row[RESIDUAL] = a * normal[0] + b * normal[1] + c * normal[2]
-            row[THICKNESS], row[TILT] = surfaces.thickness_m[n, k], surfaces.tilt[n, k]
+            row[THICKNESS], row[TILT] = inflation[n] * surfaces.thickness_m[n, k], surfaces.tilt[n, k]
             row[TIME] = times[n] if len(times) else 0.0
             squared += x * x + y * y + z * z
             count += 1

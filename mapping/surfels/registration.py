@@ -15,6 +15,7 @@ from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, d
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
+from lidarslam.mapping.surfels.large_surfaces import INFLATION, inflation_of_small
 from lidarslam.mapping.surfels.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
 from lidarslam.mapping.surfels.matching import Matcher
 from lidarslam.mapping.surfels.sampling import MIN_CORRESPONDENCES
@@ -34,7 +35,9 @@ _GATE = 6.0
 # What the prediction leaves open widens the kernel, less at each iteration.
 _NARROWING = 0.8
 # Errors of neighbouring points are correlated: so many count as one. From true errors on simulated recordings.
-_CORRELATION = 25.0
+_CORRELATION = 4.0
+# Degrees of freedom of the prediction's error.
+_FREEDOM = 4.0
 # A velocity that differs by less than this over the interval needs no second compensation.
 _SAME_ROTATION, _SAME_TRANSLATION_M = np.deg2rad(0.1), 0.01
 
@@ -73,22 +76,30 @@ def register(
     unknown = prediction.covariance
     try:
         prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
+        inflation = uniform = np.ones(len(sweep))
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
             cell_m, matcher = surfel_map.cell_m * LEVELS[level], surfel_map.matcher(len(sweep), level)
             for _ in range(coarse if level else most - iterations):
                 points = sweep.compensated(velocity)
                 matcher.match(transform_points(T_world_lidar, points), T_world_lidar)
-                system = _System.of(points, times, T_world_lidar, matcher.surfaces, cell_m, unknown)
+                system = _System.of(points, times, T_world_lidar, matcher.surfaces, inflation, cell_m, unknown)
                 if system is None:
                     return None
                 away = log(inverse(prediction.T_world_lidar) @ T_world_lidar)
-                solution = _solve(system, prior, np.concatenate([away, velocity - prediction.velocity]))
+                error = np.concatenate([away, velocity - prediction.velocity])
+                solution = _solve(system, _heavy_tailed(prior, error), error)
                 T_world_lidar = T_world_lidar @ exp(solution.step[:6])
                 velocity = velocity + solution.step[6:]
                 iterations += 1
                 unknown = _NARROWING**iterations * solution.covariance()
                 if _has_converged(solution.step, level, cell_m, system.lever_m):
-                    break
+                    if level > 0 or inflation is not uniform:
+                        break
+                    found = inflation_of_small(points, T_world_lidar, matcher.surfaces, surfel_map)
+                    if found is None:
+                        break
+                    # An odometry saw the same small surfaces.
+                    inflation, unknown, prior = found, prediction.covariance, prior / INFLATION**2
         covariance = solution.covariance()
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
@@ -122,6 +133,12 @@ def with_mean_velocity(
     return replace(registration, velocity=velocity, covariance=covariance)
 
 
+def _heavy_tailed(prior: FloatArray, error: FloatArray) -> FloatArray:
+    """The information (12, 12) of a prediction that is off by an error (12,), for Student's distribution."""
+    share = (_FREEDOM + len(error)) / (_FREEDOM + float(error @ prior @ error))
+    return min(1.0, share) * prior
+
+
 def _has_converged(step: FloatArray, level: int, cell_m: float, lever_m: float) -> bool:
     if level > 0:
         return displacement_m(step[:6], lever_m) < _COARSE_CONVERGED * cell_m
@@ -144,8 +161,8 @@ class _System:
 
     @classmethod
     def of(
-        cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, cell_m: float,
-        unknown: FloatArray,
+        cls, points: FloatArray, times: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces,
+        inflation: FloatArray, cell_m: float, unknown: FloatArray,
     ) -> "_System | None":  # fmt: skip
         """Of points (N, 3) with times (N,), or none to keep the velocity; None where too few have a surface.
 
@@ -154,7 +171,7 @@ class _System:
         direction are no outliers while it is unknown, however well all others fit.
         """
         rows = np.empty((3 * len(points), COLUMNS))
-        count, squared = linearise(points, times, np.ascontiguousarray(T_world_lidar), surfaces, rows)
+        count, squared = linearise(points, times, np.ascontiguousarray(T_world_lidar), surfaces, inflation, rows)
         if count < MIN_CORRESPONDENCES:
             return None
         rows, total = rows[:count], np.zeros((13, 13))

@@ -138,6 +138,24 @@ class SurfelMap(Stateful):
         length = float(np.linalg.norm(mean))
         return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
 
+    def goes_on(
+        self, points: FloatArray, normals: FloatArray, sensor: FloatArray, cosine: float, thickness: float
+    ) -> NDArray[np.bool_]:
+        """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), go on over the coarsest cell.
+
+        Args:
+            points: in the world.
+            normals: unit.
+            sensor: position in the world.
+            cosine: least, between the normals.
+            thickness: largest standard deviation along the normal, as a share of the cell.
+        """
+        grid = self._grids[-1]
+        rows = grid.find(points, np.array(sensor))
+        coarse = grid.refreshed(rows)[rows]
+        is_plane = (rows >= 0) & (coarse[:, 14] > 0.0) & (coarse[:, 9] < thickness * grid.cell_m)
+        return np.asarray(is_plane & (np.abs(np.einsum("ij,ij->i", normals, coarse[:, 3:6])) > cosine))
+
     def means(self) -> FloatArray:
         """Mean points (M, 3) of the cells of the middle size, in the world."""
         return self._grids[1].means()

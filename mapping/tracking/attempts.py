@@ -40,6 +40,10 @@ _FEW_POINTS, _LIKELY = 800, 0.5
 # cells, within reach of the coarse cells.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
+# Displacements tried along the least constrained direction, and the largest that is taken, cells; a factor by which
+# the quality must be better.
+_ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
+_CLEARLY_BETTER = 1.1
 
 
 class ScanMatcher:
@@ -115,6 +119,23 @@ class ScanMatcher:
             prediction = predict(moving, self.scan.stamp, Prior(), ProcessNoise(), self._config, self.scan.seen_from_s)
             attempts.append(self._attempt(prediction, prediction, patient=True))
         return [attempt for attempt in attempts if attempt.status is Status.OK]
+
+    def or_along_weakest(self, near: Attempt) -> Attempt:
+        """An attempt; where it fits poorly, a clearly better one a few cells away along its weakest direction, if any.
+
+        Steps and boxes make several optima, and coarse cells merge them; farther away, another step looks alike.
+        """
+        if near.status is Status.OK or near.fit.weakest is None or not near.fit.is_constrained:
+            return near
+        best = near
+        for cells in _ALONG_CELLS:
+            start = near.T_world_lidar.copy()
+            start[:3, 3] += cells * self._map.cell_m * np.array(near.fit.weakest)
+            other = self._attempt(near.prediction, replace(near.prediction, T_world_lidar=start), coarse_first=False)
+            away_m = float(np.linalg.norm(other.T_world_lidar[:3, 3] - near.T_world_lidar[:3, 3]))
+            if away_m < _MOST_ALONG_CELLS * self._map.cell_m and other.quality > _CLEARLY_BETTER * near.quality:
+                best = max(best, other, key=lambda attempt: attempt.quality)
+        return best
 
     def search(self, prediction: Prediction, whole_map: bool) -> Steps[Attempt | None]:
         """Relocalise by yaw search and, if that finds nothing and it is wanted, anywhere; None where neither does."""

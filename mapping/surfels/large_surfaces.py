@@ -1,0 +1,59 @@
+"""Large surfaces: walls and floors, as against people and cars that move along with the sensor."""
+
+import numpy as np
+
+from lidarslam.core.directions.degeneracy import lever_scale
+from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+# The plane of a point is part of a large one where the coarsest cell has a plane of nearly its normal, no thicker than
+# this share of that cell.
+_SAME_COSINE, _MOST_THICKNESS = 0.94, 0.08
+# Large surfaces suffice where they constrain every direction so many times as well as the noise of their normals does.
+_SUFFICIENT = 15.0
+# They contradict a pose from which they alone would move so many cells away. On recordings without crowds: below 0.1.
+_CONTRADICTION_CELLS = 0.2
+# By how much small surfaces are less certain then.
+INFLATION = 6.0
+_FEWEST = 100
+_RANGE_NOISE_M, _SCALE_PER_MEDIAN = 0.02, 1.5
+
+
+def inflation_of_small(
+    points: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, surfel_map: SurfelMap
+) -> FloatArray | None:
+    """Factors (N,) on the standard deviations of the points' surfaces, larger for small ones; None where these agree.
+
+    To a crowd that walks along, a sensor is at rest; only walls, floor and ceiling contradict. In a bare corridor or a
+    stairwell, large surfaces do not suffice for a pose, and small ones count in full.
+
+    Args:
+        points: (N, 3) in the LiDAR frame.
+        T_world_lidar: (4, 4) registered to all surfaces alike.
+        surfaces: of the points.
+        surfel_map: map with these surfaces.
+    """
+    matched = np.flatnonzero(surfaces.counts)
+    world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]
+    is_large = surfel_map.goes_on(world, normals, T_world_lidar[:3, 3], _SAME_COSINE, _MOST_THICKNESS)
+    large = matched[is_large]
+    if len(large) < _FEWEST:
+        return None
+    world, normals = world[is_large], normals[is_large]
+    residuals = np.einsum("ij,ij->i", world - surfaces.points[large], normals)
+    variances = surfaces.thickness_m[large, 0] ** 2 + _RANGE_NOISE_M**2
+    kernel = 1.0 + residuals**2 / ((_SCALE_PER_MEDIAN * np.median(np.abs(residuals))) ** 2 + variances)
+    weights = 1.0 / (kernel**2 * variances)
+    inward = normals @ T_world_lidar[:3, :3]
+    scale = lever_scale(float(np.sqrt(np.mean(np.sum(points[large] ** 2, axis=1)))))
+    jacobian = np.column_stack([np.cross(points[large], inward), inward]) / scale
+    hessian = (jacobian * weights[:, None]).T @ jacobian
+    if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * float(weights @ surfaces.tilt[large, 0] ** 2):
+        return None
+    step_m = np.linalg.norm(np.linalg.solve(hessian, jacobian.T @ (weights * residuals)))
+    if step_m < _CONTRADICTION_CELLS * surfel_map.cell_m:
+        return None
+    inflation = np.full(len(points), INFLATION)
+    inflation[large] = 1.0
+    return inflation

@@ -1,0 +1,89 @@
+"""Crowds that walk along: walls and floor contradict, where they suffice for a pose."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.surfels.large_surfaces import inflation_of_small
+from lidarslam.mapping.surfels.registration import register
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+CELL_M = 0.1
+HALL_M = np.array([8.0, 6.0, 2.5])  # half its length, width and height
+PERSON_M = np.array([0.25, 0.2, 0.85])
+WALKED = np.array([0.12, 0.02, 0.0])
+ALL, ALONG = (0, 1, 2), (1, 2)  # the axes across which there are walls
+
+
+def on_box(rng: np.random.Generator, half: FloatArray, count: int, axes: tuple[int, ...]) -> FloatArray:
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * half
+    axis = rng.choice(axes, count)
+    points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * half[axis]
+    return points
+
+
+def people(rng: np.random.Generator, count: int) -> FloatArray:
+    """Points (N, 3) on a dozen people around the sensor, each turned otherwise."""
+    parts = []
+    for k in range(12):
+        yaw, away_m = 2.1 * k, 1.5 + 0.15 * k
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        place = away_m * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0]) - [0.0, 0.0, 1.6]
+        parts.append(on_box(rng, PERSON_M, count // 12, (0, 1)) @ turn.T + place)
+    return np.concatenate(parts)
+
+
+def map_of(points: FloatArray) -> SurfelMap:
+    surfel_map = SurfelMap(CELL_M, 100.0)
+    surfel_map.insert(points, np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)), np.zeros(3))
+    return surfel_map
+
+
+def scene(axes: tuple[int, ...], crowd: int) -> tuple[SurfelMap, Sweep]:
+    """A map of a hall with people, and a sweep of it after the sensor and the people have walked."""
+    rng = np.random.default_rng(7)
+    noise = 0.003
+    hall, sweep = on_box(rng, HALL_M, 400_000, axes), on_box(rng, HALL_M, 1_500, axes)
+    standing, walking = people(rng, 60_000), people(rng, crowd)
+    points = np.concatenate([sweep - WALKED, walking])
+    surfel_map = map_of(np.concatenate([hall, standing]) + rng.normal(0.0, noise, (len(hall) + len(standing), 3)))
+    return surfel_map, Sweep(points + rng.normal(0.0, noise, points.shape))
+
+
+def registered(surfel_map: SurfelMap, sweep: Sweep) -> FloatArray:
+    """Position (3,) from a prediction of standstill."""
+    prediction = Prediction(0.0, np.eye(4), np.zeros(6), np.diag([0.1] * 3 + [0.3] * 3 + [1.0] * 6) ** 2)
+    found = register(sweep, prediction, surfel_map, with_velocity=False)
+    assert found is not None
+    return found.T_world_lidar[:3, 3]
+
+
+def inflation(surfel_map: SurfelMap, sweep: Sweep) -> FloatArray | None:
+    """At the pose of the people, at rest."""
+    matcher = surfel_map.matcher(len(sweep))
+    matcher.match(transform_points(np.eye(4), sweep.points), np.eye(4))
+    return inflation_of_small(sweep.points, np.eye(4), matcher.surfaces, surfel_map)
+
+
+@pytest.mark.parametrize("crowd", [0, 2_000, 4_000, 5_000])
+def test_a_crowd_that_walks_along_does_not_hold_the_sensor(crowd: int) -> None:
+    np.testing.assert_allclose(registered(*scene(ALL, crowd)), WALKED, atol=0.02)
+
+
+def test_small_surfaces_are_less_certain_where_walls_contradict_the_pose() -> None:
+    surfel_map, sweep = scene(ALL, 6_000)
+    factors = inflation(surfel_map, sweep)
+    assert factors is not None
+    assert (factors[:1_500] == 1.0).mean() > 0.6  # walls, floor, ceiling
+    assert (factors[1_500:] > 1.0).mean() > 0.9  # people
+
+
+def test_small_surfaces_count_in_full_along_a_bare_corridor() -> None:
+    assert inflation(*scene(ALONG, 6_000)) is None
+
+
+def test_small_surfaces_count_in_full_where_walls_agree() -> None:
+    surfel_map, sweep = scene(ALL, 6_000)
+    assert inflation(surfel_map, Sweep(np.concatenate([sweep.points[:1_500] + WALKED, sweep.points[1_500:]]))) is None
