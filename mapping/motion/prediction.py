@@ -1,6 +1,6 @@
 """Prediction of the next scan's pose and velocity by a Kalman filter of the last motion and the odometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +15,8 @@ LEAST_SIGMA = np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3)
 _ANY_VELOCITY = np.array([np.deg2rad(100.0)] * 3 + [15.0] * 3)
 UNKNOWN_VELOCITY = np.diag(np.concatenate([LEAST_SIGMA, _ANY_VELOCITY]) ** 2)
 LOST_MOTION = np.diag(np.concatenate([[np.deg2rad(20.0)] * 3 + [1.0] * 3, _ANY_VELOCITY]) ** 2)
+# Standard deviation of what is held at its prediction, m and m/s.
+_HELD = 0.001
 # The velocity of a lost sensor fades by this factor a scan.
 FADING = 0.7
 # Bounds of the process noise: standard deviations of the acceleration, rotation (rad/s^2) and translation (m/s^2).
@@ -142,6 +144,15 @@ class Prediction:
     velocity: FloatArray  # (6,) during the sweep, in the LiDAR frame, rotation first
     covariance: FloatArray  # (12, 12) of the errors of pose and velocity, as in `MotionState`
     contradicted: bool = False  # whether the odometry's motion fails the innovation test against the last velocity
+
+    def held_along(self, direction: FloatArray) -> "Prediction":
+        """The prediction with its translation and velocity along a direction (3,) of the world held."""
+        along = self.T_world_lidar[:3, :3].T @ direction
+        H = np.zeros((2, 12))
+        H[0, 3:6] = H[1, 9:] = along
+        PH = self.covariance @ H.T
+        covariance = self.covariance - PH @ np.linalg.solve(H @ PH + _HELD**2 * np.eye(2), PH.T)
+        return replace(self, covariance=0.5 * (covariance + covariance.T))
 
 
 def predict(

@@ -52,6 +52,11 @@ class SampledScan:
         return len(self.keypoints) < MIN_CORRESPONDENCES
 
     @cached_property
+    def has_rings(self) -> bool:
+        """Whether points lie in rings, as those of a spinning sensor."""
+        return bool(self.elevations.any())
+
+    @cached_property
     def seen_until_s(self) -> float:
         """Time from the stamp to the last point; 0 when the scan is compensated already."""
         times = self.sweep.times
@@ -110,15 +115,20 @@ class Sampler(Stateful):
 
 
 def has_rings(scan: Scan) -> bool:
-    """Whether the points of one instant form a column of the view, as those of a spinning sensor; true if unknown.
+    """Whether lasers keep their elevations, as those of a spinning sensor; true if unknown.
 
-    The points of a rosette or a raster, which draw strokes, are near one another.
+    The lasers of a rosette or a raster draw strokes, numbered or not. Where they are not numbered, the points of one
+    instant form a column of a spinning sensor's view, and are near one another in a stroke.
     """
-    if scan.rings is not None or scan.time_offsets is None:
+    elevations = np.arcsin(scan.points[:, 2] / np.maximum(np.sqrt(squared_ranges(scan.points)), 1e-9))
+    least = _COLUMN_SHARE * float(np.subtract(*np.quantile(elevations, (0.95, 0.05))))
+    if scan.rings is not None:
+        order = np.argsort(scan.rings, kind="stable")
+        lasers = np.split(elevations.take(order), np.flatnonzero(np.diff(scan.rings.take(order))) + 1)
+        return bool(np.median([np.subtract(*np.quantile(laser, (0.9, 0.1))) for laser in lasers]) < least)
+    if scan.time_offsets is None:
         return True
-    points = scan.points.take(np.argsort(scan.time_offsets, kind="stable"), axis=0)
-    elevations = np.arcsin(points[:, 2] / np.maximum(np.sqrt(squared_ranges(points)), 1e-9))
-    size = max(_LEAST_OF_INSTANT, len(points) // _INSTANTS)
-    instants = elevations[: len(points) // size * size].reshape(-1, size)
-    low, high = np.quantile(instants, (0.1, 0.9), axis=1)
-    return bool(np.median(high - low) > _COLUMN_SHARE * np.subtract(*np.quantile(elevations, (0.95, 0.05))))
+    elevations = elevations.take(np.argsort(scan.time_offsets, kind="stable"))
+    size = max(_LEAST_OF_INSTANT, len(elevations) // _INSTANTS)
+    instants = elevations[: len(elevations) // size * size].reshape(-1, size)
+    return bool(np.median(np.subtract(*np.quantile(instants, (0.9, 0.1), axis=1))) > least)

@@ -44,6 +44,8 @@ _DISPLACED_CELLS = 3.0
 # the quality must be better.
 _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
 _CLEARLY_BETTER = 1.1
+# Evidence below which the first sweeps without rings are held along a direction: their strokes seldom cross.
+_STROKES_EVIDENCE = 10.0
 
 
 class ScanMatcher:
@@ -209,8 +211,18 @@ class ScanMatcher:
         patient: bool = False,
         keypoints: Sweep | None = None,
     ) -> Attempt:
-        keypoints, interval_s = keypoints or self.scan.keypoints, self.scan.stamp - self.last.stamp
-        continuous = self._config.continuous_time
+        keypoints = keypoints or self.scan.keypoints
+        attempt = self._registered(prediction, start, coarse_first, patient, keypoints)
+        evidence, weakest = attempt.fit.evidence, attempt.fit.weakest
+        if self.scan.has_rings or not self._map.is_young or weakest is None or (evidence or 0.0) > _STROKES_EVIDENCE:
+            return attempt
+        held = start.held_along(np.array(weakest))
+        return self._registered(prediction, held, coarse_first, patient, keypoints)
+
+    def _registered(
+        self, prediction: Prediction, start: Prediction, coarse_first: bool, patient: bool, keypoints: Sweep
+    ) -> Attempt:
+        continuous, interval_s = self._config.continuous_time, self.scan.stamp - self.last.stamp
         registration = register(keypoints, start, self._map, continuous, coarse_first, patient)
         if registration is not None and not (continuous and keypoints.times is not None) and interval_s > 0.0:
             registration = with_mean_velocity(registration, keypoints, start, self.last, self._map, patient)

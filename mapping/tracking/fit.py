@@ -8,8 +8,9 @@ from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import TrackingConfig
 
-# Largest distance of an inlier from its surface: the largest of a length, a share of the cell and a share of the range.
-_GATE_MIN_M, _GATE_CELLS, _GATE_RATIO = 0.05, 0.5, 0.02
+# Largest distance of an inlier from its surface: the largest of a length, a share of the cell, a share of the range,
+# and standard deviations of the surface.
+_GATE_MIN_M, _GATE_CELLS, _GATE_RATIO, _GATE_SIGMAS = 0.05, 0.5, 0.02, 2.0
 # Axes of the world with fewer correspondences are not counted apart.
 _FEWEST_FACING = 30
 # Least share of points with a correspondence.
@@ -64,7 +65,8 @@ class Fit:
         if not len(distances):
             return NO_FIT
         nearest_m = max(_GATE_MIN_M, _GATE_CELLS * cell_m)
-        inlier = distances < np.maximum(nearest_m, _GATE_RATIO * ranges)
+        within_m = np.maximum(nearest_m, _GATE_RATIO * ranges)
+        inlier = distances < (within_m if thickness_m is None else np.maximum(within_m, _GATE_SIGMAS * thickness_m))
         residual_m, facing = float(np.median(distances)), np.abs(normals).argmax(axis=1)
         counts, inliers = np.bincount(facing), np.bincount(facing, weights=inlier)
         ratios = (inliers / np.maximum(counts, 1))[counts >= _FEWEST_FACING]

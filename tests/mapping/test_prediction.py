@@ -187,3 +187,13 @@ def test_the_noise_of_an_odometry_follows_its_errors() -> None:
         )
     assert 50.0 < noise.variance < 200.0
     assert noise.updated(Prior(), MOVED, AS_TOLD) == noise
+
+
+def test_what_is_held_keeps_its_prediction_and_what_is_correlated_with_it_does_not_change() -> None:
+    last = MotionState(0.0, exp([0.0, 0.0, 0.4, 1.0, 2.0, 0.0]), np.zeros(6), UNKNOWN_VELOCITY)
+    prediction = predict(last, 0.1, Prior(), ProcessNoise(), MappingConfig())
+    held = prediction.held_along(np.array([0.0, 0.0, 1.0]))
+    sigmas, before = (np.sqrt(np.diag(part.covariance)) for part in (held, prediction))
+    assert sigmas[[5, 11]].max() < 0.002
+    np.testing.assert_allclose(np.delete(sigmas, [5, 11]), np.delete(before, [5, 11]), rtol=1e-6)
+    assert np.linalg.eigvalsh(held.covariance).min() > 0.0

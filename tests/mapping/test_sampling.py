@@ -6,7 +6,8 @@ import pytest
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.surfels.sampling import SampledScan, Sampler, has_rings
+from lidarslam.simulation.sensors.table import SENSORS
 
 
 def shell(rng: np.random.Generator, radius_m: float, count: int = 20_000, stamp: float = 0.0) -> Scan:
@@ -129,3 +130,19 @@ def test_a_scene_that_has_changed_by_more_has_other_cells_in_the_end(
 def test_one_scan_of_another_scale_changes_nothing(rng: np.random.Generator) -> None:
     sizes = cell_sizes(rng, [6.0] * 10 + [60.0] + [6.0] * 10)
     assert len(set(sizes)) == 1
+
+
+@pytest.mark.parametrize("numbered", [False, True])
+@pytest.mark.parametrize("name", [name for name in SENSORS if name != "livox"])
+def test_strokes_are_told_from_rings(name: str, numbered: bool) -> None:
+    """Livox's drivers number the lasers, too."""
+    rays = SENSORS[name].pattern.rays(3)
+    scan = Scan(10.0 * rays.directions, 0.3, 0.1 * rays.fractions, rays.rings if numbered else None)
+    assert has_rings(scan) == (SENSORS[name].driver != "livox")
+
+
+def test_points_of_strokes_have_no_elevations() -> None:
+    rays = SENSORS["mid-360"].pattern.rays(0)
+    sampled = sample(Scan(10.0 * rays.directions, 0.0, 0.1 * rays.fractions))
+    assert not sampled.has_rings
+    assert not sampled.elevations.any()
