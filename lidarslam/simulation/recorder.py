@@ -132,7 +132,7 @@ class Simulation:
             points.astype(np.float32).astype(np.float64),
             index / self.sensor.rate_hz,
             echoes.rays.fractions[returned] * self.sensor.period_s,
-            echoes.rays.rings[returned],
+            echoes.rays.rings[returned] if self.sensor.has_rings else None,
         )
         brightness = intensities(cosines[returned], shares[returned])
         return SimulatedScan(scan, brightness, hits.ranges[returned], hits.moving[returned])

@@ -27,6 +27,7 @@ LIMITS = {
     "tracked-harsh": (2.0, 2.0, 6.0, 181.0, 920.0),
     "drone": (3.0, 3.0, 4.0, 90.0, 300.0),
     "car-fast": (3.5, 5.0, 3.0, 60.0, 120.0),
+    "drone-agile": (6.0, 6.0, 5.0, 170.0, 900.0),
 }
 
 
@@ -83,7 +84,7 @@ def test_laps_come_round_exactly(motion):
     np.testing.assert_allclose(motion.pose_at(laps), motion.pose_at(np.zeros(4)), atol=1e-9)
     quarter = motion.pose_at(np.array([0.25, 1.25]) * motion.duration_s)
     assert np.linalg.norm(quarter[0, :3, 3] - motion.pose_at(np.zeros(1))[0, :3, 3]) > 5.0
-    sway = 0.6 if motion.name == "drone" else 0.3
+    sway = 0.6 if CARRIERS[motion.name].banks else 0.3
     assert np.linalg.norm(quarter[0, :3, 3] - quarter[1, :3, 3]) < sway
 
 
@@ -100,7 +101,7 @@ def test_stays_within_the_free_side(motion, poses, yard):
 def test_follows_the_ground(motion, poses, yard):
     _, T = poses
     above = T[::20, 2, 3] - yard.ground_at(T[::20, :2, 3])
-    if motion.name == "drone":
+    if CARRIERS[motion.name].banks:
         assert 1.4 < above.min() < above.max() < 2.6
     else:
         assert np.abs(above).max() < 0.08
@@ -135,6 +136,22 @@ def test_legged_sways_with_its_gait(yard):
     height = motion.pose_at(times)[:, 2, 3]
     spectrum = np.abs(np.fft.rfft((height - np.poly1d(np.polyfit(times, height, 5))(times)) * np.hanning(len(times))))
     assert 1.5 < np.fft.rfftfreq(len(times), 0.01)[spectrum.argmax()] < 2.5
+
+
+def test_an_agile_drone_banks_to_twenty_degrees_with_its_acceleration(yard):
+    motion = replace(motion_along_route("drone-agile", yard, seed=4), sway=Sway())
+    times = np.arange(0.0, motion.duration_s, STEP_S)
+    T = motion.pose_at(times)
+    acceleration = np.gradient(np.gradient(T[:, :2, 3], STEP_S, axis=0), STEP_S, axis=0)
+    up = T[:, :3, 2]
+    pitch, roll = np.rad2deg(-np.arcsin(T[:, 2, 0])), np.rad2deg(np.arctan2(T[:, 2, 1], T[:, 2, 2]))
+    for angle in (pitch, roll):
+        assert 15.0 < np.abs(angle).max() < 20.5
+    # Thrust along the body's z axis, smoothed in time, carries the acceleration.
+    leaning = np.linalg.norm(acceleration, axis=1) > 2.0
+    assert leaning.mean() > 0.1
+    assert np.corrcoef(up[leaning, 0] / up[leaning, 2], acceleration[leaning, 0])[0, 1] > 0.95
+    assert np.corrcoef(up[leaning, 1] / up[leaning, 2], acceleration[leaning, 1])[0, 1] > 0.95
 
 
 def test_what_keeps_going_never_halts(yard):
@@ -178,7 +195,7 @@ def test_seeds_vary_and_repeat(yard):
 
 
 def test_unknown_motion_is_answered_with_the_choices(yard):
-    with pytest.raises(InputError, match=r"'train'.*car, handheld, legged, tracked, tracked-harsh, drone, car-fast"):
+    with pytest.raises(InputError, match=r"'train'.*car, handheld, legged, .*drone, car-fast, drone-agile"):
         motion_along_route("train", yard, 0)
 
 

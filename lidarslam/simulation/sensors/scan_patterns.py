@@ -66,7 +66,7 @@ class Rosette:
     """Lasers that draw a pattern which goes on from sweep to sweep and does not close within any recording.
 
     The line of sight turns about z while it nods up and down; the two frequencies and the sweep rate have irrational
-    ratios. The lasers nod with phases spread over a period.
+    ratios. The lasers nod with phases spread over a period, or together and a constant angle above one another.
     """
 
     elevation_range_deg: tuple[float, float]  # lowest and highest
@@ -74,6 +74,7 @@ class Rosette:
     columns: int
     turns_per_sweep: float  # of the line of sight
     nods_per_sweep: float
+    laser_step_deg: float = 0.0  # between lasers that nod together; 0 for phases spread over a period
 
     @property
     def column_angle(self) -> float:
@@ -86,17 +87,50 @@ class Rosette:
         """The rays of the sweep with that index."""
         fractions = np.arange(self.columns) / self.columns
         sweeps = scan_index + fractions[:, None]
-        phase = self.nods_per_sweep * sweeps + np.arange(self.lasers) / self.lasers
+        number = np.arange(self.lasers)
+        phase = self.nods_per_sweep * sweeps + (0.0 if self.laser_step_deg else number / self.lasers)
         # A triangle wave covers all elevations evenly, as the real pattern does to within a factor of two.
         rising = 2.0 * np.abs(np.mod(phase, 1.0) - 0.5)
         low, high = np.deg2rad(self.elevation_range_deg)
-        elevation = low + rising * (high - low)
+        above = np.deg2rad(self.laser_step_deg) * number
+        elevation = low + rising * (high - low - above[-1]) + above
         azimuth = np.broadcast_to(np.pi - 2.0 * np.pi * np.mod(self.turns_per_sweep * sweeps, 1.0), elevation.shape)
         rings = np.tile(np.arange(self.lasers, dtype=np.int32), self.columns)
         return Rays(directions(azimuth.ravel(), elevation.ravel()), np.repeat(fractions, self.lasers), rings)
 
 
-ScanPattern = Spinning | Rosette
+@dataclass(frozen=True, eq=False)
+class RisleyPrisms:
+    """Lasers above one another behind two prisms that turn in opposite senses: petals about the x axis.
+
+    Each prism deflects by half of `radius_deg`; their frequencies and the sweep rate have irrational ratios, so that
+    the petals do not repeat within any recording.
+    """
+
+    radius_deg: float  # of the circle that one laser's petals fill
+    laser_step_deg: float
+    lasers: int
+    columns: int
+    turns_per_sweep: tuple[float, float]  # of each prism
+
+    @property
+    def column_angle(self) -> float:
+        """Largest angle between two shots of the same laser, radians."""
+        return float(np.deg2rad(self.radius_deg) * np.pi * sum(self.turns_per_sweep) / self.columns)
+
+    def rays(self, scan_index: int) -> Rays:
+        """The rays of the sweep with that index."""
+        fractions = np.arange(self.columns) / self.columns
+        one, other = 2.0 * np.pi * np.multiply.outer(self.turns_per_sweep, scan_index + fractions)
+        radius = 0.5 * np.deg2rad(self.radius_deg)
+        steps = np.deg2rad(self.laser_step_deg) * (np.arange(self.lasers) - 0.5 * (self.lasers - 1))
+        elevation = radius * (np.sin(one) - np.sin(other))[:, None] + steps
+        azimuth = np.repeat(radius * (np.cos(one) + np.cos(other)), self.lasers)
+        rings = np.tile(np.arange(self.lasers, dtype=np.int32), self.columns)
+        return Rays(directions(azimuth, elevation.ravel()), np.repeat(fractions, self.lasers), rings)
+
+
+ScanPattern = Spinning | Rosette | RisleyPrisms
 """A LiDAR's optics: `columns` shots a sweep of `lasers` rays each, `column_angle` between two shots of a laser."""
 
 

@@ -34,6 +34,7 @@ class Sensor:
     rate_hz: float  # sweeps a second
     pattern: ScanPattern
     ranging: RangeModel
+    has_rings: bool = True  # whether points carry the number of their laser
 
     @property
     def period_s(self) -> float:

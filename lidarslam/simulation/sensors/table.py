@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.simulation.choices import choose
-from lidarslam.simulation.sensors.scan_patterns import Rosette, Spinning
+from lidarslam.simulation.sensors.scan_patterns import RisleyPrisms, Rosette, Spinning
 from lidarslam.simulation.sensors.sensor import RangeModel, Sensor
 
 # Altitude angles of one OS0-64 and one OS1-128, from their own metadata as published with the Ouster SDK.
@@ -74,7 +74,7 @@ def _hesai_32(columns: int) -> Spinning:
 
 
 # Range limits: VLP-16 100 m, HDL-32E 80 to 100 m, HDL-64E 120 m, OS0 50 m and OS1 120 m at 80 % reflectivity,
-# XT32 120 m, Mid-360 70 m at 80 %. Velodyne's packets count 2 mm, Hesai's 4 mm, Ouster's and Livox's 1 mm.
+# XT32 120 m, Mid-360 70 m and Avia 320 m at 80 %. Packets of Velodyne count 2 mm, Hesai 4 mm, Ouster and Livox 1 mm.
 _VELODYNE_SMALL = RangeModel(0.4, 100.0, 0.010, 0.00020, 0.0030, 0.002)
 _VELODYNE_64 = RangeModel(0.9, 120.0, 0.010, 0.00015, 0.0020, 0.002)
 _OS0 = RangeModel(0.3, 50.0, 0.010, 0.00050, 0.0061, 0.001)
@@ -82,6 +82,7 @@ _OS1_64 = RangeModel(0.5, 120.0, 0.010, 0.00025, 0.0031, 0.001)
 _OS1_128 = RangeModel(0.3, 120.0, 0.008, 0.00025, 0.0031, 0.001)
 _XT32 = RangeModel(0.1, 120.0, 0.005, 0.00010, 0.0017, 0.004)
 _MID_360 = RangeModel(0.1, 70.0, 0.010, 0.00025, 0.0030, 0.001)
+_AVIA_RANGES = RangeModel(1.0, 320.0, 0.015, 0.00025, 0.0030, 0.001)
 
 # 55.296 us a column of 16 lasers 2.304 us apart (User Manual 63-9243), rounded to 0.2 degrees
 _VLP_16 = _one_column(np.arange(-15.0, 16.0, 2.0), 1800, 0.0, 16 * 2.304 / 55.296)
@@ -93,6 +94,11 @@ _OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055
 _OS1_64_COLUMN = _ouster(np.linspace(16.611, -16.611, 64), [3.164, 1.055, -1.055, -3.164], 1024)
 # after the Mid-360: 200,000 points a second over 360 x 59 degrees, four lines
 _ROSETTE = Rosette((-7.0, 52.0), 4, 5000, turns_per_sweep=0.5 * 5.0**0.5, nods_per_sweep=10.0 * 3.0**0.5)
+# The same view as strokes of four lasers together, some ten degrees of azimuth apart, a turn a sweep.
+_STROKES = Rosette((-7.0, 52.0), 4, 5000, 0.46 * 5.0**0.5, 10.0 * 3.0**0.5, laser_step_deg=1.2)
+# 70.4 x 77.2 degrees of six lines, 240,000 points a second; the prisms turn about as fast as a Mid-40's, at 7294 and
+# 4664 a minute.
+_AVIA = RisleyPrisms(35.2, 6.8 / 5.0, 6, 4000, (7.0 * 3.0**0.5, 3.5 * 5.0**0.5))
 
 # The HDL-64E with uneven rings, as every real one has: made-up offsets of the size that calibration files have.
 _UNEVEN_DEG = np.clip(0.06 * np.random.default_rng(64).standard_normal(64), -0.12, 0.12)
@@ -108,6 +114,8 @@ _TABLE = (
     Sensor("os1-128", "ouster", 10.0, _ouster(_OS1_128_DEG, [4.21, 1.41, -1.40, -4.21], 1024), _OS1_128),
     Sensor("xt32", "hesai", 10.0, _hesai_32(2000), _XT32),
     Sensor("livox", "livox", 10.0, _ROSETTE, _MID_360),
+    Sensor("mid-360", "livox", 10.0, _STROKES, _MID_360, has_rings=False),
+    Sensor("avia", "livox", 10.0, _AVIA, _AVIA_RANGES, has_rings=False),
 )
 SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in _TABLE}
 

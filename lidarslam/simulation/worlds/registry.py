@@ -17,6 +17,9 @@ WORLDS: dict[str, str] = {
     "fields": "open_country.fields",
     "terrace": "street.terrace",
     "town": "street.town",
+    "corridor": "on_foot.corridor",
+    "stairs": "on_foot.stairs",
+    "crowd": "on_foot.crowd",
 }
 
 

@@ -30,7 +30,7 @@ def _draw_ramp(ramp: Ramp, builder: Builder, clearance: Clearance) -> None:
     for sign in (-1.0, 1.0):
         edge = sign * (0.5 * LANE_M - 0.06) * side
         builder.beam(ramp.foot + edge + 0.06 * UP, ramp.head + edge + 0.06 * UP, 0.12, 0.14)
-        _draw_railing(ramp.foot + edge, ramp.head + edge, builder)
+        draw_railing(ramp.foot + edge, ramp.head + edge, builder)
     reach = np.abs(side) * 0.5 * LANE_M
     for k, (a, b) in enumerate(pairwise(np.linspace(0.0, 1.0, round(float(np.linalg.norm(step))) + 1))):
         low, high = ramp.foot + a * step, ramp.foot + b * step
@@ -49,7 +49,7 @@ def _stand(top: FloatArray, thickness: float, builder: Builder, clearance: Clear
         builder.box(0.5 * (low + high), high - low + 0.1 * UP)
 
 
-def _draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
+def draw_railing(a: FloatArray, b: FloatArray, builder: Builder) -> None:
     """Posts every 1.5 m or so, a hand rail and a knee rail, from a to b (3,)."""
     length = float(np.linalg.norm(b - a))
     for t in np.linspace(0.0, 1.0, max(2, round(length / 1.6) + 1)):
@@ -71,7 +71,7 @@ def _draw_deck(deck: Deck, builder: Builder, clearance: Clearance) -> None:
         for y in ys:
             _stand(np.array([x, y, deck.z]), _SLAB_M + 0.3, builder, clearance)
     for a, b in deck.railings:
-        _draw_railing(np.append(a, deck.z), np.append(b, deck.z), builder)
+        draw_railing(np.append(a, deck.z), np.append(b, deck.z), builder)
 
 
 def _draw_stairs(plan: HallPlan, builder: Builder, clearance: Clearance) -> None:
@@ -86,6 +86,6 @@ def _draw_stairs(plan: HallPlan, builder: Builder, clearance: Clearance) -> None
     for side in (-0.64, 0.64):
         offset = np.array([side, 0.0, 0.0])
         builder.beam(foot + offset + 0.1 * UP, head + offset - 0.05 * UP, 0.05, 0.25)
-        _draw_railing(foot + offset, head + offset, builder)
+        draw_railing(foot + offset, head + offset, builder)
     aside = np.array([0.8, 0.9, 0.0])
     clearance.take(foot - aside, head + aside + 1.5 * UP)
