@@ -7,6 +7,7 @@ from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import (
     LEAST_SIGMA,
+    UNKNOWN_VELOCITY,
     MotionState,
     OdometryNoise,
     Prediction,

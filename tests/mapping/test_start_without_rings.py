@@ -1,0 +1,31 @@
+"""A drone that takes off with a Mid-360: a single sweep of strokes makes no map."""
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import inverse
+from lidarslam.core.tracking import Status
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.simulation.motion.carriers import mount_pose
+from lidarslam.simulation.motion.route_motion import motion_along_route
+from lidarslam.simulation.recorder import Simulation
+from lidarslam.simulation.sensors.table import find_sensor
+from lidarslam.simulation.worlds.registry import build_world
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_drone_takes_off(seed: int) -> None:
+    world = build_world("street", seed)
+    motion = motion_along_route("drone-agile", world, seed)
+    T_body_lidar = mount_pose("upright", motion.sensor_height_m)
+    simulation = Simulation(world, find_sensor("mid-360"), motion, T_body_lidar, 30, seed=seed)
+    scans, mapper = list(simulation.scans()), SurfelMapper(MappingConfig())
+    results = [mapper.process(scan, Prior()) for scan in scans]
+    T_map_lidar = simulation.ground_truth.at(np.array([scan.stamp for scan in scans]), 0.2)
+    estimated = np.array([result.state.T_world_lidar for result in results])
+    steps = inverse(inverse(T_map_lidar[:-1]) @ T_map_lidar[1:]) @ inverse(estimated[:-1]) @ estimated[1:]
+    assert np.linalg.norm(steps[10:, :3, 3], axis=1).max() < 0.1
+    assert np.linalg.norm((inverse(T_map_lidar[0]) @ T_map_lidar[-1] - estimated[-1])[:3, 3]) < 1.0
+    assert Status.LOST not in {result.status for result in results}
