@@ -119,13 +119,14 @@ class Scan:
         interpolated between the nearest ones in the stored order; where that is more than half of the points, the
         times are worth nothing and are left out. So are rings when one of them is no number of a laser.
         """
-        raw = np.asarray(points, dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # damaged bytes may be any number
+            raw = np.asarray(points, dtype=np.float64)
         if raw.size and raw.shape[-1] != 3:
             raise ValueError(f"points must be (..., 3), got {raw.shape}")
         xyz = raw.reshape(-1, 3)
         offsets = _column("time_offsets", time_offsets, len(xyz), np.float64)
         lasers = _column("rings", rings, len(xyz), None)
-        with np.errstate(over="ignore", invalid="ignore"):  # damaged bytes may be any number
+        with np.errstate(over="ignore", invalid="ignore"):
             brightness = _column("intensities", intensities, len(xyz), np.float32)
         rgb = None if colours is None else _colours(colours, len(xyz))
         xyz, valid = np.ascontiguousarray(xyz), np.empty(len(xyz), dtype=np.bool_)

@@ -35,3 +35,8 @@ class ReaderConfig(BaseModel):
         description="where the recorded z axis points: upright, upside-down, left, right, forward, backward, camera, or"
         " roll, pitch, yaw of the recorded axes in degrees; auto: seen from the ground",
     )
+    elevation_correction_deg: Annotated[float, Field(ge=-5.0, le=5.0)] | Literal["auto"] | None = Field(
+        None,
+        description="by how much all points are raised; null: 0.205 for KITTI, else 0; auto: that, and what `run` finds"
+        " in a part of the recording beforehand",
+    )

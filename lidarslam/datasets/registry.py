@@ -9,6 +9,7 @@ from typing import NamedTuple, cast
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.folders.scan_files import SCAN_SUFFIXES
+from lidarslam.datasets.mounting.elevation import KITTI_DEG
 from lidarslam.datasets.mounting.recording import MountedRecording
 from lidarslam.datasets.published.evalio_names import is_of_evalio, located
 from lidarslam.datasets.published.unrecognised import absent, result_of_program, unrecognised
@@ -28,6 +29,7 @@ class Reader(NamedTuple):
     reads: str  # the layout, in words
     recognises: Callable[[Path], bool]  # whether names alone fit; no file is opened
     takes_sequence: bool = False  # whether --sequence chooses among what a source holds
+    elevation_deg: float = 0.0  # by how much its points have to be raised, unless the settings have it
 
 
 def _is_rosbag(source: Path) -> bool:
@@ -58,6 +60,7 @@ READERS: dict[str, Reader] = {
         "KITTI odometry: the root (with --sequence) or one sequences/NN folder",
         lambda source: (source / "sequences").is_dir() or (source / "velodyne").is_dir(),
         takes_sequence=True,
+        elevation_deg=KITTI_DEG,
     ),
     "kitti-360": Reader(
         "lidarslam.datasets.published.kitti_360",
@@ -69,6 +72,7 @@ READERS: dict[str, Reader] = {
         "lidarslam.datasets.kitti.raw",
         "KITTI raw: a ..._drive_NNNN_sync or ..._extract folder",
         lambda source: (source / "velodyne_points" / "data").is_dir(),
+        elevation_deg=KITTI_DEG,
     ),
     "nuscenes": Reader(
         "lidarslam.datasets.published.nuscenes",
@@ -164,7 +168,7 @@ def recognise(source: Path) -> str | None:
 
 
 def open_recording(source: Path, config: ReaderConfig | None = None) -> Recording:
-    """Open a recording, in upright axes; scans are read later, one at a time.
+    """Open a recording, in upright axes, elevations corrected; scans are read later, one at a time.
 
     Raises:
         InputError: the source cannot be read by the chosen reader.
@@ -176,6 +180,8 @@ def open_recording(source: Path, config: ReaderConfig | None = None) -> Recordin
     if name == "rosbag" and source.is_dir() and _bag_of_folder(source).is_file():
         source = _bag_of_folder(source)
     recording = cast(Recording, import_module(READERS[name].module).open_recording(source, config))
-    if config.mounting == "upright":
+    setting = config.elevation_correction_deg
+    raised_deg = setting if isinstance(setting, float) else READERS[name].elevation_deg
+    if config.mounting == "upright" and not raised_deg:
         return recording
-    return MountedRecording(recording, config.mounting)
+    return MountedRecording(recording, config.mounting, raised_deg)

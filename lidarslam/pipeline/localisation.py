@@ -10,6 +10,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
@@ -99,16 +100,21 @@ class ScanToMap(Stateful):
     Args:
         mapper: registers.
         inertial: an IMU's part in the prior.
+        elevation: is given the scans that are registered to surfels.
     """
 
     _mapper: Mapper
     _inertial: Inertial | None
+    _elevation: ElevationEstimator | None
     _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
     _T_world_last: Annotated[FloatArray, TRANSFORM]
 
-    def __init__(self, mapper: Mapper, inertial: Inertial | None = None) -> None:
+    def __init__(
+        self, mapper: Mapper, inertial: Inertial | None = None, elevation: ElevationEstimator | None = None
+    ) -> None:
         self._mapper = mapper
         self._inertial = inertial
+        self._elevation = elevation
         self._T_odom_lidar = np.eye(4)
         self._T_world_last = np.eye(4)
 
@@ -134,6 +140,8 @@ class ScanToMap(Stateful):
             mapped = self._mapper.process(estimated.scan, prior)
         else:
             mapped = self.surfel_mapper.process_sampled(estimated.sampled, prior)
+            if self._elevation is not None:
+                self._elevation.add(estimated.sampled, mapped)
         if self._inertial is not None:
             self._inertial.update(estimated.scan, mapped)
         expected = inverse(self._T_world_last) @ mapped.T_world_predicted
@@ -171,8 +179,13 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
     return fit.status, f"only {100.0 * fit.inlier_ratio:.0f} % of the points fit the previous scan"
 
 
-def make_localiser(config: Config, inertial: Inertial | None = None) -> Localiser:
-    """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone."""
+def make_localiser(
+    config: Config, inertial: Inertial | None = None, elevation: ElevationEstimator | None = None
+) -> Localiser:
+    """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
+
+    Of surfels, the error of the sensor's elevations is estimated on the way.
+    """
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())
     if config.mapping.method == "loam":
@@ -180,4 +193,4 @@ def make_localiser(config: Config, inertial: Inertial | None = None) -> Localise
 
         return ScanToMap(LoamMapper(config.mapping), inertial)
     corrects = config.pose_graph.enabled and config.pose_graph.corrects_local_map
-    return ScanToMap(SurfelMapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0), inertial)
+    return ScanToMap(SurfelMapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0), inertial, elevation)

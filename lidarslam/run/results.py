@@ -92,7 +92,7 @@ def write_results(
         log.warn("the map is empty: min_range_m, max_range_m and min_hits of global_map leave no point")
     skipped = 0 if tracked.stopped else tracked.asked - len(log) - tracked.faults.left_out
     contradictions = find_contradictions(tracked.slides, log.trajectory.T_world_lidar)
-    summary = summarise(log, written, skipped, closed, contradictions)
+    summary = summarise(log, written, skipped, closed, contradictions, tracked.elevation)
     directory.write_json(files.SUMMARY, summary.to_json())
     return RunOutcome(summary, metrics, tracked.stopped)
 

@@ -61,6 +61,8 @@ def lost_when_finished(request: RunRequest) -> bool | None:
         lost |= is_unconstrained(summary.get("unconstrained_m", 0.0), summary.get("length_m", 0.0))
     except (ConfigError, InputError, KeyError, TypeError, ValueError):
         return None
+    if request.config.reader.elevation_correction_deg == "auto":
+        was["reader"]["elevation_correction_deg"] = "auto"  # config.yaml has what was found
     if was_run != describe_run(request) or was != request.config.model_dump(exclude=WITHOUT_EFFECT):
         raise InputError(f"{out}: holds another finished run; name another directory, or replace it with --overwrite")
     return lost

@@ -14,6 +14,7 @@ from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.run.elevation import with_elevations
 from lidarslam.run.inertial import imu_samples
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
@@ -80,6 +81,7 @@ def execute(
                 stack.callback(graph.close)
             with viewing(request.rerun, config.viewer, recording.name, directory, log, page) as viewer:
                 compiling.wait_for_first_scan(phase)
+                request, recording = with_elevations(request, recording, chosen, phase)
                 phase("reading the first scans")
                 tracked = track(request, recording, chosen, odometry, log, graph, viewer, progress, unfinished)
                 interruptions.protect_results()
@@ -90,7 +92,7 @@ def execute(
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
             formats = request.map_formats
-            outcome = write_results(directory, config, describe_run(request), tracked, closed, drawn, formats)
+            outcome = write_results(directory, request.config, describe_run(request), tracked, closed, drawn, formats)
         if unfinished is not None:
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.files.state.is_file()

@@ -16,6 +16,7 @@ from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.recording import Recording
+from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
@@ -27,6 +28,7 @@ from lidarslam.pipeline.localisation import Localiser, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
+from lidarslam.run.elevation import Elevation
 from lidarslam.run.inertial import open_inertial
 from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
@@ -52,6 +54,7 @@ class Tracked:
     views: Views  # range images of some scans, for the removal of moving objects
     slides: PairTests  # pairs of scans, for the detection of slips
     error: InputError | KeyboardInterrupt | None  # what ended it before its last scan, None when nothing did
+    elevation: Elevation | None = None  # the error of the sensor's elevations; None where nothing shows it
 
     @property
     def stopped(self) -> str | None:
@@ -99,7 +102,8 @@ def track(
     if inertial is not None:
         scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
-    localiser = localiser or make_localiser(config, inertial)
+    estimator = ElevationEstimator()
+    localiser = localiser or make_localiser(config, inertial, estimator)
     store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
@@ -116,8 +120,12 @@ def track(
             raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)
         why = "; ".join(_why_none(log, faults, error))
         raise NoScanError(f"{request.source}: no scan could be used: {why}", False)
-    built = pipeline.map
-    return Tracked(recording, truth, log, len(chosen), faults, built.global_map, built.views, built.slides.tests, error)
+    built, elevation = pipeline.map, Elevation.found(recording, estimator)
+    if elevation is not None and elevation.warning is not None:
+        log.warn(elevation.warning)
+    return Tracked(
+        recording, truth, log, len(chosen), faults, built.global_map, built.views, built.slides.tests, error, elevation
+    )
 
 
 def _process(

@@ -9,10 +9,9 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid
 from lidarslam.core.text.trajectory_io import format_kitti
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.odometry import KittiOdometryRecording
 from lidarslam.datasets.mounting.recording import MountedRecording
-from lidarslam.datasets.registry import choose_reader, open_recording
+from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 
 # The camera looks along the LiDAR's x: x_cam = -y, y_cam = -z, z_cam = x, a little tilted, and moved.
 AXES = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -22,7 +21,7 @@ T_CAM_LIDAR = AXES @ exp([0.01, -0.02, 0.015, 0.1, -0.05, -0.3])
 @pytest.fixture
 def uncorrected(monkeypatch):
     """Scans as they lie on disk."""
-    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
+    monkeypatch.setitem(READERS, "kitti-odometry", READERS["kitti-odometry"]._replace(elevation_deg=0.0))
 
 
 def _truth(count: int) -> np.ndarray:
@@ -102,12 +101,11 @@ def test_more_poses_than_stamps_are_cut_off(tmp_path, rng):
     assert len(open_recording(tmp_path).ground_truth) == 6
 
 
-def test_the_correction_raises_every_point(tmp_path, rng, monkeypatch):
+def test_the_correction_raises_every_point(tmp_path, rng):
     _write_sequence(tmp_path, rng)
     recording = open_recording(tmp_path)
     raised = next(recording.scans()).points
-    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
-    plain = next(recording.scans()).points
+    plain = next(open_recording(tmp_path, ReaderConfig(elevation_correction_deg=0.0)).scans()).points
     elevation = [np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) for p in (plain, raised)]
     np.testing.assert_allclose(np.rad2deg(elevation[1] - elevation[0]), 0.205, atol=1e-9)
     assert any("0.205" in note for note in recording.describe().notes)

@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, is_rigid, log, make_transform
 from lidarslam.datasets.config import ReaderConfig
-from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.oxts import oxts_poses
-from lidarslam.datasets.registry import choose_reader, open_recording
+from lidarslam.datasets.registry import READERS, choose_reader, open_recording
 from lidarslam.datasets.times.azimuth import offsets_from_azimuth
 from lidarslam.datasets.times.stamps import increasing_rows, mend_stamps
 
@@ -27,7 +26,7 @@ MID_S, JITTER_S = 0.1037, 0.004
 @pytest.fixture
 def uncorrected(monkeypatch):
     """Scans as they lie on disk."""
-    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
+    monkeypatch.setitem(READERS, "kitti-raw", READERS["kitti-raw"]._replace(elevation_deg=0.0))
 
 
 def _stamp_lines(seconds: np.ndarray) -> str:
@@ -267,11 +266,10 @@ def test_without_calibration_or_oxts_there_is_no_truth(tmp_path, rng):
     assert recording.describe().ground_truth is None
 
 
-def test_the_correction_changes_elevations_and_no_times(tmp_path, rng, monkeypatch):
-    recording = open_recording(_write_drive(tmp_path, rng))
-    raised = next(recording.scans())
-    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
-    plain = next(recording.scans())
+def test_the_correction_changes_elevations_and_no_times(tmp_path, rng):
+    drive = _write_drive(tmp_path, rng)
+    raised = next(open_recording(drive).scans())
+    plain = next(open_recording(drive, ReaderConfig(elevation_correction_deg=0.0)).scans())
     elevation = [np.arctan2(s.points[:, 2], np.hypot(s.points[:, 0], s.points[:, 1])) for s in (plain, raised)]
     np.testing.assert_allclose(np.rad2deg(elevation[1] - elevation[0]), 0.205, atol=1e-9)
     np.testing.assert_array_equal(raised.time_offsets, plain.time_offsets)

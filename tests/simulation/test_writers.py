@@ -12,7 +12,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import exp, inverse, transform_points
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
-from lidarslam.datasets.kitti import correction
+from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.kitti.calibration import read_calibration, read_tr
 from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.recorder import SimulatedScan
@@ -245,10 +245,10 @@ def test_compensation_moves_each_point_by_the_motion_since_the_stamp(sweeps, rig
     assert compensate(still, rig) is still.points
 
 
-def test_kitti_scans_lie_too_low_like_kittis_own(tmp_path, sweeps, rig, monkeypatch):
+def test_kitti_scans_lie_too_low_like_kittis_own(tmp_path, sweeps, rig):
     write("kitti", tmp_path / "drive", sweeps, rig)
-    monkeypatch.setattr(correction, "ELEVATION_DEG", 0.0)
-    points = next(open_recording(tmp_path / "drive").scans()).points
+    stored = ReaderConfig(elevation_correction_deg=0.0)
+    points = next(open_recording(tmp_path / "drive", stored).scans()).points
     true_points = compensate(sweeps[0].scan, rig)
     raised_deg = np.rad2deg(elevation(true_points) - elevation(points))
     np.testing.assert_allclose(raised_deg, 0.205, atol=1e-3)

@@ -21,7 +21,6 @@ from lidarslam.datasets.config import ReaderConfig
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
-from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_tr
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.times.stamps import assumed_rate, increasing_rows, read_stamps
@@ -130,8 +129,7 @@ class KittiOdometryRecording(FileRecording):
 
     def _read(self, index: int, faults: Faults) -> Scan:  # noqa: ARG002
         rows = read_bin(self._files[index])
-        points = correction.correct_elevation(rows[:, :3], correction.ELEVATION_DEG)
-        return Scan.from_raw(points, self.stamps[index], intensities=rows[:, 3])
+        return Scan.from_raw(rows[:, :3], self.stamps[index], intensities=rows[:, 3])
 
     def _truth_path(self) -> Path | None:
         return self._pose_file if (self._folder / "calib.txt").is_file() else None
@@ -142,7 +140,6 @@ class KittiOdometryRecording(FileRecording):
 
     def _notes(self) -> Iterator[str]:
         yield "The scans are motion compensated by the publishers; they have no per-point time and need none."
-        yield correction.NOTE
 
     @property
     def warnings(self) -> tuple[str, ...]:

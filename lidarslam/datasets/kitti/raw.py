@@ -19,7 +19,6 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.folders.file_recording import FileRecording
 from lidarslam.datasets.folders.scan_files import numbered_scans, read_bin
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.datasets.kitti import correction
 from lidarslam.datasets.kitti.calibration import read_raw_calibration
 from lidarslam.datasets.kitti.oxts import OxtsPoses, read_oxts
 from lidarslam.datasets.kitti.raw_timing import read_sweep_timing
@@ -123,11 +122,9 @@ class KittiRawRecording(FileRecording):
         points = rows[:, :3]
         offsets = None
         if self._config.time_reference != "none":
-            # The elevation correction turns points in their vertical plane, so azimuths are the same before it.
             before_s, after_s = self._timing.before_s[index], self._timing.after_s[index]
             offsets = offsets_from_azimuth(points, float(before_s), float(after_s))
-        corrected = correction.correct_elevation(points, correction.ELEVATION_DEG)
-        return Scan.from_raw(corrected, self.stamps[index], offsets, intensities=rows[:, 3])
+        return Scan.from_raw(points, self.stamps[index], offsets, intensities=rows[:, 3])
 
     def _truth_path(self) -> Path | None:
         return None if self.ground_truth is None else self._folder / "oxts"
@@ -147,7 +144,6 @@ class KittiRawRecording(FileRecording):
         return (*self._timing.notes, *gaps)
 
     def _notes(self) -> Iterator[str]:
-        yield correction.NOTE
         if self._oxts is None:
             yield "There is no oxts folder, so there is no ground truth."
             return

@@ -1,4 +1,4 @@
-"""A recording in upright axes."""
+"""A recording in upright axes, with its elevations corrected."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,6 +13,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.config import Mounting
 from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.mounting.elevation import correct_elevation
 from lidarslam.datasets.mounting.guess import UPRIGHT, Guess, guess_mounting
 from lidarslam.datasets.mounting.rotation import transform_of, turned, written
 from lidarslam.datasets.recording import Recording, RecordingInfo
@@ -27,10 +28,12 @@ class MountedRecording:
     Args:
         recorded: in its own axes.
         mounting: of these; auto: guessed from the first scans, when it is needed.
+        raised_deg: added to the elevations of all points, above the recorded x-y plane.
     """
 
-    def __init__(self, recorded: Recording, mounting: Mounting) -> None:
+    def __init__(self, recorded: Recording, mounting: Mounting, raised_deg: float = 0.0) -> None:
         self.recorded = recorded
+        self.raised_deg = raised_deg
         self._mounting = mounting
 
     @cached_property
@@ -93,9 +96,14 @@ class MountedRecording:
         self, start: int = 0, stop: int | None = None, step: int = 1, faults: Faults | None = None
     ) -> Iterator[Scan]:
         """The scans with the indices of `range(start, stop, step)`, in upright axes."""
-        T = self.T_upright_recorded  # guessed before the first scan: two passes through one file may not alternate
+        _ = self.T_upright_recorded  # guessed before the first scan: two passes through one file may not alternate
         scans = self.recorded.scans(start, stop, step, faults)
-        return (turned(scan, T) for scan in scans) if self._is_turned else scans
+        return map(self._upright, scans) if self._is_turned or self.raised_deg else scans
+
+    def _upright(self, scan: Scan) -> Scan:
+        if self.raised_deg:
+            scan = replace(scan, points=correct_elevation(scan.points, self.raised_deg))
+        return turned(scan, self.T_upright_recorded)
 
     def describe(self) -> RecordingInfo:
         """The contents of the recording, and its mounting unless it is upright."""
@@ -104,7 +112,11 @@ class MountedRecording:
             notes.append(f"{self._guess.warning[0].upper()}{self._guess.warning[1:]}.")
         elif self._is_turned:
             notes.append(f"The scans are turned upright, as reader.mounting={written(self._guess.mounting)}.")
-        return replace(info, first=turned(info.first, self.T_upright_recorded), notes=(*info.notes, *notes))
+        if self.raised_deg:
+            notes.append(
+                f"Every point is raised by {self.raised_deg:g} degrees of elevation, before every method alike."
+            )
+        return replace(info, first=self._upright(info.first), notes=(*info.notes, *notes))
 
 
 def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
@@ -112,3 +124,10 @@ def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
     if isinstance(recording, MountedRecording):
         return recording.recorded, recording.T_upright_recorded
     return recording, np.eye(4)
+
+
+def elevation_of(recording: Recording | None) -> tuple[float, float]:
+    """By how many degrees a recording's points are raised, and the cosine between its recorded z axis and up."""
+    if not isinstance(recording, MountedRecording):
+        return 0.0, 1.0
+    return recording.raised_deg, float(recording.T_upright_recorded[2, 2])

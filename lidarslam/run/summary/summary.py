@@ -14,6 +14,7 @@ from lidarslam.core.text.plain_text import count
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.slides.slides import Contradiction
 from lidarslam.pipeline.estimates import STAGES
+from lidarslam.run.elevation import Elevation, elevation_json
 from lidarslam.run.loop_closing import GraphOutcome, LoopReport
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.timing import Milliseconds, SlowestScan
@@ -91,6 +92,7 @@ class RunSummary:
     warnings: tuple[str, ...]
     contradictions: tuple[Contradiction, ...] = ()
     slowest: SlowestScan | None = None
+    elevation: Elevation | None = None
 
     @property
     def went_astray(self) -> bool:
@@ -123,6 +125,7 @@ class RunSummary:
             "degraded_scans": self.degraded_scans,
             "unconstrained_m": self.unconstrained_m,
             "map_contradictions": [vars(found) for found in self.contradictions],
+            **elevation_json(self.elevation),
             **graph_and_map_json(self.graph, self.map, self.warnings),
         }
 
@@ -143,6 +146,7 @@ def summarise(
     skipped: int,
     closed: GraphOutcome | None = None,
     contradictions: tuple[Contradiction, ...] = (),
+    elevation: Elevation | None = None,
 ) -> RunSummary:
     """Summarise a run.
 
@@ -152,6 +156,7 @@ def summarise(
         skipped: scans that were asked for and are missing without a warning in the log.
         closed: the optimised pose graph, if there is one.
         contradictions: where the map contradicts itself.
+        elevation: the error of the sensor's elevations.
     """
     trajectory, total_ms = log.trajectory, log.total_ms
     stages = {"total": total_ms} | dict(zip(STAGES, log.stage_ms.T, strict=True))
@@ -172,6 +177,7 @@ def summarise(
         warnings=(*log.warnings, *_warnings(log, skipped, contradictions, unconstrained_m)),
         contradictions=contradictions,
         slowest=SlowestScan.of(log.stage_ms),
+        elevation=elevation,
     )
 
 

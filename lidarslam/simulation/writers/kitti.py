@@ -8,7 +8,7 @@ import numpy as np
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
 from lidarslam.core.scan import Scan
 from lidarslam.core.text.trajectory_io import format_kitti
-from lidarslam.datasets.kitti.correction import ELEVATION_DEG, correct_elevation
+from lidarslam.datasets.mounting.elevation import KITTI_DEG, correct_elevation
 from lidarslam.simulation.recorder import SimulatedScan
 from lidarslam.simulation.writers.interface import Rig
 
@@ -66,7 +66,7 @@ def compensate(scan: Scan, rig: Rig) -> FloatArray:
 def _rows(points: FloatArray, simulated: SimulatedScan) -> FloatArray:
     # KITTI's own scans lie too low, and everybody who reads them raises them; exact points would come out too high.
     intensities = simulated.intensities / _FULL_INTENSITY
-    return np.column_stack([correct_elevation(points, -ELEVATION_DEG), intensities]).astype("<f4")
+    return np.column_stack([correct_elevation(points, -KITTI_DEG), intensities]).astype("<f4")
 
 
 def _format_calibration() -> str:

@@ -1,0 +1,1 @@
+"""Estimating the error of a sensor's elevations."""

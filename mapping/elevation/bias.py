@@ -1,0 +1,187 @@
+"""The elevation bias of a LiDAR, from surfaces that were seen from near and from far.
+
+With an error of elevation, a point at range r is off by r times that angle, across its ray: the same ground seen from
+near and from far disagrees, and bends under the sensor. No motion explains the bend, so that the angle is observable
+while the sensor moves. Some scans of a stretch are adjusted together (bundle adjustment): their poses, the planes that
+they see, and one angle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.state.stateful import TRANSFORM, Shape
+from lidarslam.mapping.surfels.voxel_hash import point_keys
+
+IntArray = NDArray[np.intp]
+
+_ITERATIONS = 6
+# A plane has at least so many points, of so many scans, and is thin compared with its width, and not long and narrow.
+_FEWEST_POINTS, _FEWEST_SCANS = 10, 3
+_MOST_THICKNESS, _LEAST_WIDTH, _MOST_THICKNESS_M = 0.4, 0.15, 0.1
+# Standard deviations of a mean of points across its surface, and along its ray; the second is large because all points
+# of a laser share its offset of range, so that grazing rays, which it moves along the surface, count most.
+_NOISE_M, _RANGE_M = 0.02, 0.1
+# Accuracy of a range as manufacturers state it: an offset that all points may share.
+_OFFSET_M = 0.02
+# Scale of Geman and McClure's weights.
+_SCALE_M = 0.1
+# Errors are taken as independent between sectors of azimuth and scans, and between bands of elevation, not within. The
+# last are those of lasers, and the same everywhere.
+_BAND_RAD, _SECTOR_RAD = np.deg2rad(1.0), np.deg2rad(30.0)
+# A larger angle is no error of calibration, but a stretch that does not show one.
+_LARGEST_RAD = np.deg2rad(5.0)
+# Beyond this sine of the elevation the azimuth is not defined well.
+_STEEPEST = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPoints:
+    """Points of a scan, compensated, with its pose."""
+
+    points: Annotated[FloatArray, Shape(None, 3)]  # in the LiDAR frame
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]
+
+
+@dataclass(frozen=True)
+class ElevationBias:
+    """By how much all points of a sensor lie too low, in radians: raised by it, they are right."""
+
+    angle: float
+    # standard deviations: of what differs from stretch to stretch, and of what the sensor's other errors contribute
+    scatter: float
+    systematic: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the angle."""
+        return float(np.hypot(self.scatter, self.systematic))
+
+
+def combined(found: FloatArray) -> ElevationBias | None:
+    """The weighted mean of rows (N, 3) of angle, scatter and systematic deviation; None of none."""
+    if not len(found):
+        return None
+    angles, scatters, systematic = found.T
+    weights = 1.0 / (scatters**2 + systematic**2)
+    weights /= weights.sum()
+    return ElevationBias(
+        float(weights @ angles), float(np.linalg.norm(weights * scatters)), float(weights @ systematic)
+    )
+
+
+def estimate_bias(scans: Sequence[PlacedPoints], edge_m: float) -> ElevationBias | None:
+    """The bias of a stretch, of elevations above the x-y plane.
+
+    Args:
+        scans: with poses that are nearly right.
+        edge_m: of the cubes in which points are taken as one plane.
+
+    Returns:
+        None where too few surfaces were seen by several scans.
+    """
+    points = np.concatenate([scan.points for scan in scans])
+    number = np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans])
+    poses, bias = np.stack([scan.T_world_lidar for scan in scans]), ElevationBias(0.0, np.inf, np.inf)
+    sines = points[:, 2] / np.linalg.norm(points, axis=1)
+    usable = np.abs(sines) < _STEEPEST
+    points, number, elevations = points[usable], number[usable], np.arcsin(sines[usable])
+    # The motion of a point for a radian of elevation.
+    rho = np.hypot(points[:, 0], points[:, 1])
+    lift = np.column_stack([-points[:, :2] * (points[:, 2] / rho)[:, None], rho])
+    for _ in range(_ITERATIONS):
+        system = _System.of(points + bias.angle * lift, lift, elevations, number, poses, edge_m)
+        if system is None:
+            return None
+        step, scatter, systematic = system.solve()
+        poses = poses @ exp(step[:-1].reshape(-1, 6))
+        bias = ElevationBias(bias.angle + float(step[-1]), scatter, systematic)
+        if not abs(bias.angle) < _LARGEST_RAD:
+            return None
+    return bias
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Linearised distances from planes: a row for the mean of a scan's points in a plane's cube."""
+
+    scans: int  # K
+    # plane, scan: (M,) their numbers; jacobian: (M, 7) with pose and angle; residual, weight: (M,)
+    plane: IntArray
+    scan: IntArray
+    jacobian: FloatArray
+    residual: FloatArray
+    weight: FloatArray
+    cosine: FloatArray  # (M,) of the angle between ray and normal: the derivative with the range
+    band: IntArray  # (M,) of elevation
+    sector: IntArray  # (M,) of azimuth
+
+    @classmethod
+    def of(
+        cls, points: FloatArray, lift: FloatArray, elevations: FloatArray, number: IntArray, poses: FloatArray,
+        edge_m: float,
+    ) -> "_System | None":  # fmt: skip
+        """Of points (N, 3) with their scans' numbers (N,), at poses (K, 4, 4)."""
+        world = np.einsum("nij,nj->ni", poses[number, :3, :3], points) + poses[number, :3, 3]
+        _, cube = np.unique(point_keys(world, edge_m), return_inverse=True)
+        middle = _means(world, cube)
+        away = world - middle[cube]
+        products = np.stack([away[:, i] * away[:, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))], 1)
+        values, axes = np.linalg.eigh(_means(products, cube)[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+        spread = np.sqrt(np.maximum(values, 0.0)).T
+        key, row = np.unique(cube * len(poses) + number, return_inverse=True)
+        plane, scan = np.divmod(key, len(poses))
+        is_plane = (np.bincount(cube) >= _FEWEST_POINTS) & (np.bincount(plane) >= _FEWEST_SCANS)
+        is_plane &= (spread[0] < _MOST_THICKNESS * spread[1]) & (spread[1] > _LEAST_WIDTH * spread[2])
+        kept = np.flatnonzero((is_plane & (spread[0] < _MOST_THICKNESS_M))[plane])
+        if len(kept) < 7 * len(poses):
+            return None
+        normal = axes[plane, :, 0]
+        means = _means(np.column_stack([points, lift, away, elevations]), row)
+        inward = np.einsum("nji,nj->ni", poses[scan, :3, :3], normal)
+        p, residual = means[:, :3], np.einsum("ni,ni->n", means[:, 6:9], normal)
+        jacobian = np.column_stack([np.cross(p, inward), inward, np.einsum("ni,ni->n", means[:, 3:6], inward)])
+        cosine = np.einsum("ni,ni->n", p, inward) / np.linalg.norm(p, axis=1)
+        weight = 1.0 / ((_NOISE_M**2 + (_RANGE_M * cosine) ** 2) * (1.0 + (residual / _SCALE_M) ** 2) ** 2)
+        band = np.floor(means[:, 9] / _BAND_RAD).astype(np.intp)
+        sector = np.floor(np.arctan2(p[:, 1], p[:, 0]) / _SECTOR_RAD).astype(np.intp)
+        _, plane = np.unique(plane[kept], return_inverse=True)
+        rows = (jacobian, residual, weight, cosine, band - band.min(), sector - sector.min())
+        return cls(len(poses), plane, scan[kept], *(values[kept] for values in rows))
+
+    def solve(self) -> tuple[FloatArray, float, float]:
+        """The step (6 K + 1,) of poses and angle, offsets of the planes eliminated; the angle's standard deviations.
+
+        They are those of a regression whose errors are alike within a group, or come from an offset of all ranges.
+        """
+        planes = np.bincount(self.plane, self.weight)
+        columns = np.column_stack([6 * self.scan[:, None] + np.arange(6), np.full(len(self.scan), 6 * self.scans)])
+        whole = np.zeros((len(self.scan), 6 * self.scans + 1))
+        np.put_along_axis(whole, columns, self.jacobian, axis=1)
+        order = np.argsort(self.plane, kind="stable")
+        begins = np.searchsorted(self.plane[order], np.arange(len(planes)))
+        whole -= (np.add.reduceat((self.weight[:, None] * whole)[order], begins) / planes[:, None])[self.plane]
+        weighted = self.weight[:, None] * whole
+        A, b = weighted.T @ whole, weighted.T @ self.residual
+        # The first pose is kept; the others may have directions that no plane constrains.
+        A[np.diag_indices(6 * self.scans)] += np.repeat([1e9, 1.0], [6, 6 * self.scans - 6])
+        both = np.linalg.solve(A[:-1, :-1], np.column_stack([A[:-1, -1], b[:-1]]))
+        # What of the angle's effect no motion explains, and what is left of the residuals.
+        unexplained = whole[:, -1] - whole[:, :-1] @ both[:, 0]
+        information = float(self.weight @ unexplained**2)
+        angle = -float(self.weight @ (unexplained * self.residual)) / information
+        step = np.append(-both[:, 1] - angle * both[:, 0], angle)
+        scores = self.weight * unexplained * (self.residual + whole @ step)
+        sector, scan, band = (np.linalg.norm(np.bincount(n, scores)) for n in (self.sector, self.scan, self.band))
+        offset = _OFFSET_M * float(self.weight @ (unexplained * self.cosine))
+        return step, float(np.hypot(sector, scan)) / information, float(np.hypot(band, offset)) / information
+
+
+def _means(values: FloatArray, group: IntArray) -> FloatArray:
+    """Means (G, C) of the rows of values (N, C) with the same number (N,)."""
+    sums = np.stack([np.bincount(group, column) for column in values.T], axis=1)
+    return np.asarray(sums / np.bincount(group)[:, None], dtype=np.float64)
