@@ -56,9 +56,9 @@ class Elevation:
         if not self.is_certain:
             return None
         return (
-            f"the sensor's elevations are off: points have to be raised by {self.elevation_bias_deg:+.2f} degrees"
-            f" (standard deviation {self.elevation_sigma_deg:.2f}) instead of {self.elevation_correction_deg:+.3g};"
-            f" --set reader.elevation_correction_deg={self.elevation_bias_deg:.2f} does so"
+            f"elevation bias of {self.elevation_bias_deg:+.2f} +- {self.elevation_sigma_deg:.2f} degrees, where"
+            f" {self.elevation_correction_deg:g} are corrected: try --set"
+            f" reader.elevation_correction_deg={self.elevation_bias_deg:.2f}"
         )
 
 

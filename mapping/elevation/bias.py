@@ -20,9 +20,10 @@ from lidarslam.mapping.surfels.voxel_hash import point_keys
 IntArray = NDArray[np.intp]
 
 _ITERATIONS = 6
-# A plane has at least so many points, of so many scans, and is thin compared with its width, and not long and narrow.
+# A plane has at least so many points, of so many scans, is not long and narrow, and is thin compared with its width and
+# with range noise: of grass, near and far scans see other parts.
 _FEWEST_POINTS, _FEWEST_SCANS = 10, 3
-_MOST_THICKNESS, _LEAST_WIDTH, _MOST_THICKNESS_M = 0.4, 0.15, 0.1
+_MOST_THICKNESS, _LEAST_WIDTH, _MOST_THICKNESS_M = 0.4, 0.15, 0.03
 # Standard deviations of a mean of points across its surface, and along its ray; the second is large because all points
 # of a laser share its offset of range, so that grazing rays, which it moves along the surface, count most.
 _NOISE_M, _RANGE_M = 0.02, 0.1

@@ -17,8 +17,8 @@ from lidarslam.mapping.tracking.mapped_scan import MappedScan
 _SCANS, _SPACING = 10, 0.2
 # A stretch that ends early needs so many.
 _FEWEST_SCANS = 4
-# Stretches in all: each takes some 40 ms, and more of them add little.
-_MOST_STRETCHES = 16
+# Stretches in all: each takes some 50 ms, and more of them add little.
+_MOST_STRETCHES = 8
 # Edge of the cubes with a plane, in cells of the map. Of these, so many are left out that a scan has about this many
 # points; the same ones for all scans, as what matters is seen by several.
 _EDGE_CELLS = 2.0

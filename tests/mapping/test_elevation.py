@@ -1,0 +1,112 @@
+"""The elevation bias of a sensor, against one that was added to exact rays of a street."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp
+from lidarslam.core.scan import Scan
+from lidarslam.core.state.stateful import Saved, State
+from lidarslam.core.tracking import Status
+from lidarslam.datasets.mounting.elevation import correct_elevation
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.elevation.bias import PlacedPoints, combined, estimate_bias
+from lidarslam.mapping.elevation.stretches import ElevationEstimator
+from lidarslam.mapping.motion.prediction import MotionState
+from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.tracking.mapped_scan import MappedScan
+
+EDGE_M, SCANS, STEP_M, NOISE_M = 0.8, 10, 1.5, 0.02
+TRUE_DEG = 0.2
+
+
+def poses() -> FloatArray:
+    along = -7.0 + STEP_M * np.arange(SCANS)
+    zero = np.zeros(SCANS)
+    return exp(np.stack([zero, zero, 0.02 * np.arange(SCANS), along, zero, zero - 1.0], axis=-1))
+
+
+def scan_at(place: Any, number: int, T: FloatArray, low_deg: float) -> FloatArray:
+    """Points (N, 3) of a sensor that places them too low."""
+    points = place.sweep(lambda times: np.tile(T, (len(times), 1, 1)), 0.1 * number).points
+    noise = np.random.default_rng(number).normal(0.0, NOISE_M, len(points))
+    return correct_elevation(points * (1.0 + noise / np.linalg.norm(points, axis=1))[:, None], -low_deg)
+
+
+@pytest.fixture(scope="module")
+def street(room: Any) -> Any:
+    pillars = tuple((x, 7.0 * side, 0.5) for x in range(-50, 50, 9) for side in (-1, 1))
+    return replace(room, half_size=(60.0, 9.0, 3.0), pillars=pillars)
+
+
+def stretch(street: Any, low_deg: float) -> list[PlacedPoints]:
+    """Scans at poses that are off by a centimetre and a tenth of a degree."""
+    rng = np.random.default_rng(7)
+    off = exp(rng.normal(0.0, [0.002] * 3 + [0.01] * 3, (SCANS, 6)))
+    return [
+        PlacedPoints(scan_at(street, number, T, low_deg), T @ off[number])
+        for number, T in enumerate(poses())
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("low_deg", [-TRUE_DEG, 0.0, TRUE_DEG])
+def test_a_known_bias_is_found(street: Any, low_deg: float) -> None:
+    bias = estimate_bias(stretch(street, low_deg), EDGE_M)
+    assert bias is not None
+    assert np.rad2deg(bias.angle) == pytest.approx(low_deg, abs=0.02)
+    assert abs(np.rad2deg(bias.angle) - low_deg) < 2.0 * np.rad2deg(bias.sigma)
+    assert np.rad2deg(bias.sigma) < 0.06
+
+
+def test_a_common_offset_of_ranges_is_within_the_standard_deviation(street: Any) -> None:
+    scans = [
+        replace(one, points=one.points * (1.0 + 0.02 / np.linalg.norm(one.points, axis=1))[:, None])
+        for one in stretch(street, 0.0)
+    ]
+    bias = estimate_bias(scans, EDGE_M)
+    assert bias is not None
+    assert abs(bias.angle) < 2.0 * bias.sigma
+
+
+def test_what_is_systematic_does_not_average_out() -> None:
+    bias = combined(np.tile([0.003, 0.001, 0.0005], (100, 1)))
+    assert bias is not None
+    assert (bias.angle, bias.scatter, bias.systematic) == pytest.approx((0.003, 0.0001, 0.0005))
+    assert combined(np.zeros((0, 3))) is None
+
+
+def registered(T: FloatArray, status: Status = Status.OK) -> MappedScan:
+    return MappedScan(MotionState(0.0, T, np.zeros(6), np.eye(12)), T, status is not Status.LOST, status)
+
+
+@pytest.fixture(scope="module")
+def sampled(street: Any) -> list[SampledScan]:
+    sampler = Sampler(MappingConfig())
+    return [
+        sampler.sample(Scan(scan_at(street, number, T, TRUE_DEG), 0.1 * number)) for number, T in enumerate(poses())
+    ]
+
+
+def test_a_saved_estimator_goes_on_as_before(
+    sampled: list[SampledScan], through_disk: Callable[[State], Saved]
+) -> None:
+    whole, first, second = ElevationEstimator(), ElevationEstimator(), ElevationEstimator()
+    for number, (scan, T) in enumerate(zip(sampled, poses(), strict=True)):
+        whole.add(scan, registered(T))
+        (first if number < 5 else second).add(scan, registered(T))
+        if number == 4:
+            second.restore(through_disk(first.state()))
+    assert whole.bias() == second.bias()
+    bias = whole.bias()
+    assert bias is not None
+    assert np.rad2deg(bias.angle) == pytest.approx(TRUE_DEG, abs=0.03)
+
+
+def test_a_stretch_ends_where_tracking_does(sampled: list[SampledScan]) -> None:
+    estimator = ElevationEstimator()
+    for number, (scan, T) in enumerate(zip(sampled, poses(), strict=True)):
+        estimator.add(scan, registered(T, Status.LOST if number % 3 == 2 else Status.OK))
+    assert estimator.bias() is None
