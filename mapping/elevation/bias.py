@@ -28,7 +28,7 @@ _MOST_THICKNESS, _LEAST_WIDTH, _MOST_THICKNESS_M = 0.4, 0.15, 0.03
 # of a laser share its offset of range, so that grazing rays, which it moves along the surface, count most.
 _NOISE_M, _RANGE_M = 0.02, 0.1
 # Accuracy of a range as manufacturers state it: an offset that all points may share.
-_OFFSET_M = 0.02
+_OFFSET_M = 0.03
 # Scale of Geman and McClure's weights.
 _SCALE_M = 0.1
 # Errors are taken as independent between sectors of azimuth and scans, and between bands of elevation, not within. The
