@@ -126,7 +126,7 @@ def recorded_axes(recording: Recording) -> tuple[Recording, FloatArray]:
     return recording, np.eye(4)
 
 
-def elevation_of(recording: Recording | None) -> tuple[float, float]:
+def elevation_of(recording: Recording) -> tuple[float, float]:
     """By how many degrees a recording's points are raised, and the cosine between its recorded z axis and up."""
     if not isinstance(recording, MountedRecording):
         return 0.0, 1.0
