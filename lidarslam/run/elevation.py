@@ -19,7 +19,7 @@ from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.run.request import RunRequest
 
 # An error is certain beyond so many standard deviations.
-_CERTAIN_SIGMAS = 3.0
+_CERTAIN_SIGMAS = 4.0
 # The elevations of a sensor whose recorded z axis is farther from up or down than this are about another axis.
 _UPRIGHT = 0.999
 # Scans that are registered beforehand, at most; fewer where the error is known well enough before.
