@@ -76,7 +76,7 @@ def live(ctx: click.Context, /, topic: str | None, out: Path | None, **options: 
             progress.phase("loading the program")
             from lidarslam.run.modes.live.live import execute
             from lidarslam.run.modes.live.request import LiveRequest
-            from lidarslam.run.summary.summary_text import format_outcome
+            from lidarslam.run.summary_text import format_outcome
             from lidarslam.storage.directory import RERUN
 
             options |= {"reader": None, "sequence": None, "topic": topic}  # those of recordings

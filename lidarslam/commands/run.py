@@ -64,7 +64,7 @@ def run(ctx: click.Context, /, source: Path, out: Path | None, **options: Any) -
             from lidarslam.run.request import RunRequest
             from lidarslam.run.resuming import abandoned, lost_when_finished
             from lidarslam.run.run import execute
-            from lidarslam.run.summary.summary_text import format_outcome, format_stop
+            from lidarslam.run.summary_text import format_outcome, format_stop
             from lidarslam.storage.directory import RERUN
 
             config, map_formats = take_config(options, source), take_map_formats(options)

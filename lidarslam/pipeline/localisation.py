@@ -1,6 +1,7 @@
 """The pose of each scan: scan-to-map registration, or the odometry alone with a check against the previous scan."""
 
 import time
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
@@ -16,6 +17,7 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
+from lidarslam.mapping.tracking.smoothed_start import SmoothedMotion
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
@@ -101,6 +103,7 @@ class ScanToMap(Stateful):
         mapper: registers.
         inertial: an IMU's part in the prior.
         elevation: is given the scans that are registered to surfels.
+        start: motions of the first scans, by stamp, that replace those of the odometry in the prior.
     """
 
     _mapper: Mapper
@@ -110,8 +113,13 @@ class ScanToMap(Stateful):
     _T_world_last: Annotated[FloatArray, TRANSFORM]
 
     def __init__(
-        self, mapper: Mapper, inertial: Inertial | None = None, elevation: ElevationEstimator | None = None
+        self,
+        mapper: Mapper,
+        inertial: Inertial | None = None,
+        elevation: ElevationEstimator | None = None,
+        start: Mapping[float, SmoothedMotion] | None = None,
     ) -> None:
+        self._start = start or {}
         self._mapper = mapper
         self._inertial = inertial
         self._elevation = elevation
@@ -130,10 +138,8 @@ class ScanToMap(Stateful):
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Refine the odometry's pose; where it measured nothing, the mapper predicts with the last velocity."""
         started = time.perf_counter()
-        measured = estimated.interval_s is not None
-        odometry = SweepMotion(estimated.velocity, following.velocity if following else None)
-        motion = estimated.motion
-        prior = Prior(motion.T_prev_curr if measured else None, odometry.mean(estimated.scan), motion.covariance)
+        measured, motion = estimated.interval_s is not None, estimated.motion
+        prior = self._prior(estimated, following)
         if self._inertial is not None:
             prior = self._inertial.prior(estimated.scan, prior)
         if self.surfel_mapper is None or estimated.sampled is None:
@@ -165,6 +171,16 @@ class ScanToMap(Stateful):
             cell_m=None if self.surfel_mapper is None else self.surfel_mapper.cell_m,
         )
 
+    def _prior(self, estimated: Estimated, following: Estimated | None) -> Prior:
+        motion = self._start.get(estimated.scan.stamp)
+        after = None if following is None else self._start.get(following.scan.stamp) or following
+        if motion is not None:
+            sweep = SweepMotion(motion.velocity, after.velocity if after else None)
+            return Prior(motion.T_prev_curr, sweep.mean(estimated.scan), motion.covariance)
+        sweep = SweepMotion(estimated.velocity, after.velocity if after else None)
+        T_prev_curr = None if estimated.interval_s is None else estimated.motion.T_prev_curr
+        return Prior(T_prev_curr, sweep.mean(estimated.scan), estimated.motion.covariance)
+
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
     """Lost without a measured motion; else as the fit to the previous scan and degeneracy have it."""
@@ -180,11 +196,14 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
 
 
 def make_localiser(
-    config: Config, inertial: Inertial | None = None, elevation: ElevationEstimator | None = None
+    config: Config,
+    inertial: Inertial | None = None,
+    elevation: ElevationEstimator | None = None,
+    start: Mapping[float, SmoothedMotion] | None = None,
 ) -> Localiser:
     """The configured scan-to-map registration, with an IMU where there is one, or the odometry alone.
 
-    Of surfels, the error of the sensor's elevations is estimated on the way.
+    Of surfels, the error of the sensor's elevations is estimated on the way, and the first scans may be smoothed.
     """
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())
@@ -193,4 +212,5 @@ def make_localiser(
 
         return ScanToMap(LoamMapper(config.mapping), inertial)
     corrects = config.pose_graph.enabled and config.pose_graph.corrects_local_map
-    return ScanToMap(SurfelMapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0), inertial, elevation)
+    mapper = SurfelMapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0)
+    return ScanToMap(mapper, inertial, elevation, start)

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from lidarslam.config.settings import Config
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import inverse
 from lidarslam.core.scan import Scan
@@ -22,6 +23,7 @@ from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
+from lidarslam.mapping.tracking.smoothed_start import SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import Localiser, make_localiser
@@ -103,7 +105,8 @@ def track(
         scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
     estimator = ElevationEstimator()
-    localiser = localiser or make_localiser(config, inertial, estimator)
+    if localiser is None:
+        localiser = make_localiser(config, inertial, estimator, _start(config, recording, chosen))
     store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
@@ -126,6 +129,15 @@ def track(
     return Tracked(
         recording, truth, log, len(chosen), faults, built.global_map, built.views, built.slides.tests, error, elevation
     )
+
+
+def _start(config: Config, recording: Recording, chosen: range) -> dict[float, SmoothedMotion]:
+    """The motions of the first scans, where they have to be smoothed."""
+    if config.mapping.method != "surfels":
+        return {}
+    with suppress(InputError):  # raised again when the scans are read
+        return smoothed_start(take_in(recording, chosen, Faults()), config.mapping)
+    return {}
 
 
 def _process(

@@ -6,7 +6,7 @@ from lidarslam.core.text.plain_text import count, joined
 from lidarslam.run.modes.merge.summary import MergedRecording, MergeSummary
 from lidarslam.run.modes.merge.writing import MergeOutcome
 from lidarslam.run.results import RunOutcome
-from lidarslam.run.summary.summary_text import format_map
+from lidarslam.run.summary_text import format_map
 
 
 def format_merge(out: Path, outcome: MergeOutcome) -> str:
