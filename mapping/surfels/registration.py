@@ -36,6 +36,9 @@ _GATE = 6.0
 _NARROWING = 0.8
 # Errors of neighbouring points are correlated: so many count as one. From true errors on simulated recordings.
 _CORRELATION = 4.0
+# Share of the correspondences' information in the resulting covariance: scans have errors in common, which the balance
+# with the prediction need not allow for. From true errors on real drives.
+_INFORMATION_SHARE = 0.25
 # Degrees of freedom of the prediction's error.
 _FREEDOM = 4.0
 # A velocity that differs by less than this over the interval needs no second compensation.
@@ -100,7 +103,7 @@ def register(
                         break
                     # An odometry saw the same small surfaces.
                     inflation, unknown, prior = found, prediction.covariance, prior / INFLATION**2
-        covariance = solution.covariance()
+        covariance = solution.covariance(_INFORMATION_SHARE)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
     return Registration(orthonormalize(T_world_lidar), velocity, covariance, solution.degeneracy, iterations, matcher)
@@ -194,12 +197,12 @@ class _Solution:
     prior: FloatArray
     degeneracy: Degeneracy
 
-    def covariance(self) -> FloatArray:
-        """(12, 12); along degenerate directions the correspondences' information does not count."""
+    def covariance(self, share: float = 1.0) -> FloatArray:
+        """(12, 12) with a share of the correspondences' information, none of it along degenerate directions."""
         scale = np.array([self.degeneracy.lever_m] * 3 + [1.0] * 3)
         D = self.degeneracy.directions
         observed = np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
-        return np.asarray(np.linalg.inv(observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
+        return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
 
 
 def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
