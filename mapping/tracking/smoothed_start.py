@@ -17,6 +17,7 @@ from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
 # Scans that are smoothed, and those of them that show whether that is needed, where a sweep makes a map.
 SMOOTHED, _SHOWING = 20, 8
+_FEWEST_KNOWN = 6
 # Standard deviations of a smoothed motion, rotation first.
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
 
@@ -39,7 +40,7 @@ def smoothed_start(scans: Iterable[Scan], config: MappingConfig) -> dict[float, 
     """Motions of the first scans, by stamp; empty where registration in order suffices.
 
     The map of a single sweep is thin, and what it lets slide stays in the map. So the first scans are registered in
-    order; from the last of them back, with the motions of the later half known, to a new map; and the motions of the
+    order; from the last of them back, with the motions of the latest known, to a new map; and the motions of the
     first half are those that this map shows. None is known where that loses track.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
@@ -54,9 +55,11 @@ def smoothed_start(scans: Iterable[Scan], config: MappingConfig) -> dict[float, 
             break
     if not needed or len(taken) < _SHOWING:
         return {}
-    known = forwards[len(forwards) // 2 - 1 :]
+    known = _tracked_at_last(forwards)
+    if len(known) < _FEWEST_KNOWN:
+        return {}
     backwards = _backwards(taken, _motions(known), unlimited)
-    if not (_is_tracked(known) and _is_tracked(backwards)):
+    if len(_tracked_at_last(backwards, most=len(backwards))) < len(backwards):
         return {}
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
     return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
@@ -82,5 +85,12 @@ def _motions(results: list[MappedScan]) -> list[FloatArray]:
     return [np.asarray(inverse(before) @ after, dtype=np.float64) for before, after in pairwise(poses)]
 
 
-def _is_tracked(results: list[MappedScan]) -> bool:
-    return all(result.status is not Status.LOST and result.is_connected for result in results)
+def _tracked_at_last(results: list[MappedScan], most: int | None = None) -> list[MappedScan]:
+    """The last of them, at most half if not given, that were tracked from one to the next."""
+    first = len(results) - (most or len(results) // 2 + 1)
+    for number in range(first, len(results)):
+        if results[number].status is Status.LOST:
+            first = number + 1
+        elif not results[number].is_connected:
+            first = number
+    return results[first:]
