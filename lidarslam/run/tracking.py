@@ -1,5 +1,6 @@
 """A recording through the pipeline: every scan is logged and shown, the state saved."""
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
@@ -23,7 +24,7 @@ from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
-from lidarslam.mapping.tracking.smoothed_start import SmoothedMotion, smoothed_start
+from lidarslam.mapping.tracking.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import Localiser, make_localiser
@@ -36,6 +37,8 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Progress = Callable[[int, int, ScanResult], None]
@@ -133,8 +136,9 @@ def track(
 
 def _start(config: Config, recording: Recording, chosen: range) -> dict[float, SmoothedMotion]:
     """The motions of the first scans, where they have to be smoothed."""
-    if config.mapping.method != "surfels":
+    if config.mapping.method != "surfels" or len(chosen) < SHOWING:
         return {}
+    logger.info("the first scans are registered beforehand")
     with suppress(InputError):  # raised again when the scans are read
         return smoothed_start(take_in(recording, chosen, Faults()), config.mapping)
     return {}

@@ -16,7 +16,7 @@ from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
 # Scans that are smoothed, and those of them that show whether that is needed, where a sweep makes a map.
-SMOOTHED, _SHOWING = 20, 8
+SMOOTHED, SHOWING = 20, 8
 _FEWEST_KNOWN = 6
 # Standard deviations of a smoothed motion, rotation first.
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
@@ -51,9 +51,9 @@ def smoothed_start(scans: Iterable[Scan], config: MappingConfig) -> dict[float, 
         forwards.append(ordered.process_sampled(sampled, Prior()))
         taken.append(scan)
         needed |= not sampled.has_rings or forwards[-1].status is not Status.OK
-        if len(taken) == SMOOTHED or (len(taken) == _SHOWING and not needed):
+        if len(taken) == SMOOTHED or (len(taken) == SHOWING and not needed):
             break
-    if not needed or len(taken) < _SHOWING:
+    if not needed or len(taken) < SHOWING:
         return {}
     known = _tracked_at_last(forwards)
     if len(known) < _FEWEST_KNOWN:
