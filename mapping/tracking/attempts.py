@@ -131,6 +131,8 @@ class ScanMatcher:
             return near
         best = near
         for cells in _ALONG_CELLS:
+            if self._budget.is_spent:
+                break
             start = near.T_world_lidar.copy()
             start[:3, 3] += cells * self._map.cell_m * np.array(near.fit.weakest)
             other = self._attempt(near.prediction, replace(near.prediction, T_world_lidar=start), coarse_first=False)
@@ -213,6 +215,7 @@ class ScanMatcher:
     ) -> Attempt:
         keypoints = keypoints or self.scan.keypoints
         attempt = self._registered(prediction, start, coarse_first, patient, keypoints)
+        # What hardly anything constrains would be estimated from the errors of the normals.
         evidence, weakest = attempt.fit.evidence, attempt.fit.weakest
         if self.scan.has_rings or not self._map.is_young or weakest is None or (evidence or 0.0) > _STROKES_EVIDENCE:
             return attempt
