@@ -8,9 +8,11 @@ from lidarslam.mapping.config import MappingConfig
 
 # Fewer points make no pose, and no scale.
 MIN_POINTS = 60
-# Cells per median range, and bounds of their size.
+# Cells per median range, and bounds of their size. Where walls are closer than so many metres, the cells are the
+# smallest: steps and door frames are as large in a wider stairwell.
 _CELLS_PER_RANGE = 30.0
 _CELL_BOUNDS_M = (0.05, 1.0)
+_CLOSE_M = 3.0
 # The cell size changes when the smoothed median range has changed by this factor.
 _RANGE_CHANGE = 2.0
 _RANGE_SMOOTHING = 0.05
@@ -39,4 +41,6 @@ class SceneScale(Stateful):
         low_m, high_m = self._cell_range_m / _RANGE_CHANGE, self._cell_range_m * _RANGE_CHANGE
         if self.range_m > 0.0 and not low_m <= self.range_m <= high_m:
             self._cell_range_m = self.range_m
+        if self._cell_range_m < _CLOSE_M:
+            return _CELL_BOUNDS_M[0]
         return float(np.clip(self._cell_range_m / _CELLS_PER_RANGE, *_CELL_BOUNDS_M))
