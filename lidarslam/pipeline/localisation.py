@@ -172,14 +172,12 @@ class ScanToMap(Stateful):
         )
 
     def _prior(self, estimated: Estimated, following: Estimated | None) -> Prior:
-        motion = self._start.get(estimated.scan.stamp)
+        smoothed = self._start.get(estimated.scan.stamp)
+        before = smoothed or estimated
         after = None if following is None else self._start.get(following.scan.stamp) or following
-        if motion is not None:
-            sweep = SweepMotion(motion.velocity, after.velocity if after else None)
-            return Prior(motion.T_prev_curr, sweep.mean(estimated.scan), motion.covariance)
-        sweep = SweepMotion(estimated.velocity, after.velocity if after else None)
-        T_prev_curr = None if estimated.interval_s is None else estimated.motion.T_prev_curr
-        return Prior(T_prev_curr, sweep.mean(estimated.scan), estimated.motion.covariance)
+        velocity = SweepMotion(before.velocity, after.velocity if after else None).mean(estimated.scan)
+        motion = smoothed or estimated.motion
+        return Prior(None if before.interval_s is None else motion.T_prev_curr, velocity, motion.covariance)
 
 
 def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:

@@ -1,7 +1,7 @@
 """Smoothing of the first scans: their motions by registration backwards in time, to the map of the scans after them."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,7 +28,11 @@ class SmoothedMotion:
 
     T_prev_curr: FloatArray  # (4, 4)
     interval_s: float
-    covariance: FloatArray = field(default_factory=_COVARIANCE.copy)  # (6, 6), as that of an odometry
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6), as that of an odometry."""
+        return _COVARIANCE
 
     @property
     def velocity(self) -> FloatArray:
@@ -55,11 +59,11 @@ def smoothed_start(scans: Iterable[Scan], config: MappingConfig) -> dict[float, 
             break
     if not needed or len(taken) < SHOWING:
         return {}
-    known = _tracked_at_last(forwards)
+    known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
     if len(known) < _FEWEST_KNOWN:
         return {}
     backwards = _backwards(taken, _motions(known), unlimited)
-    if len(_tracked_at_last(backwards, most=len(backwards))) < len(backwards):
+    if len(_tracked_at_last(backwards)) < len(backwards):
         return {}
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
     return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
@@ -85,12 +89,12 @@ def _motions(results: list[MappedScan]) -> list[FloatArray]:
     return [np.asarray(inverse(before) @ after, dtype=np.float64) for before, after in pairwise(poses)]
 
 
-def _tracked_at_last(results: list[MappedScan], most: int | None = None) -> list[MappedScan]:
-    """The last of them, at most half if not given, that were tracked from one to the next."""
-    first = len(results) - (most or len(results) // 2 + 1)
-    for number in range(first, len(results)):
-        if results[number].status is Status.LOST:
+def _tracked_at_last(results: list[MappedScan]) -> list[MappedScan]:
+    """The last of them that were tracked from one to the next."""
+    first = 0
+    for number, result in enumerate(results):
+        if result.status is Status.LOST:
             first = number + 1
-        elif not results[number].is_connected:
+        elif not result.is_connected:
             first = number
     return results[first:]
