@@ -90,7 +90,7 @@ def estimate(recorded: Recorded, config: Config) -> tuple[Trajectory, list[Statu
     inertial, scans = None, recorded.scans
     if config.odometry.uses_imu:
         assert recorded.imu.T_lidar_imu is not None
-        inertial = Inertial(recorded.imu, recorded.imu.T_lidar_imu, config.mapping)
+        inertial = Inertial(recorded.imu, recorded.imu.T_lidar_imu)
         scans = [inertial.gyroscope.evened(scan) for scan in scans]
     odometry, graph = make_odometry(config.odometry), begin_graph(config)
     try:

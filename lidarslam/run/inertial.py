@@ -57,7 +57,7 @@ def open_inertial(config: Config, recording: Recording, chosen: range) -> Inerti
     if T_lidar_imu is None:
         logger.info("finding how the IMU is mounted")
         T_lidar_imu = _found(config, recording, chosen, samples)
-    return Inertial(samples, T_lidar_imu, config.mapping)
+    return Inertial(samples, T_lidar_imu)
 
 
 def _rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> FloatArray:

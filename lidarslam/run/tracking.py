@@ -22,6 +22,7 @@ from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
+from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.mapping.tracking.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
@@ -109,7 +110,7 @@ def track(
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
     estimator = ElevationEstimator()
     if localiser is None:
-        localiser = make_localiser(config, inertial, estimator, _start(config, recording, chosen))
+        localiser = make_localiser(config, inertial, estimator, _start(config, recording, chosen, inertial))
     store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)
     if checkpoints is not None:
@@ -134,13 +135,18 @@ def track(
     )
 
 
-def _start(config: Config, recording: Recording, chosen: range) -> dict[float, SmoothedMotion]:
+def _start(
+    config: Config, recording: Recording, chosen: range, inertial: Inertial | None
+) -> dict[float, SmoothedMotion]:
     """The motions of the first scans, where they have to be smoothed."""
     if config.mapping.method != "surfels" or len(chosen) < SHOWING:
         return {}
     logger.info("the first scans are registered beforehand")
     with suppress(InputError):  # raised again when the scans are read
-        return smoothed_start(take_in(recording, chosen, Faults()), config.mapping)
+        scans = take_in(recording, chosen, Faults())
+        if inertial is None:
+            return smoothed_start(scans, config.mapping)
+        return smoothed_start(map(inertial.gyroscope.evened, scans), config.mapping, inertial.anew())
     return {}
 
 

@@ -72,6 +72,11 @@ class Gyroscope:
         at_ends = first_s >= near[0] - self._longest_s and last_s <= near[-1] + self._longest_s if len(near) else False
         return bool(at_ends and (np.diff(near) <= self._longest_s).all())
 
+    def within(self, first_s: float, last_s: float, step_s: float) -> FloatArray:
+        """(M,) even instants of a time that samples cover, as far as they do."""
+        first_s, last_s = np.clip([first_s, last_s], self._stamps[0], self._stamps[-1])
+        return np.linspace(first_s, last_s, max(2, int(np.ceil((last_s - first_s) / step_s)) + 1))
+
     def turn(self, first_s: float, last_s: float, bias: FloatArray) -> FloatArray:
         """(3, 3) R_first_last of the LiDAR between two instants; the bias (3,) is of the LiDAR's axes, rad/s."""
         steps = max(1, int(np.ceil(abs(last_s - first_s) / _STEP_S)))

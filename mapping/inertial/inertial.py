@@ -1,26 +1,32 @@
-"""An IMU's part in scan-to-map registration: the prior of a scan's turn and attitude, and what that needs to know."""
+"""An IMU's part in scan-to-map registration: it predicts each scan's state, and follows the registered poses."""
 
 from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, exp, inverse, log, make_transform, rotation_angle
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, make_transform, rotation_angle, skew
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
-from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.inertial.bias import BiasFilter
-from lidarslam.mapping.inertial.gravity import GravityFilter, Station, Velocity
-from lidarslam.mapping.inertial.gyroscope import Gyroscope, Integral
+from lidarslam.mapping.inertial.gyroscope import Gyroscope
+from lidarslam.mapping.inertial.preintegration import STANDARD_GRAVITY, Preintegration
+from lidarslam.mapping.inertial.window import InertialWindow, Knot
 from lidarslam.mapping.motion.prediction import GravityDirection, MotionState, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
-# Standard deviation of a translation that only goes on as before: the mapper's own process noise decides.
-_ANY_TRANSLATION_M = 10.0
-# Smoothing of the velocity between poses: without, errors at the stamps of uncompensated sweeps would swing.
-_SMOOTHING = 0.5
-_STEPS = 40
+# Errors of registered poses that no registration reports: standard deviations, rotation first.
+_REGISTRATION = np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3)
+# Error of a sweep's mean velocity, of which the motion is none: rotation, rad/s, and translation, m/s.
+_UNEVEN = np.array([0.01] * 3 + [0.03] * 3)
+# Directions of which a registration has at least this much information, beside the prediction, are measured.
+_LEAST_GAIN = 0.1
+# Time around a stamp over which the specific force is taken as gravity, seconds.
+_LEVEL_S, _STEP_S = 1.0, 0.02
+# Dead reckoning by the IMU alone ends after this time, seconds.
+_DEAD_RECKONING_S = 2.0
+# Gravity is measured this often, seconds, where its direction is known to this, radians.
+_EVERY_S, _LEVEL_SIGMA = 1.0, np.deg2rad(0.5)
 # The turns of IMU and LiDAR disagree when they differ by more than this share, and by more than registration does.
 _FEWEST_TURNS, _MOST_DIFFERENT, _REGISTRATION_ERROR = 50, 0.2, np.deg2rad(0.15)
 
@@ -31,27 +37,38 @@ class Inertial(Stateful):
     Args:
         samples: of the IMU.
         T_lidar_imu: (4, 4) extrinsic calibration.
-        config: of the mapping.
     """
 
-    _bias: BiasFilter
-    _gravity: GravityFilter
-    _last: MotionState | None
-    _velocity: Annotated[FloatArray, Shape(3)]  # translation between the last poses, body frame, m/s
+    _window: InertialWindow
+    _registered_s: float | None  # stamp of the last registered scan
+    _measured_s: float | None  # stamp at which gravity was measured last
+    _up_world: Annotated[FloatArray, Shape(3)] | None  # unit, as first known
     _direction: GravityDirection | None
     # of the turns that were compared: how many, and the sums of squares of their angles and of the differences
     _turns: int
     _angles2: float
     _differences2: float
 
-    def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray, config: MappingConfig) -> None:
-        self._config = config
-        self._lever = T_lidar_imu[:3, 3]
+    def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
+        self._samples, self._extrinsics = samples, T_lidar_imu
+        self._T_lidar_imu = make_transform(np.eye(3), T_lidar_imu[:3, 3])  # of samples in the LiDAR's axes
         self.gyroscope = Gyroscope(samples, T_lidar_imu[:3, :3])
-        self._force = Integral(samples.stamps, samples.accelerations @ T_lidar_imu[:3, :3].T)
-        self._bias, self._gravity = BiasFilter(), GravityFilter()
-        self._last, self._velocity, self._direction = None, np.zeros(3), None
+        self._preintegration = Preintegration(samples, T_lidar_imu[:3, :3])
+        self._window = InertialWindow(self._preintegration)
+        self._predicted: Knot | None = None
+        self._registered_s, self._measured_s, self._up_world, self._direction = None, None, None, None
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
+
+    def anew(self) -> "Inertial":
+        """A new one of the same samples."""
+        return Inertial(self._samples, self._extrinsics)
+
+    def reversed(self, about_s: float) -> "Inertial":
+        """A new one of the same samples, with time reversed about an instant."""
+        samples = self._samples
+        stamps = 2.0 * about_s - samples.stamps[::-1]
+        reversed_ = ImuSamples(stamps, -samples.angular_velocities[::-1], samples.accelerations[::-1])
+        return Inertial(reversed_, self._extrinsics)
 
     @property
     def disagreement(self) -> str | None:
@@ -64,87 +81,121 @@ class Inertial(Stateful):
 
     @property
     def direction(self) -> GravityDirection | None:
-        """Gravity as measured with the last scan, in its LiDAR frame; None where nothing was."""
+        """Gravity as measured until the last scan, in its LiDAR frame; None where nothing was."""
         return self._direction
 
     def prior(self, scan: Scan, prior: Prior) -> Prior:
-        """The odometry's prior of a scan, fused with the turn that the gyroscope measured; with gravity, if known."""
-        last, translation = self._last, self._velocity if prior.velocity is None else prior.velocity[3:]
-        rate = self.gyroscope.mean_rate(scan)
-        velocity = prior.velocity if rate is None else np.concatenate([rate - self._bias.bias, translation])
-        if last is None or not self.gyroscope.covers(last.stamp, scan.stamp):
-            return replace(prior, velocity=velocity)
-        turn, covariance = self._turn(last.stamp, scan.stamp)
-        gravity = None if self._direction is None else self._direction.turned(turn)
-        if prior.T_prev_curr is None:
-            rotation = log(make_transform(turn, np.zeros(3)))[:3]
-            moved = exp(np.concatenate([rotation, self._velocity * (scan.stamp - last.stamp)]))
-            unmoved = _without_translation(covariance) / self._config.prior_caution**2
-            return Prior(moved, velocity, unmoved, gravity, turn_is_measured=True)
-        # The mapper's caution is meant for the odometry, whose errors repeat; the filter follows the gyroscope's.
-        own = prior.motion_covariance(self._config)
-        fused, covariance = fuse_turn(prior.T_prev_curr, own, turn, covariance)
-        return Prior(fused, velocity, covariance / self._config.prior_caution**2, gravity, turn_is_measured=True)
+        """The odometry's prior of a scan, with the state that the IMU predicts."""
+        last, self._predicted = self._window.last, None
+        if last is None or scan.stamp <= last.stamp or not self.gyroscope.covers(last.stamp, scan.stamp):
+            return prior
+        if self._registered_s is None or scan.stamp - self._registered_s > _DEAD_RECKONING_S:
+            return prior
+        self._predicted = knot = self._window.predicted(scan.stamp)
+        return replace(prior, inertial=self._lidar_state(scan, knot, self._window.covariance(knot)))
 
     def update(self, scan: Scan, mapped: MappedScan) -> None:
-        """Take the result of a scan: bias, velocity and gravity follow it."""
-        last, state = self._last, mapped.state
-        follows = last is not None and mapped.registered and mapped.is_connected
-        covered = last is not None and self.gyroscope.covers(last.stamp, scan.stamp)
-        self._last, self._direction = state, None
-        if last is None or not follows or not covered:
-            self._bias.restart(state.T_world_lidar[:3, :3] if mapped.registered or last is None else None)
-            if last is not None and not mapped.is_connected:
-                self._gravity.forget()
-            self._direction = self._gravity.registered(self._station(state, None))
+        """Take the result of a scan: biases, velocity and gravity follow it."""
+        knot, self._predicted, self._direction = self._predicted, None, None
+        T_world_imu = mapped.state.T_world_lidar @ self._T_lidar_imu
+        follows = mapped.registered and mapped.is_connected
+        if knot is None or (mapped.registered and not mapped.is_connected):
+            self._up_world = None
+            if mapped.registered or self._window.last is None:
+                self._begin(scan, T_world_imu)
             return
-        turn, _ = self._turn(last.stamp, scan.stamp)
-        interval_s = scan.stamp - last.stamp
-        self._bias.turned(turn, interval_s, self.gyroscope.change(last.stamp, scan.stamp))
-        self._bias.registered(state.T_world_lidar[:3, :3], state.covariance[:3, :3])
-        T_last_now = inverse(last.T_world_lidar) @ state.T_world_lidar
-        self._velocity = (1.0 - _SMOOTHING) * self._velocity + _SMOOTHING * log(T_last_now)[3:] / interval_s
+        if follows and mapped.predicted_covariance is not None:
+            self._compare(knot, mapped)
+            innovation = log(inverse(mapped.T_world_predicted) @ mapped.state.T_world_lidar)
+            predicted, registered = mapped.predicted_covariance[:6, :6], mapped.state.covariance[:6, :6]
+            step, information = gained(predicted, registered, innovation)
+            measured = mapped.state.T_world_lidar @ exp(step) @ self._T_lidar_imu
+            knot = replace(knot, T_world_imu=measured, sqrt_information=self._root(information))
+            self._registered_s = scan.stamp
+        self._window.add(knot)
+        self._direction = self._gravity(knot.stamp)
+
+    def _gravity(self, stamp: float) -> GravityDirection | None:
+        """Gravity once a second, as soon as its direction in the world is known."""
+        if self._measured_s is not None and stamp - self._measured_s < _EVERY_S - 1e-6:
+            return None
+        last, covariance = self._window.last, self._window.covariance()
+        assert last is not None
+        tilt = last.T_nav_imu[:3, :3] @ covariance[:3, :3] @ last.T_nav_imu[:3, :3].T
+        if np.sqrt(np.linalg.eigvalsh(tilt[:2, :2])[-1]) > _LEVEL_SIGMA:
+            return None
+        self._measured_s, up = stamp, last.T_nav_imu[2, :3]
+        if self._up_world is None:
+            self._up_world = last.T_nav_world[2, :3]
+        across = skew(up)
+        return GravityDirection(up, self._up_world, across @ covariance[:3, :3] @ across.T)
+
+    def _begin(self, scan: Scan, T_world_imu: FloatArray) -> None:
+        if self.gyroscope.covers(scan.stamp, scan.stamp):
+            instants = self.gyroscope.within(scan.stamp - _LEVEL_S, scan.stamp + _LEVEL_S, _STEP_S)
+            turns = self.gyroscope.rotations(instants, np.zeros(3))
+            at = self.gyroscope.turn(scan.stamp, instants[0], np.zeros(3))
+            up = at @ np.einsum("nij,nj->i", turns[:-1], self._preintegration.means(instants)[:, 3:])
+            self._window.begin(scan.stamp, T_world_imu, self._root(np.diag(_REGISTRATION**-2)), up)
+            self._registered_s = scan.stamp
+
+    def _root(self, information: FloatArray) -> FloatArray:
+        """(6, 6) square root of the IMU pose's information by the LiDAR pose's."""
+        values, vectors = np.linalg.eigh(information)
+        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        return np.asarray(root @ adjoint(self._T_lidar_imu), dtype=np.float64)
+
+    def _lidar_state(self, scan: Scan, knot: Knot, covariance: FloatArray) -> MotionState:
+        """The LiDAR's pose and velocity during a sweep, with their covariance (12, 12), of a state of the IMU."""
+        T_imu_lidar = inverse(self._T_lidar_imu)
+        T_nav_lidar = knot.T_nav_imu @ T_imu_lidar
+        T_world_lidar = inverse(knot.T_nav_world) @ T_nav_lidar
+        R, lever = T_nav_lidar[:3, :3], T_imu_lidar[:3, 3]
+        begin, end = _sweep(scan)
+        around = scan.stamp + (np.array([begin, end]) if end > begin else np.array([-0.005, 0.005]))
+        mean = self._preintegration.means(around)[0]
+        rate = self.gyroscope.mean_rate(scan)
+        rate = (mean[:3] if rate is None else rate) - knot.bias[3:]
+        acceleration = mean[3:] - knot.bias[:3] - R[2] * STANDARD_GRAVITY
+        translation = R.T @ knot.velocity + np.cross(rate, lever) + 0.5 * (begin + end) * acceleration
+        J = np.zeros((12, 21))
+        J[:6, :6], J[:6, 15:] = adjoint(self._T_lidar_imu), -adjoint(inverse(T_world_lidar))
+        J[6:9, 12:15] = -np.eye(3)
+        J[9:, :3], J[9:, 6:9], J[9:, 12:15] = skew(R.T @ knot.velocity), R.T, skew(lever)
+        P = J @ covariance @ J.T
+        P[6:, 6:] += np.diag(_UNEVEN**2)
+        return MotionState(scan.stamp, T_world_lidar, np.concatenate([rate, translation]), P)
+
+    def _compare(self, knot: Knot, mapped: MappedScan) -> None:
+        last = self._window.last
+        assert last is not None
+        turn = last.T_nav_imu[:3, :3].T @ knot.T_nav_imu[:3, :3]
+        moved = last.T_world_imu[:3, :3].T @ mapped.state.T_world_lidar[:3, :3]
         self._turns += 1
         self._angles2 += float(rotation_angle(turn)) ** 2
-        self._differences2 += float(rotation_angle(turn.T @ T_last_now[:3, :3])) ** 2
-        since = self._integrated(last.stamp, scan.stamp)
-        self._direction = self._gravity.registered(self._station(state, since))
-
-    def _turn(self, first_s: float, last_s: float) -> tuple[FloatArray, FloatArray]:
-        """The measured turn (3, 3) between two stamps and its covariance (3, 3)."""
-        turn = self.gyroscope.turn(first_s, last_s, self._bias.bias)
-        change = self.gyroscope.change(first_s, last_s)
-        return turn, self._bias.turn_covariance(turn, last_s - first_s, change)
-
-    def _station(self, state: MotionState, since: Velocity | None) -> Station:
-        R = state.T_world_lidar[:3, :3]
-        return Station(state.stamp, R, state.T_world_lidar[:3, 3] + R @ self._lever, since)
-
-    def _integrated(self, first_s: float, last_s: float) -> Velocity:
-        """The specific force between two stamps."""
-        instants = np.linspace(first_s, last_s, _STEPS + 1)
-        rotations = self.gyroscope.rotations(instants, self._bias.bias)
-        changes = self._force.between(instants)
-        turned = np.einsum("nij,nj->ni", 0.5 * (rotations[:-1] + rotations[1:]), changes)
-        middles = 0.5 * (instants[:-1] + instants[1:]) - first_s
-        return Velocity(last_s - first_s, turned.sum(axis=0), middles @ turned, rotations[_STEPS // 2])
+        self._differences2 += float(rotation_angle(turn.T @ moved)) ** 2
 
 
-def fuse_turn(
-    T_prev_curr: FloatArray, covariance: FloatArray, turn: FloatArray, turn_covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """A motion (4, 4) and an independent measurement (3, 3) of its rotation, weighted by their information.
+def gained(prior: FloatArray, posterior: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What a registration measured beside its prediction: the pose from the registered one (6,), and its information.
 
-    The translation follows the rotation as the motion's covariance (6, 6) has it. Errors are from the right.
+    The quotient of two Gaussians, the prediction's and the registered pose's, with covariances (6, 6) and the step (6,)
+    between them; with errors of registered poses that no registration reports.
     """
-    innovation = log(make_transform(T_prev_curr[:3, :3].T @ turn, np.zeros(3)))[:3]
-    gain = np.linalg.solve(covariance[:3, :3] + turn_covariance, covariance[:3]).T
-    fused = covariance - gain @ covariance[:3]
-    return T_prev_curr @ exp(gain @ innovation), np.asarray(0.5 * (fused + fused.T), dtype=np.float64)
+    L = np.linalg.cholesky(prior)
+    S = L.T @ np.linalg.solve(posterior, L) - np.eye(6)
+    values, Q = np.linalg.eigh(0.5 * (S + S.T))
+    values = np.maximum(values, 0.0)
+    measured = values > _LEAST_GAIN
+    shares = np.where(measured, 1.0 / np.where(measured, values, 1.0), 0.0)
+    inverse_root = Q.T @ np.linalg.inv(L)
+    G = inverse_root.T @ (values[:, None] * inverse_root)
+    information = np.linalg.solve(np.eye(6) + G * _REGISTRATION**2, G)
+    return L @ Q @ (shares * (inverse_root @ step)), np.asarray(0.5 * (information + information.T), dtype=np.float64)
 
 
-def _without_translation(rotation: FloatArray) -> FloatArray:
-    """(6, 6) of a motion of which only the rotation is known."""
-    covariance = _ANY_TRANSLATION_M**2 * np.eye(6)
-    covariance[:3, :3] = rotation
-    return covariance
+def _sweep(scan: Scan) -> tuple[float, float]:
+    """Begin and end of a sweep from its stamp, seconds; zero where its points have no times."""
+    if scan.time_offsets is None or not len(scan):
+        return 0.0, 0.0
+    return min(0.0, float(scan.time_offsets.min())), max(0.0, float(scan.time_offsets.max()))

@@ -99,6 +99,7 @@ class LoamMapper(Stateful):
             degenerate=names,
             iterations=registration.iterations,
             added=is_added,
+            predicted_covariance=predicted.covariance,
         )
 
     def _with_mean_velocity(self, state: MotionState, middle_s: float, last: MotionState) -> MotionState:
@@ -141,7 +142,8 @@ def _predict(stamp: float, prior: Prior, last: MotionState, config: MappingConfi
     motion = exp(last.velocity * (stamp - last.stamp)) if prior.T_prev_curr is None else prior.T_prev_curr
     F, covariance = adjoint(inverse(motion)), UNKNOWN_VELOCITY.copy()
     covariance[:6, :6] = F @ last.covariance[:6, :6] @ F.T + prior.motion_covariance(config)
-    return MotionState(stamp, last.T_world_lidar @ motion, velocity, covariance)
+    state = MotionState(stamp, last.T_world_lidar @ motion, velocity, covariance)
+    return state if prior.inertial is None else state.fused(prior.inertial)
 
 
 def _lost(predicted: MotionState, fit: Fit | None, reason: str) -> MappedScan:

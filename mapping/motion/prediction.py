@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, skew
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log
 from lidarslam.core.state.stateful import TRANSFORM, Shape
 from lidarslam.mapping.config import MappingConfig
 
@@ -56,8 +56,11 @@ class Prior:
     # (6, 6) of the error `xi` in `T_true = T_prev_curr @ exp(xi)`, rotation first; None for the configured standard
     # deviations
     covariance: FloatArray | None = None
-    gravity: GravityDirection | None = None  # at the scan's stamp
-    turn_is_measured: bool = False  # whether a gyroscope measured the motion's rotation
+    inertial: "MotionState | None" = None  # the state that an IMU predicts
+
+    def without_odometry(self) -> "Prior":
+        """What an IMU measured."""
+        return Prior(inertial=self.inertial)
 
     def motion_covariance(self, config: MappingConfig) -> FloatArray:
         """(6, 6) of the motion: the odometry's own, inflated for errors correlated in time, or the configured one."""
@@ -77,6 +80,19 @@ class MotionState:
     # (12, 12) of the errors of pose and velocity; the pose's is `xi` in `T_true = T_world_lidar @ exp(xi)`
     covariance: Annotated[FloatArray, Shape(12, 12)]
     seen_until_s: float = 0.0  # time from the stamp to the sweep's last point, over which the velocity was observed
+
+    def fused(self, other: "MotionState") -> "MotionState":
+        """The mean of two states, weighted by their information."""
+        gain = np.linalg.solve(self.covariance + other.covariance, self.covariance).T
+        away = np.concatenate([log(inverse(self.T_world_lidar) @ other.T_world_lidar), other.velocity - self.velocity])
+        step, covariance = gain @ away, self.covariance - gain @ self.covariance
+        T_world_lidar = self.T_world_lidar @ exp(step[:6])
+        return replace(
+            self,
+            T_world_lidar=T_world_lidar,
+            velocity=self.velocity + step[6:],
+            covariance=0.5 * (covariance + covariance.T),
+        )
 
 
 @dataclass(frozen=True)
@@ -144,6 +160,18 @@ class Prediction:
     velocity: FloatArray  # (6,) during the sweep, in the LiDAR frame, rotation first
     covariance: FloatArray  # (12, 12) of the errors of pose and velocity, as in `MotionState`
     contradicted: bool = False  # whether the odometry's motion fails the innovation test against the last velocity
+    is_inertial: bool = False  # whether an IMU has a part in it
+
+    def is_held_within(self, distance_m: float) -> bool:
+        """Whether it is an IMU's, with no larger standard deviation of the position."""
+        return self.is_inertial and bool(np.linalg.eigvalsh(self.covariance[3:6, 3:6])[-1] < distance_m**2)
+
+    def holds(self, T_world_lidar: FloatArray, within_m: float) -> bool:
+        """Whether it is an IMU's, known to a distance, and a pose (4, 4) agrees with it."""
+        if not self.is_held_within(within_m):
+            return False
+        away = log(inverse(self.T_world_lidar) @ T_world_lidar)
+        return float(away @ np.linalg.solve(self.covariance[:6, :6], away)) < _GATE
 
     def held_along(self, direction: FloatArray) -> "Prediction":
         """The prediction with its translation and velocity along a direction (3,) of the world held."""
@@ -187,14 +215,12 @@ def predict(
         H[:, 18:] = np.eye(6)
         noise = covariance * (_VELOCITY_INFLATION / interval_s) ** 2
         joint, _ = joint.updated(H, prior.velocity - joint.next_velocity, noise)
-    if prior.gravity is not None:
-        expected = joint.T_world_next[:3, :3].T @ prior.gravity.world
-        H = np.zeros((3, 24))
-        H[:, 12:15] = skew(expected)
-        joint, _ = joint.updated(H, prior.gravity.lidar - expected, prior.gravity.covariance)
-    marginal = joint.covariance[12:, 12:]
-    marginal[:6, :6] += np.diag(LEAST_SIGMA**2)
-    return Prediction(stamp, joint.T_world_next, joint.next_velocity, marginal, contradicted)
+    state = MotionState(stamp, joint.T_world_next, joint.next_velocity, joint.covariance[12:, 12:])
+    if prior.inertial is not None:
+        state = state.fused(prior.inertial)
+    state.covariance[:6, :6] += np.diag(LEAST_SIGMA**2)
+    is_inertial = prior.inertial is not None
+    return Prediction(stamp, state.T_world_lidar, state.velocity, state.covariance, contradicted, is_inertial)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,8 @@ _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
 _CLEARLY_BETTER = 1.1
 # Evidence below which the first sweeps without rings are held along a direction: their strokes seldom cross.
 _STROKES_EVIDENCE = 10.0
+# Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells.
+_HELD_CELLS = 0.5
 
 
 class ScanMatcher:
@@ -233,7 +235,8 @@ class ScanMatcher:
             return self.none(prediction)
         points = keypoints.compensated(registration.velocity)
         fit = measure_fit(points, registration.T_world_lidar, self._map, registration.matcher)
-        status = fit.status(self._config.tracking, self._map.is_young)
+        held = start.holds(registration.T_world_lidar, _HELD_CELLS * self._map.cell_m)
+        status = fit.status(self._config.tracking, self._map.is_young, held)
         return Attempt(prediction, self._map, registration, fit, status)
 
 

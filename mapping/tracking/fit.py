@@ -98,9 +98,12 @@ class Fit:
         """Share of inliers among all points, by the worst axis."""
         return self.overlap * (self.inlier_ratio or 0.0)
 
-    def status(self, config: TrackingConfig, is_young: bool = False) -> Status:
-        """Tracking status of the scan; in a young map, the support alone cannot say that it is lost."""
-        support = 1.0 if self.support is None else self.support
+    def status(self, config: TrackingConfig, is_young: bool = False, is_held: bool = False) -> Status:
+        """Tracking status of the scan.
+
+        In a young map, the support alone cannot say that it is lost; where an IMU holds the pose, it says nothing.
+        """
+        support = 1.0 if self.support is None or is_held else self.support
         if self.inlier_ratio is None or self.overlap < _LEAST_OVERLAP:
             return Status.LOST
         if self.inlier_ratio < config.lost_below or (support < _LOST_SUPPORT and not is_young):

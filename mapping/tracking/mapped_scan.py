@@ -24,3 +24,4 @@ class MappedScan:
     added: bool = False  # whether the scan is good enough for the map, and was inserted
     # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
     is_connected: bool = True
+    predicted_covariance: FloatArray | None = None  # (12, 12) of the prediction; None where nothing was registered

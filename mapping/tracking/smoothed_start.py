@@ -10,6 +10,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
@@ -17,7 +18,9 @@ from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 
 # Scans that are smoothed, and those of them that show whether that is needed, where a sweep makes a map.
 SMOOTHED, SHOWING = 20, 8
-_FEWEST_KNOWN = 6
+_FEWEST_KNOWN, _LEAST_OK = 6, 0.7
+# With an IMU they are smoothed, too, where they are this far apart, seconds.
+_LONG_S = 0.25
 # Standard deviations of a smoothed motion, rotation first.
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
 
@@ -40,38 +43,69 @@ class SmoothedMotion:
         return body_velocity(self.T_prev_curr, self.interval_s)
 
 
-def smoothed_start(scans: Iterable[Scan], config: MappingConfig) -> dict[float, SmoothedMotion]:
+class _Tracking:
+    """A mapper, with an IMU where there is one."""
+
+    def __init__(self, config: MappingConfig, inertial: Inertial | None) -> None:
+        self._mapper, self._inertial = SurfelMapper(config), inertial
+        self.results: list[MappedScan] = []
+        self.has_rings = True
+
+    def process(self, scan: Scan, prior: Prior) -> MappedScan:
+        """Register the next scan."""
+        if self._inertial is not None:
+            prior = self._inertial.prior(scan, prior)
+        sampled = self._mapper.sample(scan)
+        self.has_rings &= sampled.has_rings
+        mapped = self._mapper.process_sampled(sampled, prior)
+        if self._inertial is not None:
+            self._inertial.update(scan, mapped)
+        self.results.append(mapped)
+        return mapped
+
+
+def smoothed_start(
+    scans: Iterable[Scan], config: MappingConfig, inertial: Inertial | None = None
+) -> dict[float, SmoothedMotion]:
     """Motions of the first scans, by stamp; empty where registration in order suffices.
 
     The map of a single sweep is thin, and what it lets slide stays in the map. So the first scans are registered in
     order; from the last of them back, with the motions of the latest known, to a new map; and the motions of the
     first half are those that this map shows. None is known where that loses track.
+
+    Args:
+        scans: of which the first are taken.
+        config: of the mapping.
+        inertial: a new one, whose samples are used in both directions of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
-    ordered, forwards, needed = SurfelMapper(unlimited), [], False
+    ordered, needed = _Tracking(unlimited, inertial), False
+    forwards = ordered.results
     taken: list[Scan] = []
     for scan in scans:
-        sampled = ordered.sample(scan)
-        forwards.append(ordered.process_sampled(sampled, Prior()))
+        mapped = ordered.process(scan, Prior())
+        far = inertial is not None and bool(taken) and scan.stamp - taken[-1].stamp > _LONG_S
         taken.append(scan)
-        needed |= not sampled.has_rings or forwards[-1].status is not Status.OK
+        needed |= far or not ordered.has_rings or mapped.status is not Status.OK
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not needed):
             break
     if not needed or len(taken) < SHOWING:
         return {}
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
-    if len(known) < _FEWEST_KNOWN:
+    if len(known) < _FEWEST_KNOWN or sum(one.status is Status.OK for one in known) < _LEAST_OK * len(known):
         return {}
-    backwards = _backwards(taken, _motions(known), unlimited)
+    end_s = taken[-1].stamp
+    reverse = _Tracking(unlimited, None if inertial is None else inertial.reversed(end_s))
+    backwards = _backwards(taken, _motions(known), reverse)
     if len(_tracked_at_last(backwards)) < len(backwards):
         return {}
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
     return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
 
 
-def _backwards(scans: list[Scan], known: list[FloatArray], config: MappingConfig) -> list[MappedScan]:
+def _backwards(scans: list[Scan], known: list[FloatArray], tracking: _Tracking) -> list[MappedScan]:
     """The scans, last first, registered to a new map; the motions (4, 4) of the last of them are known."""
-    mapper, results, end = SurfelMapper(config), [], scans[-1].stamp
+    end = scans[-1].stamp
     for number, scan in enumerate(reversed(scans)):
         prior, step = Prior(), max(number, 1)
         if step <= len(known):
@@ -79,8 +113,8 @@ def _backwards(scans: list[Scan], known: list[FloatArray], config: MappingConfig
             velocity = body_velocity(T_prev_curr, scans[-step].stamp - scans[-step - 1].stamp)
             prior = Prior(T_prev_curr if number else None, velocity, _COVARIANCE)
         times = None if scan.time_offsets is None else -scan.time_offsets
-        results.append(mapper.process(replace(scan, stamp=2.0 * end - scan.stamp, time_offsets=times), prior))
-    return results
+        tracking.process(replace(scan, stamp=2.0 * end - scan.stamp, time_offsets=times), prior)
+    return tracking.results
 
 
 def _motions(results: list[MappedScan]) -> list[FloatArray]:

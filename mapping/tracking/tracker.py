@@ -93,7 +93,7 @@ class Tracker(Stateful):
             self._in_vain = found is None and not self.is_searching
             return found or matcher.none(prediction)
         uncertain = self._state.is_uncertain(scan.stamp - last.stamp)
-        near = matcher.register(prediction, self._begins_coarse(scan))
+        near = matcher.register(prediction, self._begins_coarse(scan, prediction))
         if not (uncertain or self._budget.is_spent):
             near = self._improve(matcher, prior, prediction, near)
         unconfirmed = self._state.is_unconfirmed
@@ -137,6 +137,7 @@ class Tracker(Stateful):
         return MappedScan(
             state=state,
             T_world_predicted=attempt.prediction.T_world_lidar,
+            predicted_covariance=attempt.prediction.covariance,
             registered=True,
             status=status,
             message=message,
@@ -174,17 +175,19 @@ class Tracker(Stateful):
         self._process_noise, self._odometry_noise = earlier._process_noise, earlier._odometry_noise
         self._end_search()
 
-    def _begins_coarse(self, scan: SampledScan) -> bool:
-        return self._prediction_error_m > _FINE_ERROR_CELLS * scan.cell_m
+    def _begins_coarse(self, scan: SampledScan, prediction: Prediction) -> bool:
+        within_m = _FINE_ERROR_CELLS * scan.cell_m
+        return self._prediction_error_m > within_m and not prediction.is_held_within(within_m)
 
     def _improve(self, matcher: ScanMatcher, prior: Prior, prediction: Prediction, near: Attempt) -> Attempt:
         """The best of a registration and others: any acceleration, without a contradicted odometry, displacements."""
         best, has_odometry = self._or_turning(matcher, prior, prediction, near), prior.T_prev_curr is not None
         is_poor = has_odometry and best.status is not Status.OK
         if (prediction.contradicted or is_poor) and self._state.velocity_known and not self._budget.is_spent:
-            alone = self.predict(matcher.scan, Prior(), matcher.last)
-            other = matcher.register(alone, self._begins_coarse(matcher.scan))
-            best = max(best, self._or_turning(matcher, Prior(), alone, other), key=lambda attempt: attempt.quality)
+            inertial = prior.without_odometry()
+            alone = self.predict(matcher.scan, inertial, matcher.last)
+            other = matcher.register(alone, self._begins_coarse(matcher.scan, alone))
+            best = max(best, self._or_turning(matcher, inertial, alone, other), key=lambda attempt: attempt.quality)
             is_poor = has_odometry and best.status is not Status.OK
         if (is_poor or not self._state.velocity_known) and not self._budget.is_spent:
             rotations = prediction.T_world_lidar, matcher.last.T_world_lidar
@@ -235,7 +238,7 @@ class Tracker(Stateful):
             self._search.begin(matcher.search(prediction, self._map_is_due), prediction)
             self._map_is_due = False
         found, tracked_s = self._search.go_on(matcher, prediction, self._budget), self._state.tracked_s
-        return found if found and found.is_reachable(tracked_s, prior.turn_is_measured) else None
+        return found if found and found.is_reachable(tracked_s, prior.inertial is not None) else None
 
     def _end_search(self) -> None:
         self._search.drop()

@@ -1,0 +1,226 @@
+"""Pose, velocity, biases and gravity over the latest scans: a window of preintegrated IMU and registered poses.
+
+A square-root information smoother: the factors are GTSAM's, the oldest state is marginalised (Dong-Si and Mourikis,
+ICRA 2011; Leutenegger et al., IJRR 2015). The world's pose in a levelled frame is part of the state: its tilt is the
+direction of gravity.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Annotated
+
+import gtsam
+import numpy as np
+from gtsam.imuBias import ConstantBias
+from gtsam.symbol_shorthand import B, V, X
+
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
+from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
+from lidarslam.mapping.inertial.preintegration import Preintegration
+
+# Scans of the window, and iterations after each.
+_SCANS, _ITERATIONS = 10, 4
+_CONVERGED = 0.005
+# Degrees of freedom: pose, velocity, biases, pose of the world.
+_SIZE = 21
+# Standard deviations of the first state: velocity, m/s; biases of accelerometer and gyroscope; tilt of the world.
+_VELOCITY, _FORCE_BIAS, _RATE_BIAS, _TILT = 15.0, 0.15, 0.01, np.deg2rad(5.0)
+# Walk of gravity in the world, which follows the drift of the map: rad/sqrt(s); no other drift.
+_TILT_WALK, _FIXED = np.deg2rad(0.01), 1e-5
+# Registrations off by more deviations count less.
+_HUBER = 4.0
+# Columns of two knots that GTSAM's factor has in order: poses and velocities, then biases, and the right-hand side.
+_OF_IMU = np.r_[0:9, 21:30, 9:15, 30:36, 42]
+
+
+@dataclass(frozen=True, eq=False)
+class Knot:
+    """State at the stamp of a scan."""
+
+    stamp: float  # seconds
+    T_nav_imu: Annotated[FloatArray, TRANSFORM]  # (4, 4); the navigation frame has its z axis upwards
+    velocity: Annotated[FloatArray, Shape(3)]  # (3,) in the navigation frame, m/s
+    bias: Annotated[FloatArray, Shape(6)]  # (6,) of accelerometer, m/s^2, and gyroscope, rad/s
+    T_nav_world: Annotated[FloatArray, TRANSFORM]  # (4, 4)
+    integrated_at: Annotated[FloatArray, Shape(6)]  # (6,) bias at which samples since the last are integrated
+    T_world_imu: Annotated[FloatArray, TRANSFORM]  # (4, 4) as registered
+    sqrt_information: Annotated[FloatArray, Shape(6, 6)]  # of the registration; zero where there was none
+
+    def moved(self, step: FloatArray) -> "Knot":
+        """The state after a step (21,)."""
+        return replace(
+            self,
+            T_nav_imu=gtsam.Pose3(self.T_nav_imu).retract(step[:6]).matrix(),
+            velocity=self.velocity + step[6:9],
+            bias=self.bias + step[9:15],
+            T_nav_world=gtsam.Pose3(self.T_nav_world).retract(step[15:]).matrix(),
+        )
+
+    def away_from(self, other: "Knot") -> FloatArray:
+        """(21,) the step from another state to this one."""
+        return np.concatenate([
+            log(inverse(other.T_nav_imu) @ self.T_nav_imu),
+            self.velocity - other.velocity,
+            self.bias - other.bias,
+            log(inverse(other.T_nav_world) @ self.T_nav_world),
+        ])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """Gaussian of the oldest state: `|A step - b|^2` about a mean."""
+
+    mean: Knot
+    A: Annotated[FloatArray, Shape(_SIZE, _SIZE)]
+    b: Annotated[FloatArray, Shape(_SIZE)]
+
+
+class InertialWindow(Stateful):
+    """The latest knots; the first of all begins it."""
+
+    _knots: list[Knot]
+    _prior: _Prior | None
+    _latest: Annotated[FloatArray, Shape(_SIZE, _SIZE)]  # square root of the latest state's information
+
+    def __init__(self, preintegration: Preintegration) -> None:
+        self._preintegration = preintegration
+        self._measurements: dict[float, gtsam.PreintegratedCombinedMeasurements] = {}
+        self._knots, self._prior, self._latest = [], None, np.eye(_SIZE)
+
+    @property
+    def last(self) -> Knot | None:
+        """The latest state; None before the first."""
+        return self._knots[-1] if self._knots else None
+
+    def begin(self, stamp: float, T_world_imu: FloatArray, sqrt_information: FloatArray, up: FloatArray) -> None:
+        """Begin at a registered pose (4, 4), with the specific force (3,) there; biases and gravity stay."""
+        last, sigmas = self.last, np.full(_SIZE, np.inf)
+        sigmas[6:9], sigmas[9:12], sigmas[12:15], sigmas[15:] = _VELOCITY, _FORCE_BIAS, _RATE_BIAS, _TILT
+        A, bias = np.diag(1.0 / sigmas), np.zeros(6)
+        if last is None:
+            T_nav_world: FloatArray = np.eye(4)
+            T_nav_world[:3, :3] = _turn_to_vertical(T_world_imu[:3, :3] @ up)
+        else:
+            T_nav_world, bias = last.T_nav_world, last.bias
+            # Of the marginal of biases and tilt.
+            kept = np.linalg.inv(self.covariance()[9:, 9:])
+            A[9:, 9:] = np.linalg.cholesky(kept).T
+        knot = Knot(
+            stamp, T_nav_world @ T_world_imu, np.zeros(3), bias, T_nav_world, bias, T_world_imu, sqrt_information
+        )
+        self._knots, self._measurements = [knot], {}
+        self._prior = _Prior(knot, A, np.zeros(_SIZE))
+        self._latest = np.linalg.qr(_own_rows(self._prior, knot)[:, :_SIZE], mode="r")
+
+    def predicted(self, stamp: float) -> Knot:
+        """The state at the next stamp by the IMU alone."""
+        last = self._knots[-1]
+        pim = self._preintegration.between(last.stamp, stamp, last.bias)
+        self._measurements[stamp] = pim
+        state = pim.predict(
+            gtsam.NavState(gtsam.Pose3(last.T_nav_imu), last.velocity), ConstantBias(last.bias[:3], last.bias[3:])
+        )
+        T = state.pose().matrix()
+        return Knot(
+            stamp, T, state.velocity(), last.bias, last.T_nav_world, last.bias,
+            inverse(last.T_nav_world) @ T, np.zeros((6, 6)),
+        )  # fmt: skip
+
+    def add(self, knot: Knot) -> None:
+        """Take the next state, with its registration if there is one: all states follow."""
+        self._knots.append(knot)
+        for _ in range(_ITERATIONS):
+            step = self._step()
+            if np.abs(step).max() < _CONVERGED:
+                break
+        while len(self._knots) > _SCANS:
+            first, second = self._knots[:2]
+            assert self._prior is not None
+            R = _eliminated(_own_rows(self._prior, first), self._between_rows(first, second))
+            self._prior = _remaining(second, R)
+            self._knots = self._knots[1:]
+            self._measurements.pop(second.stamp, None)
+
+    def covariance(self, following: Knot | None = None) -> FloatArray:
+        """(21, 21) of the latest state, or of a predicted one that follows it."""
+        root, last = self._latest, self._knots[-1]
+        if following is not None:
+            own = np.pad(root, ((0, 0), (0, 1)))
+            root = _remaining(following, _eliminated(own, self._between_rows(last, following))).A
+        inverse_root = np.linalg.inv(root)
+        return np.asarray(inverse_root @ inverse_root.T, dtype=np.float64)
+
+    def _step(self) -> FloatArray:
+        """Gauss-Newton step of all states, by elimination in their order; that of the latest (21,)."""
+        rows, prior = [], self._prior
+        assert prior is not None
+        for first, second in pairwise(self._knots):
+            R = _eliminated(_own_rows(prior, first), self._between_rows(first, second))
+            prior = _remaining(second, R)
+            rows.append(R[:_SIZE])
+        last = np.linalg.qr(_own_rows(prior, self._knots[-1]), mode="r")[:_SIZE]
+        self._latest = last[:, :_SIZE]
+        steps = [np.linalg.solve(self._latest, last[:, -1])]
+        for row in reversed(rows):
+            steps.append(np.linalg.solve(row[:, :_SIZE], row[:, -1] - row[:, _SIZE:-1] @ steps[-1]))
+        self._knots = [knot.moved(step) for knot, step in zip(self._knots, reversed(steps), strict=True)]
+        return steps[0]
+
+    def _between_rows(self, first: Knot, second: Knot) -> FloatArray:
+        """Whitened rows `[first | second | b]` (21, 43) of the IMU between two knots and the walk of gravity."""
+        values = gtsam.Values()
+        for n, knot in enumerate((first, second)):
+            values.insert(X(n), gtsam.Pose3(knot.T_nav_imu))
+            values.insert(V(n), knot.velocity)
+            values.insert(B(n), ConstantBias(knot.bias[:3], knot.bias[3:]))
+        pim = self._measured(first, second)
+        factor = gtsam.CombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), pim).linearize(values)
+        rows: FloatArray = np.zeros((_SIZE, 2 * _SIZE + 1))
+        rows[:15, _OF_IMU] = factor.augmentedJacobian()
+        root = 1.0 / np.array([_TILT_WALK * np.sqrt(second.stamp - first.stamp)] * 3 + [_FIXED] * 3)
+        away = log(inverse(first.T_nav_world) @ second.T_nav_world)
+        rows[15:, 15:21], rows[15:, 36:42], rows[15:, -1] = -np.diag(root), np.diag(root), -root * away
+        return rows
+
+    def _measured(self, before: Knot, knot: Knot) -> gtsam.PreintegratedCombinedMeasurements:
+        if knot.stamp not in self._measurements:
+            self._measurements[knot.stamp] = self._preintegration.between(before.stamp, knot.stamp, knot.integrated_at)
+        return self._measurements[knot.stamp]
+
+
+def _eliminated(own: FloatArray, between: FloatArray) -> FloatArray:
+    """Upper triangle `[first | second | b]` of a knot's rows `[first | b]` and those between it and the next."""
+    rows: FloatArray = np.zeros((len(own) + len(between), 2 * _SIZE + 1))
+    rows[: len(own), :_SIZE], rows[: len(own), -1] = own[:, :-1], own[:, -1]
+    rows[len(own) :] = between
+    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+
+
+def _remaining(second: Knot, R: FloatArray) -> _Prior:
+    """What the triangle of two knots leaves of the second."""
+    return _Prior(second, R[_SIZE : 2 * _SIZE, _SIZE:-1], R[_SIZE : 2 * _SIZE, -1])
+
+
+def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:
+    """Whitened rows `[own | b]` (27, 22) of a knot's Gaussian and its registered pose."""
+    away = (prior.b - prior.A @ knot.away_from(prior.mean))[:, None]
+    return np.vstack([np.hstack([prior.A, away]), _registered_rows(knot)])
+
+
+def _registered_rows(knot: Knot) -> FloatArray:
+    """Whitened rows `[own | b]` (6, 22) of a registered pose, robust by Huber's kernel."""
+    expected = inverse(knot.T_nav_world) @ knot.T_nav_imu
+    residual = knot.sqrt_information @ log(inverse(knot.T_world_imu) @ expected)
+    norm = float(np.linalg.norm(residual))
+    weight = np.sqrt(_HUBER / norm) if norm > _HUBER else 1.0
+    rows: FloatArray = np.zeros((6, _SIZE + 1))
+    rows[:, :6], rows[:, 15:21] = knot.sqrt_information, -knot.sqrt_information @ adjoint(inverse(expected))
+    rows[:, -1] = -residual
+    return weight * rows
+
+
+def _turn_to_vertical(up: FloatArray) -> FloatArray:
+    """(3, 3) the shortest rotation that turns a vector (3,) to the z axis."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix(), dtype=np.float64)
