@@ -51,7 +51,11 @@ CONFINED = {
     "kiss_slam": ("lidarslam.compare.peers.kiss_slam",),
     "rko_lio": ("lidarslam.compare.peers.rko_lio",),
     "small_gicp": ("lidarslam.compare.peers.small_gicp",),
-    "gtsam": ("lidarslam.mapping.pose_graph.optimizer",),
+    "gtsam": (
+        "lidarslam.mapping.pose_graph.optimizer",
+        "lidarslam.mapping.inertial.preintegration",
+        "lidarslam.mapping.inertial.window",
+    ),
     "rerun": ("lidarslam.viewer.rerun_*",),
     "click": ("lidarslam.cli", "lidarslam.commands.*"),
     "laspy": ("lidarslam.compare.assessment.reference_cloud", "lidarslam.mapping.global_map.survey_formats"),

@@ -27,6 +27,8 @@ _LEVEL_S, _STEP_S = 1.0, 0.02
 _DEAD_RECKONING_S = 2.0
 # Gravity is measured this often, seconds, where its direction is known to this, radians.
 _EVERY_S, _LEVEL_SIGMA = 1.0, np.deg2rad(0.5)
+# The vertical of the world is replaced by one whose deviation is smaller by this factor.
+_BETTER = 0.7
 # The turns of IMU and LiDAR disagree when they differ by more than this share, and by more than registration does.
 _FEWEST_TURNS, _MOST_DIFFERENT, _REGISTRATION_ERROR = 50, 0.2, np.deg2rad(0.15)
 
@@ -42,7 +44,8 @@ class Inertial(Stateful):
     _window: InertialWindow
     _registered_s: float | None  # stamp of the last registered scan
     _measured_s: float | None  # stamp at which gravity was measured last
-    _up_world: Annotated[FloatArray, Shape(3)] | None  # unit, as first known
+    _up_world: Annotated[FloatArray, Shape(3)] | None  # unit, as first known well
+    _up_sigma: float  # radians
     _direction: GravityDirection | None
     # of the turns that were compared: how many, and the sums of squares of their angles and of the differences
     _turns: int
@@ -56,7 +59,8 @@ class Inertial(Stateful):
         self._preintegration = Preintegration(samples, T_lidar_imu[:3, :3])
         self._window = InertialWindow(self._preintegration)
         self._predicted: Knot | None = None
-        self._registered_s, self._measured_s, self._up_world, self._direction = None, None, None, None
+        self._registered_s, self._measured_s, self._direction = None, None, None
+        self._up_world, self._up_sigma = None, np.inf
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
 
     def anew(self) -> "Inertial":
@@ -122,13 +126,16 @@ class Inertial(Stateful):
         last, covariance = self._window.last, self._window.covariance()
         assert last is not None
         tilt = last.T_nav_imu[:3, :3] @ covariance[:3, :3] @ last.T_nav_imu[:3, :3].T
-        if np.sqrt(np.linalg.eigvalsh(tilt[:2, :2])[-1]) > _LEVEL_SIGMA:
+        sigma = float(np.sqrt(np.linalg.eigvalsh(tilt[:2, :2])[-1]))
+        if sigma > _LEVEL_SIGMA:
             return None
         self._measured_s, up = stamp, last.T_nav_imu[2, :3]
-        if self._up_world is None:
-            self._up_world = last.T_nav_world[2, :3]
+        if self._up_world is None or sigma < _BETTER * self._up_sigma:
+            self._up_world, self._up_sigma = last.T_nav_world[2, :3], sigma
         across = skew(up)
-        return GravityDirection(up, self._up_world, across @ covariance[:3, :3] @ across.T)
+        return GravityDirection(
+            up, self._up_world, across @ covariance[:3, :3] @ across.T + self._up_sigma**2 * np.eye(3)
+        )
 
     def _begin(self, scan: Scan, T_world_imu: FloatArray) -> None:
         if self.gyroscope.covers(scan.stamp, scan.stamp):

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from gtsam.imuBias import ConstantBias
 from gtsam.symbol_shorthand import B, V, X
+from scipy.linalg import solve_triangular
 
 from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
 from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
@@ -50,10 +51,10 @@ class Knot:
         """The state after a step (21,)."""
         return replace(
             self,
-            T_nav_imu=gtsam.Pose3(self.T_nav_imu).retract(step[:6]).matrix(),
+            T_nav_imu=_matrix(gtsam.Pose3(self.T_nav_imu).retract(step[:6])),
             velocity=self.velocity + step[6:9],
             bias=self.bias + step[9:15],
-            T_nav_world=gtsam.Pose3(self.T_nav_world).retract(step[15:]).matrix(),
+            T_nav_world=_matrix(gtsam.Pose3(self.T_nav_world).retract(step[15:])),
         )
 
     def away_from(self, other: "Knot") -> FloatArray:
@@ -110,7 +111,7 @@ class InertialWindow(Stateful):
         )
         self._knots, self._measurements = [knot], {}
         self._prior = _Prior(knot, A, np.zeros(_SIZE))
-        self._latest = np.linalg.qr(_own_rows(self._prior, knot)[:, :_SIZE], mode="r")
+        self._latest = _triangle(_own_rows(self._prior, knot)[:, :_SIZE])
 
     def predicted(self, stamp: float) -> Knot:
         """The state at the next stamp by the IMU alone."""
@@ -120,7 +121,7 @@ class InertialWindow(Stateful):
         state = pim.predict(
             gtsam.NavState(gtsam.Pose3(last.T_nav_imu), last.velocity), ConstantBias(last.bias[:3], last.bias[3:])
         )
-        T = state.pose().matrix()
+        T = _matrix(state.pose())
         return Knot(
             stamp, T, state.velocity(), last.bias, last.T_nav_world, last.bias,
             inverse(last.T_nav_world) @ T, np.zeros((6, 6)),
@@ -158,11 +159,11 @@ class InertialWindow(Stateful):
             R = _eliminated(_own_rows(prior, first), self._between_rows(first, second))
             prior = _remaining(second, R)
             rows.append(R[:_SIZE])
-        last = np.linalg.qr(_own_rows(prior, self._knots[-1]), mode="r")[:_SIZE]
+        last = _triangle(_own_rows(prior, self._knots[-1]))[:_SIZE]
         self._latest = last[:, :_SIZE]
-        steps = [np.linalg.solve(self._latest, last[:, -1])]
+        steps = [solve_triangular(self._latest, last[:, -1])]
         for row in reversed(rows):
-            steps.append(np.linalg.solve(row[:, :_SIZE], row[:, -1] - row[:, _SIZE:-1] @ steps[-1]))
+            steps.append(solve_triangular(row[:, :_SIZE], row[:, -1] - row[:, _SIZE:-1] @ steps[-1]))
         self._knots = [knot.moved(step) for knot, step in zip(self._knots, reversed(steps), strict=True)]
         return steps[0]
 
@@ -188,17 +189,26 @@ class InertialWindow(Stateful):
         return self._measurements[knot.stamp]
 
 
+def _matrix(pose: gtsam.Pose3) -> FloatArray:
+    # Column by column, sums would round otherwise than those of a restored state.
+    return np.ascontiguousarray(pose.matrix(), dtype=np.float64)
+
+
 def _eliminated(own: FloatArray, between: FloatArray) -> FloatArray:
     """Upper triangle `[first | second | b]` of a knot's rows `[first | b]` and those between it and the next."""
     rows: FloatArray = np.zeros((len(own) + len(between), 2 * _SIZE + 1))
     rows[: len(own), :_SIZE], rows[: len(own), -1] = own[:, :-1], own[:, -1]
     rows[len(own) :] = between
+    return _triangle(rows)
+
+
+def _triangle(rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
 
 
 def _remaining(second: Knot, R: FloatArray) -> _Prior:
     """What the triangle of two knots leaves of the second."""
-    return _Prior(second, R[_SIZE : 2 * _SIZE, _SIZE:-1], R[_SIZE : 2 * _SIZE, -1])
+    return _Prior(second, R[_SIZE : 2 * _SIZE, _SIZE:-1].copy(), R[_SIZE : 2 * _SIZE, -1].copy())
 
 
 def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:

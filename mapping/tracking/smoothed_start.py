@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, inverse
+from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
@@ -20,7 +20,14 @@ from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 SMOOTHED, SHOWING = 20, 8
 _FEWEST_KNOWN, _LEAST_OK = 6, 0.7
 # With an IMU they are smoothed, too, where they are this far apart, seconds.
-_LONG_S = 0.25
+_LONG_S = 0.15
+# Scans by which their first velocity is chosen then, and the velocities, m/s: at rest to running.
+TRIED, _SPACING_M_S = 5, 1.0
+_VELOCITIES = [np.zeros(3)] + [
+    speed * np.array([np.cos(angle), np.sin(angle), 0.0])
+    for speed, count in ((1.0, 6), (2.0, 8))
+    for angle in 2.0 * np.pi / count * np.arange(count)
+]
 # Standard deviations of a smoothed motion, rotation first.
 _COVARIANCE = np.diag(np.array([np.deg2rad(0.1)] * 3 + [0.005] * 3) ** 2)
 
@@ -79,16 +86,22 @@ def smoothed_start(
         inertial: a new one, whose samples are used in both directions of time.
     """
     unlimited = config.model_copy(update={"budget_ms": None})
-    ordered, needed = _Tracking(unlimited, inertial), False
-    forwards = ordered.results
-    taken: list[Scan] = []
-    for scan in scans:
+    taken, rest = [], iter(scans)
+    ordered = _Tracking(unlimited, inertial)
+    if inertial is not None:
+        taken = list(islice(rest, TRIED))
+        if len(taken) == TRIED and taken[1].stamp - taken[0].stamp > _LONG_S:
+            ordered = _likeliest(taken, unlimited, inertial)
+        else:
+            rest, taken = chain(taken, rest), []
+    needed = bool(taken)
+    for scan in rest:
         mapped = ordered.process(scan, Prior())
-        far = inertial is not None and bool(taken) and scan.stamp - taken[-1].stamp > _LONG_S
         taken.append(scan)
-        needed |= far or not ordered.has_rings or mapped.status is not Status.OK
+        needed |= not ordered.has_rings or mapped.status is not Status.OK
         if len(taken) == SMOOTHED or (len(taken) == SHOWING and not needed):
             break
+    forwards = ordered.results
     if not needed or len(taken) < SHOWING:
         return {}
     known = _tracked_at_last(forwards)[-(len(forwards) // 2 + 1) :]
@@ -101,6 +114,28 @@ def smoothed_start(
         return {}
     moved = zip(pairwise(scan.stamp for scan in taken), _motions(backwards[::-1]), strict=True)
     return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
+
+
+def _likeliest(scans: list[Scan], config: MappingConfig, inertial: Inertial) -> _Tracking:
+    """The first scans, tracked from the velocity at which they fit best: far apart, they leave it open.
+
+    What an IMU measured relates it to the motion between all scans, and so the later ones decide.
+    """
+    interval_s, best, most = scans[1].stamp - scans[0].stamp, None, -np.inf
+    for velocity in _VELOCITIES:
+        tracking = _Tracking(config, inertial.anew())
+        tracking.process(scans[0], Prior())
+        moved = exp(np.concatenate([np.zeros(3), velocity * interval_s]))
+        covariance = np.diag([np.pi**2] * 3 + [(0.5 * _SPACING_M_S * interval_s) ** 2] * 3)
+        tracking.process(scans[1], Prior(moved, None, covariance / config.prior_caution**2))
+        for scan in scans[2:]:
+            tracking.process(scan, Prior())
+        fits = [one.fit for one in tracking.results if one.fit is not None]
+        quality = sum(fit.inlier_share * (fit.support or 0.0) for fit in fits)
+        if quality > most:
+            best, most = tracking, quality
+    assert best is not None
+    return best
 
 
 def _backwards(scans: list[Scan], known: list[FloatArray], tracking: _Tracking) -> list[MappedScan]:
