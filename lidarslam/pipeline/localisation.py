@@ -12,12 +12,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import TRANSFORM, Saved, State, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.elevation.stretches import ElevationEstimator
-from lidarslam.mapping.inertial.inertial import Inertial
-from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
+from lidarslam.mapping.smoothed_start import SmoothedMotion
 from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.smoothed_start import SmoothedMotion
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
@@ -52,6 +51,26 @@ class Mapper(Protocol):
 
     def state(self) -> State:
         """What it carries from scan to scan, the map included."""
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from a state, before the first scan."""
+
+
+class InertialPrediction(Protocol):
+    """An IMU's part in the prior of each scan."""
+
+    @property
+    def direction(self) -> GravityDirection | None:
+        """Gravity as measured until the last scan; None where nothing was."""
+
+    def prior(self, scan: Scan, prior: Prior) -> Prior:
+        """The odometry's prior, with the state that the IMU predicts."""
+
+    def update(self, scan: Scan, mapped: MappedScan) -> None:
+        """Follow the result of a scan."""
+
+    def state(self) -> State:
+        """What it carries from scan to scan."""
 
     def restore(self, saved: Saved) -> None:
         """Go on from a state, before the first scan."""
@@ -107,7 +126,7 @@ class ScanToMap(Stateful):
     """
 
     _mapper: Mapper
-    _inertial: Inertial | None
+    _inertial: InertialPrediction | None
     _elevation: ElevationEstimator | None
     _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
     _T_world_last: Annotated[FloatArray, TRANSFORM]
@@ -115,7 +134,7 @@ class ScanToMap(Stateful):
     def __init__(
         self,
         mapper: Mapper,
-        inertial: Inertial | None = None,
+        inertial: InertialPrediction | None = None,
         elevation: ElevationEstimator | None = None,
         start: Mapping[float, SmoothedMotion] | None = None,
     ) -> None:
@@ -195,7 +214,7 @@ def _judge(motion: Motion, fit: Consistency) -> tuple[Status, str]:
 
 def make_localiser(
     config: Config,
-    inertial: Inertial | None = None,
+    inertial: InertialPrediction | None = None,
     elevation: ElevationEstimator | None = None,
     start: Mapping[float, SmoothedMotion] | None = None,
 ) -> Localiser:

@@ -2,6 +2,7 @@
 
 import logging
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +14,12 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.mounting.recording import recorded_axes
 from lidarslam.datasets.recording import Recording
-from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.inertial.mounting import Mounting, MountingError, Turns, find_mounting
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+
+if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.inertial.inertial import Inertial
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +43,7 @@ def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
     return samples
 
 
-def open_inertial(config: Config, recording: Recording, chosen: range) -> Inertial | None:
+def open_inertial(config: Config, recording: Recording, chosen: range) -> "Inertial | None":
     """The IMU's part in a run over the chosen scans; None where the odometry uses no IMU.
 
     Raises:
@@ -50,6 +53,8 @@ def open_inertial(config: Config, recording: Recording, chosen: range) -> Inerti
     samples = imu_samples(config, recording)
     if samples is None:
         return None
+    from lidarslam.mapping.inertial.inertial import Inertial
+
     T_lidar_imu = samples.T_lidar_imu
     if config.odometry.imu_rotation_deg is not None:
         T_recorded_imu = make_transform(_rotation(config.odometry.imu_rotation_deg), np.zeros(3))

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -22,10 +22,9 @@ from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.global_map.tile_store import TileStore
-from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
-from lidarslam.mapping.tracking.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
+from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import Localiser, make_localiser
@@ -38,6 +37,9 @@ from lidarslam.run.request import RunRequest
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.unfinished import Unfinished
 from lidarslam.viewer.viewer import Viewer
+
+if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.inertial.inertial import Inertial
 
 logger = logging.getLogger(__name__)
 
@@ -136,7 +138,7 @@ def track(
 
 
 def _start(
-    config: Config, recording: Recording, chosen: range, inertial: Inertial | None
+    config: Config, recording: Recording, chosen: range, inertial: "Inertial | None"
 ) -> dict[float, SmoothedMotion]:
     """The motions of the first scans, where they have to be smoothed."""
     if config.mapping.method != "surfels" or len(chosen) < SHOWING:

@@ -6,7 +6,7 @@ import pytest
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.tracking.smoothed_start import SMOOTHED, smoothed_start
+from lidarslam.mapping.smoothed_start import SMOOTHED, smoothed_start
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation

@@ -7,7 +7,7 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.tracking.smoothed_start import smoothed_start
+from lidarslam.mapping.smoothed_start import smoothed_start
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route

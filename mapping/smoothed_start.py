@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import chain, islice, pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,11 +11,13 @@ from lidarslam.core.geometry import FloatArray, exp, inverse
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.inertial.inertial import Inertial
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+
+if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.inertial.inertial import Inertial
 
 # Scans that are smoothed, and those of them that show whether that is needed, where a sweep makes a map.
 SMOOTHED, SHOWING = 20, 8
@@ -53,7 +56,7 @@ class SmoothedMotion:
 class _Tracking:
     """A mapper, with an IMU where there is one."""
 
-    def __init__(self, config: MappingConfig, inertial: Inertial | None) -> None:
+    def __init__(self, config: MappingConfig, inertial: "Inertial | None") -> None:
         self._mapper, self._inertial = SurfelMapper(config), inertial
         self.results: list[MappedScan] = []
         self.has_rings = True
@@ -72,7 +75,7 @@ class _Tracking:
 
 
 def smoothed_start(
-    scans: Iterable[Scan], config: MappingConfig, inertial: Inertial | None = None
+    scans: Iterable[Scan], config: MappingConfig, inertial: "Inertial | None" = None
 ) -> dict[float, SmoothedMotion]:
     """Motions of the first scans, by stamp; empty where registration in order suffices.
 
@@ -116,7 +119,7 @@ def smoothed_start(
     return {stamp: SmoothedMotion(T_prev_curr, stamp - before) for (before, stamp), T_prev_curr in moved}
 
 
-def _likeliest(scans: list[Scan], config: MappingConfig, inertial: Inertial) -> _Tracking:
+def _likeliest(scans: list[Scan], config: MappingConfig, inertial: "Inertial") -> _Tracking:
     """The first scans, tracked from the velocity at which they fit best: far apart, they leave it open.
 
     What an IMU measured relates it to the motion between all scans, and so the later ones decide.
