@@ -60,7 +60,7 @@ class Inertial(Stateful):
         self._window = InertialWindow(self._preintegration)
         self._predicted: Knot | None = None
         self._registered_s, self._measured_s, self._direction = None, None, None
-        self._up_world, self._up_sigma = None, np.inf
+        self._up_world, self._up_sigma = None, np.pi
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
 
     def anew(self) -> "Inertial":
