@@ -13,6 +13,10 @@ _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
 # Medians of the specific force's size, in the unit of the recording: what is carried feels about one g on average.
 _IN_G = (0.7, 1.5)
 _IN_SI = (7.0, 15.0)
+# Ranges of sensors begin here: rad/s and m/s^2. A sensor out of its range repeats its largest value so often in a row.
+_LEAST_RANGES, _REPEATED = (1.0, 15.0), 3
+# Share of missing samples that is noted.
+_MISSING = 0.02
 
 
 def usable_samples(
@@ -24,8 +28,8 @@ def usable_samples(
 ) -> ImuSamples | None:
     """The samples in the order of time; None where there are none.
 
-    Samples with a number that is not finite or the stamp of another one are left out, and accelerations in g are
-    converted; both are noted.
+    Samples with a number that is not finite or the stamp of another one are left out, and those out of the sensor's
+    range; accelerations in g are converted. All is noted, and samples that are missing.
 
     Args:
         stamps: (N,) seconds, in any order.
@@ -47,7 +51,30 @@ def usable_samples(
         notes = (*notes, f"The IMU's accelerations are in g (median {size:.2f}) and were converted to m/s^2.")
     elif not _IN_SI[0] < size < _IN_SI[1]:
         notes = (*notes, f"The IMU's accelerations have a median of {size:.3g}, which is gravity in no known unit.")
-    return ImuSamples(stamps[rows], angular_velocities[rows], force, T_lidar_imu, notes)
+    kept = ~(_saturated(angular_velocities[rows], _LEAST_RANGES[0]) | _saturated(force, _LEAST_RANGES[1]))
+    if (saturated := len(kept) - int(kept.sum())) > 0:
+        notes = (*notes, f"{count(saturated, 'IMU sample')} out of the sensor's range left out.")
+    missing = _missing(stamps[rows])
+    if missing > _MISSING:
+        notes = (*notes, f"{100.0 * missing:.0f} % of the IMU's samples are missing.")
+    return ImuSamples(stamps[rows][kept], angular_velocities[rows][kept], force[kept], T_lidar_imu, notes)
+
+
+def _saturated(vectors: FloatArray, least: float) -> FloatArray:
+    """(N,) whether a component of a vector (N, 3) is one of several equal ones in a row, at the largest of them all."""
+    sizes = np.abs(vectors)
+    largest = sizes.max(axis=0)
+    at_limit = (sizes == largest) & (largest > least)
+    runs = np.lib.stride_tricks.sliding_window_view(np.pad(at_limit, ((_REPEATED - 1,) * 2, (0, 0))), _REPEATED, axis=0)
+    whole = runs.all(axis=-1)
+    return np.asarray(np.any([whole[n : n + len(vectors)] for n in range(_REPEATED)], axis=(0, 2)))
+
+
+def _missing(stamps: FloatArray) -> float:
+    """Share of the samples that are missing of a steady rate."""
+    if len(stamps) < 3:
+        return 0.0
+    return 1.0 - (len(stamps) - 1) * float(np.median(np.diff(stamps))) / float(stamps[-1] - stamps[0])
 
 
 def _left_out(not_finite: int, repeated: int) -> Iterator[str]:

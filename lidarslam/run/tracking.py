@@ -106,7 +106,7 @@ def track(
     """
     config, faults = request.config, Faults()
     scans = take_in(recording, chosen, faults)
-    inertial = open_inertial(config, recording, chosen)
+    inertial = open_inertial(config, recording, chosen, log.warn)
     if inertial is not None:
         scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
@@ -122,8 +122,8 @@ def track(
         for warning in recording.warnings:
             log.warn(warning)
     error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
-    if inertial is not None and inertial.disagreement is not None:
-        log.warn(inertial.disagreement)
+    for warning in inertial.warnings if inertial is not None else ():
+        log.warn(warning)
     if not log.points_read:
         if isinstance(error, KeyboardInterrupt):
             raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)

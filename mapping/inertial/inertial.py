@@ -31,6 +31,12 @@ _EVERY_S, _LEVEL_SIGMA = 1.0, np.deg2rad(0.5)
 _BETTER = 0.7
 # The turns of IMU and LiDAR disagree when they differ by more than this share, and by more than registration does.
 _FEWEST_TURNS, _MOST_DIFFERENT, _REGISTRATION_ERROR = 50, 0.2, np.deg2rad(0.15)
+# Biases are reported from here on, and by so many deviations: sensor, part of the bias, m/s^2 and rad/s; as written.
+_DEVIATIONS = 5.0
+_LARGE_BIASES = (
+    ("accelerometer", slice(0, 3), 0.5, 1.0 / STANDARD_GRAVITY, "g"),
+    ("gyroscope", slice(3, 6), np.deg2rad(0.8), 180.0 / np.pi, "deg/s"),
+)
 
 
 class Inertial(Stateful):
@@ -75,8 +81,20 @@ class Inertial(Stateful):
         return Inertial(reversed_, self._extrinsics)
 
     @property
-    def disagreement(self) -> str | None:
-        """A warning where the turns of IMU and LiDAR disagree: its mounting or its clock is wrong; None else."""
+    def warnings(self) -> list[str]:
+        """What is wrong with the IMU, one sentence each."""
+        warnings, last = [] if self._disagreement is None else [self._disagreement], self._window.last
+        if last is not None:
+            covariance = self._window.covariance()[9:15, 9:15]
+            for sensor, part, least, scale, unit in _LARGE_BIASES:
+                size, sigma = np.linalg.norm(last.bias[part]), np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1])
+                if size > max(least, _DEVIATIONS * sigma):
+                    warnings.append(f"the IMU's {sensor} has a bias of {scale * size:.2f} {unit}; estimated, corrected")
+        return warnings
+
+    @property
+    def _disagreement(self) -> str | None:
+        """Where the turns of IMU and LiDAR disagree, its mounting or its clock is wrong; None else."""
         differences2 = self._differences2 - self._turns * _REGISTRATION_ERROR**2
         if self._turns < _FEWEST_TURNS or differences2 < _MOST_DIFFERENT**2 * self._angles2:
             return None

@@ -253,3 +253,24 @@ def test_an_empty_table(tmp_path):
     folder = folder_of_scans(tmp_path / "scans")
     (folder / "imu.csv").write_text("stamp_s,wx,wy,wz,ax,ay,az\n")
     assert open_recording(folder).imu is None
+
+
+def test_samples_out_of_the_sensors_range_are_left_out():
+    stamps = np.arange(400) / 200
+    rates = np.stack([3 * np.sin(stamps), np.cos(stamps), 0 * stamps], axis=1)
+    forces = np.tile([0.0, 0.0, 9.81], (400, 1))
+    found = usable_samples(stamps, np.clip(rates, -2.0, 2.0), forces, None)
+    expected = np.abs(rates[:, 0]) < 2.0
+    np.testing.assert_array_equal(found.stamps, stamps[expected])
+    assert found.notes == (f"{(~expected).sum()} IMU samples out of the sensor's range left out.",)
+    assert usable_samples(stamps, rates, forces, None).notes == ()
+
+
+def test_missing_samples_are_noted(rng):
+    stamps = np.arange(1000) / 200
+    kept = rng.permutation(1000) >= 100
+    zeros, forces = np.zeros((900, 3)), np.tile([0.0, 0.0, 9.81], (900, 1))
+    (note,) = usable_samples(stamps[kept], zeros, forces, None).notes
+    assert note == "10 % of the IMU's samples are missing."
+    jittered = stamps[:900] + rng.uniform(-0.001, 0.001, 900)
+    assert usable_samples(jittered, zeros, forces, None).notes == ()

@@ -1,6 +1,8 @@
 """`lidarslam run` with a recording's IMU: whether it helps, what it needs, and that it changes nothing unasked."""
 
 import json
+import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +87,7 @@ def test_shaken_sweeps_are_straightened(recording: Path, run: Any) -> None:
         errors[method] = rotation_error_deg(out, recording)
         metrics = json.loads((out / "metrics.json").read_text())
         assert metrics["association"]["matched"] == SCANS
+    assert "corrected" not in result.output
     assert 5.0 * errors["imu"] < errors["constant-velocity"]
     assert errors["imu"] < 0.15
 
@@ -117,10 +120,7 @@ def test_an_imu_needs_a_map(recording: Path, run: Any) -> None:
     assert "the IMU takes part in scan-to-map registration" in result.output
 
 
-def test_the_mounting_is_found_where_the_recording_has_none(
-    tmp_path: Path, room: Any, run: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("lidarslam.run.inertial._EVERY", 110)
+def test_the_mounting_is_found_where_the_recording_has_none(tmp_path: Path, room: Any, run: Any) -> None:
     source = record(tmp_path / "room", room, scans=115, mounting=False)
     result, out = run(source, "--odometry", "imu", "--stop", "115")
     assert result.exit_code == 0, result.output
@@ -131,11 +131,45 @@ def test_an_unknown_mounting_is_not_guessed_but_may_be_given(tmp_path: Path, roo
     source = record(tmp_path / "room", room, scans=20, mounting=False)
     result, _ = run(source, "--odometry", "imu", name="guess")
     assert result.exit_code == 1
-    assert "the extrinsic rotation of its IMU is not recorded, and not observable (too few scans)" in result.output
+    assert (
+        "the extrinsic rotation of its IMU is not recorded, and not observable (only 15 turns could be" in result.output
+    )
     angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
     result, out = run(source, "--odometry", "imu", "--set", f"odometry.imu_rotation_deg={angles}", name="given")
     assert result.exit_code == 0, result.output
     assert rotation_error_deg(out, source) < 0.2
+
+
+def flawed(recording: Path, folder: Path, flaw: Callable[[FloatArray], FloatArray]) -> Path:
+    """The recording with other samples of the IMU."""
+    shutil.copytree(recording, folder)
+    file = folder / "imu.csv"
+    header = file.read_text().partition("\n")[0].removeprefix("# ")
+    np.savetxt(file, flaw(np.loadtxt(file, delimiter=",")), delimiter=",", header=header)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory: pytest.TempPathFactory, room: Any) -> Path:
+    return record(tmp_path_factory.mktemp("imu") / "room", room, scans=40)
+
+
+def test_a_late_clock_is_corrected(longer: Path, tmp_path: Path, run: Any) -> None:
+    late = flawed(longer, tmp_path / "late", lambda rows: rows + np.eye(7)[0] * 0.02)
+    result, out = run(late, "--odometry", "imu")
+    assert result.exit_code == 0, result.output
+    found = re.search(r"the IMU's stamps are (\d+) ms late; corrected", result.output)
+    assert found is not None, result.output
+    assert int(found[1]) == pytest.approx(20, abs=3)
+    assert rotation_error_deg(out, longer) < 0.15
+
+
+def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Path, run: Any) -> None:
+    reversed_ = flawed(longer, tmp_path / "reversed", lambda rows: rows * [1, -1, -1, -1, 1, 1, 1])
+    result, out = run(reversed_, "--odometry", "imu")
+    assert result.exit_code == 1
+    assert "turns of the LiDAR about x, y, z are -x, -y, -z of the gyroscope" in result.output
+    assert not (out / "trajectory.tum").exists()
 
 
 def test_a_programs_own_loop_has_no_imu() -> None:

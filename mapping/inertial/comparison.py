@@ -1,0 +1,239 @@
+"""What LiDAR and IMU measured of the same motion, compared: axes and units, clocks, signs.
+
+Turns show rotation and clock (Wahba's problem; Gauss-Newton on the rotation vectors), accelerations the accelerometer:
+three positions give the velocity's change without a velocity (as in Qin and Shen's alignment, IROS 2017).
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, log, make_transform
+from lidarslam.core.imu import ImuSamples
+from lidarslam.mapping.inertial.gyroscope import Gyroscope
+from lidarslam.mapping.inertial.preintegration import Preintegration
+
+# Turns are compared over this time, and velocities: long beside the errors of registered poses.
+_SPAN_S = 0.5
+_FEWEST, _LONGEST_S = 20, 3.0
+# Errors of a turn at least, radians, and of the change of a velocity, m/s.
+_TURN_ERROR, _VELOCITY_ERROR = np.deg2rad(0.1), 0.05
+# The rotation is observable when its worst axis is this certain; turns agree when at most this share of them remains.
+_MOST_SIGMA, _MOST_REMAINING = np.deg2rad(1.0), 0.3
+# Deviations before the comparison: of the clock, seconds, of the rotation, radians, and of the bias, rad/s.
+_CLOCK_S, _ROTATION, _BIAS = 0.1, np.deg2rad(5.0), 0.1
+_SHIFT_S = 1e-3
+# Turns about an axis are seen where their power is so many times that of errors; axes that agree correlate.
+_CLEAR, _CORRELATED = 100.0, 0.8
+# Accelerations are reversed where their ratio is below this, and zero by so many deviations.
+_REVERSED, _DEVIATIONS = 0.3, 4.0
+_REWEIGHTED = 8
+_AXES = np.array(["x", "y", "z"])
+
+
+class MountingError(ValueError):
+    """The rotation is not observable by the turns; the message has the reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """A rotation that was found."""
+
+    R_lidar_imu: FloatArray  # (3, 3)
+    sigma: float  # standard deviation about the worst axis, radians
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Errors of an IMU's clock and rotation."""
+
+    offset_s: float  # its stamps are late by so much
+    offset_sigma_s: float
+    rotation: FloatArray  # (3,) rotation vector from its axes, as they were given, to the LiDAR's
+    rotation_sigma: float  # of its worst axis, radians
+
+
+class Comparison:
+    """The motion since half a second before each registered pose, by both.
+
+    Args:
+        samples: of the IMU.
+        T_lidar_imu: (4, 4) its extrinsic calibration; the identity while there is none.
+    """
+
+    def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
+        self._gyroscope = Gyroscope(samples, T_lidar_imu[:3, :3])
+        self._preintegration = Preintegration(samples, T_lidar_imu[:3, :3])
+        self._lever = T_lidar_imu[:3, 3]
+        self._recent: deque[tuple[float, FloatArray]] = deque()
+        # Rows (13,): rotation vectors of LiDAR and IMU, the latter's change per second of the clock, the time, and the
+        # integral of the angular velocity.
+        self._turns: list[FloatArray] = []
+        # Rotations (3, 3) and changes of the velocity (3,) by LiDAR and IMU, of the world.
+        self._velocities: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+
+    def __len__(self) -> int:
+        return len(self._turns)
+
+    def add(self, stamp: float, T_world_lidar: FloatArray, is_connected: bool) -> None:
+        """Take a registered pose (4, 4); one that does not follow from those before begins anew."""
+        if not is_connected:
+            self._recent.clear()
+        self._recent.append((stamp, T_world_lidar))
+        first = self._before(stamp - _SPAN_S)
+        if first is None or not self._gyroscope.covers(first[0] - _SHIFT_S, stamp + _SHIFT_S):
+            return
+        self._compare_turns(first, (stamp, T_world_lidar))
+        earlier = self._before(first[0] - _SPAN_S)
+        if earlier is not None and self._gyroscope.covers(earlier[0], stamp):
+            self._compare_velocities(earlier, first, (stamp, T_world_lidar))
+        while self._recent and self._recent[0][0] < stamp - _LONGEST_S:
+            self._recent.popleft()
+
+    def mounting(self) -> Mounting:
+        """The rotation between both frames (Wahba's problem, by SVD); the gyroscope's bias is in the mean.
+
+        Raises:
+            MountingError: the turns are too few, about one axis only, or do not agree.
+        """
+        if len(self) < _FEWEST:
+            raise MountingError(f"only {len(self)} turns could be compared")
+        turns = np.array(self._turns)
+        a, b = (_about_mean(of, turns[:, 9:10]) for of in (turns[:, :3], turns[:, 3:6]))
+        U, _, Vt = np.linalg.svd(a.T @ b)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        remaining = a - b @ R.T
+        error = max(_TURN_ERROR, float(np.sqrt((remaining**2).mean())))
+        information = np.eye(3) * float((a**2).sum()) - a.T @ a
+        sigma = error / float(np.sqrt(max(np.linalg.eigvalsh(information)[0], 1e-12)))
+        if sigma > _MOST_SIGMA:
+            raise MountingError(
+                f"it turns too little, or about one axis only: uncertain by {min(180.0, np.rad2deg(sigma)):.0f} degrees"
+            )
+        if _share(remaining, a) > _MOST_REMAINING:
+            raise MountingError("the turns of LiDAR and IMU do not agree: different clocks, or axes of another kind")
+        return Mounting(np.asarray(R, dtype=np.float64), sigma)
+
+    def alignment(self) -> Alignment:
+        """The errors of clock and rotation, with the gyroscope's bias; as good as the turns show them."""
+        rows = np.array(self._turns).reshape(-1, 13)
+        a, b, change, spans = rows[:, :3], rows[:, 3:6], rows[:, 6:9], rows[:, 9]
+        J = np.zeros((len(rows), 3, 7))
+        J[:, :, 0], J[:, :, 1:4] = change, -_skews(b)
+        J[:, :, 4:] = -spans[:, None, None] * np.eye(3)
+        prior = np.diag(np.array([_CLOCK_S, *3 * [_ROTATION], *3 * [_BIAS]]) ** -2.0)
+        x, covariance = _robust_fit(J, a - b, prior, _TURN_ERROR)
+        worst = float(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1]))
+        return Alignment(float(x[0]), float(np.sqrt(covariance[0, 0])), x[1:4], worst)
+
+    def contradiction(self) -> str | None:
+        """What is seen of axes, signs or units that cannot be right; None where nothing is."""
+        if len(self) < _FEWEST:
+            return None
+        return self._contradicting_turns() or self._contradicting_velocities()
+
+    def _contradicting_turns(self) -> str | None:
+        """Turns differ, and others of the IMU's axes agree with those of the LiDAR."""
+        turns = np.array(self._turns)
+        lidar, imu = (_about_mean(of, turns[:, 9:10]) for of in (turns[:, :3], turns[:, 10:]))
+        powers = (lidar**2).sum(axis=0)
+        seen = powers > _CLEAR * _TURN_ERROR**2 * len(lidar)
+        wrong = seen & (((imu - lidar) ** 2).sum(axis=0) > (2.0 * _MOST_REMAINING) ** 2 * powers)
+        correlations = lidar.T @ imu / np.sqrt(np.outer(powers, (imu**2).sum(axis=0)).clip(1e-12))
+        axes = np.abs(correlations).argmax(axis=1)
+        best = correlations[range(3), axes]
+        if not wrong.any() or np.abs(best[wrong]).min() < _CORRELATED:
+            return None
+        if (axes[seen] == np.flatnonzero(seen)).all() and (best[seen] > 0.0).all():
+            size = float(np.sqrt((imu[:, seen] ** 2).sum() / powers[seen].sum()))
+            return f"the gyroscope measures {size:.2g} times the turns of the LiDAR: its unit is not rad/s"
+        names = ", ".join(f"{'-' if best[axis] < 0.0 else '+'}{_AXES[axes[axis]]}" for axis in np.flatnonzero(seen))
+        return (
+            f"turns of the LiDAR about {', '.join(_AXES[seen])} are {names} of the gyroscope, by its extrinsic"
+            " calibration: a sign, the order of its axes, or the calibration is wrong"
+        )
+
+    def _contradicting_velocities(self) -> str | None:
+        """Velocities change by a negative multiple of what the accelerometer measured, beside gravity and a bias."""
+        if len(self._velocities) < _FEWEST:
+            return None
+        rotations, lidar, imu = (np.stack(column) for column in zip(*self._velocities, strict=True))
+        gravity = np.broadcast_to(np.eye(3), rotations.shape)
+        ratio, sigma = _robust_fit(
+            np.concatenate([imu[:, :, None], gravity, rotations], axis=2),
+            lidar,
+            np.diag([1e-4, *3 * [1e-4], *3 * [1.0]]),
+            _VELOCITY_ERROR,
+        )
+        if ratio[0] > -_REVERSED or ratio[0] > -_DEVIATIONS * np.sqrt(sigma[0, 0]):
+            return None
+        return (
+            "accelerations of the LiDAR's positions are opposed to those of the accelerometer, by its extrinsic"
+            " calibration: a sign, the order of its axes, or the calibration is wrong"
+        )
+
+    def _before(self, stamp: float) -> tuple[float, FloatArray] | None:
+        """The last recent pose that is not after a stamp."""
+        return next((pose for pose in reversed(self._recent) if pose[0] <= stamp + 1e-3), None)
+
+    def _compare_turns(self, first: tuple[float, FloatArray], last: tuple[float, FloatArray]) -> None:
+        begin, end = first[0], last[0]
+        none = np.zeros(3)
+        imu = _vector(self._gyroscope.turn(begin, end, none))
+        later = _vector(self._gyroscope.turn(begin + _SHIFT_S, end + _SHIFT_S, none))
+        lidar = _vector(first[1][:3, :3].T @ last[1][:3, :3])
+        integral = self._preintegration.means(np.array([begin, end]))[0, :3] * (end - begin)
+        self._turns.append(np.concatenate([lidar, imu, (later - imu) / _SHIFT_S, [end - begin], integral]))
+
+    def _compare_velocities(self, *poses: tuple[float, FloatArray]) -> None:
+        """The velocity's change from the middle of one span to that of the next; gravity is a term of its own."""
+        stamps = np.array([stamp for stamp, _ in poses])
+        rotations = np.stack([T[:3, :3] for _, T in poses])
+        positions = np.stack([T[:3, 3] + T[:3, :3] @ self._lever for _, T in poses])
+        first, second = np.diff(stamps)
+        pims = [self._preintegration.between(a, b, np.zeros(6)) for a, b in pairwise(stamps)]
+        lidar = (positions[2] - positions[1]) / second - (positions[1] - positions[0]) / first
+        imu = (
+            rotations[0] @ (pims[0].deltaVij() - pims[0].deltaPij() / first)
+            + rotations[1] @ pims[1].deltaPij() / second
+        )
+        self._velocities.append((rotations[1], lidar, imu))
+
+
+def _robust_fit(J: FloatArray, y: FloatArray, prior: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
+    """Solution (K,) and covariance of `J x = y` for vectors (N, 3), reweighted by Cauchy's kernel.
+
+    Args:
+        J: (N, 3, K).
+        y: (N, 3), of errors that are estimated, and have at least this standard deviation.
+        prior: (K, K) information of zero.
+    """
+    weight, error = np.ones(len(y)), least
+    x, covariance = np.zeros(len(prior)), np.linalg.inv(prior)
+    for _ in range(_REWEIGHTED if len(y) else 0):
+        covariance = np.linalg.inv(np.einsum("n,nij,nik->jk", weight, J, J) / error**2 + prior)
+        x = covariance @ np.einsum("n,nij,ni->j", weight, J, y) / error**2
+        squares = ((y - J @ x) ** 2).mean(axis=1)
+        error = max(least, 1.2 * float(np.sqrt(np.median(squares))))
+        weight = 1.0 / (1.0 + squares / (2.0 * error) ** 2)
+    return x, covariance
+
+
+def _about_mean(turns: FloatArray, spans: FloatArray) -> FloatArray:
+    """Turns (N, 3) without their mean rate, of which a constant bias is a part."""
+    return np.asarray(turns - spans * (turns.sum(axis=0) / spans.sum()), dtype=np.float64)
+
+
+def _share(remaining: FloatArray, of: FloatArray) -> float:
+    return float(np.sqrt((remaining**2).sum() / (of**2).sum()))
+
+
+def _vector(R: FloatArray) -> FloatArray:
+    return log(make_transform(R, np.zeros(3)))[:3]
+
+
+def _skews(vectors: FloatArray) -> FloatArray:
+    """(N, 3, 3) matrices of the cross product."""
+    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2), dtype=np.float64)
