@@ -11,6 +11,7 @@ from lidarslam.core.limits import require_range_left
 OdometryName = Literal["learned", "kiss-icp", "constant-velocity", "imu", "learned+imu", "external"]
 NetworkName = Literal["correlation", "delora"]
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
+Metres = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 
 class LearnedConfig(BaseModel):
@@ -63,6 +64,9 @@ class OdometryConfig(BaseModel):
         None,
         description="roll, pitch, yaw of the IMU in the LiDAR's recorded axes; null: the recording's, else found by its"
         " turns",
+    )
+    imu_position_m: tuple[Metres, Metres, Metres] = Field(
+        (0.0, 0.0, 0.0), description="of the IMU in the LiDAR's recorded axes, beside imu_rotation_deg"
     )
 
     @property

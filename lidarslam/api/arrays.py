@@ -41,6 +41,18 @@ def make_scan(points: ArrayLike, point_times: ArrayLike | None, stamp: float, mo
     return turned(scan, transform_of(mounting))
 
 
+def make_vector(name: str, numbers: ArrayLike) -> FloatArray:
+    """Three finite numbers (3,), copied.
+
+    Raises:
+        InputError: they are something else.
+    """
+    vector = np.array(_numbers(name, numbers), dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"{name} must be three finite numbers, got {numbers!r}")
+    return vector
+
+
 def check_stamp(stamp: float, last: float | None) -> float:
     """The stamp in seconds.
 

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 from threadpoolctl import ThreadpoolController
 from typing_extensions import Self
 
-from lidarslam.api.arrays import check_stamp, check_sweep, make_scan
+from lidarslam.api.arrays import check_stamp, check_sweep, make_scan, make_vector
 from lidarslam.api.registered_scan import RegisteredScan
 from lidarslam.api.saving import Built, python_names, save_run
 from lidarslam.config.settings import Config, make_config
-from lidarslam.core.errors import InputError, LidarSlamError
+from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.scan import Scan
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.datasets.faults import Faults
@@ -30,8 +30,9 @@ from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.pipeline.estimates import Estimated, Localised
 from lidarslam.pipeline.localisation import make_localiser
 from lidarslam.pipeline.stages import Stages
+from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.loop_closing import begin_graph
-from lidarslam.run.run import open_odometry, require_scans_only
+from lidarslam.run.run import open_odometry, require_no_trajectory
 from lidarslam.run.scan_log import ScanLog
 
 logger = logging.getLogger(__name__)
@@ -58,15 +59,17 @@ class Slam:
 
     def __init__(self, config: Config | str | PathLike[str] | Mapping[str, Any] | None = None) -> None:
         self._config = make_config(config)
-        require_scans_only(self._config)
+        require_no_trajectory(self._config)
         with CompileAhead(parts_of(self._config)) as compiling, python_names():
             self._odometry = open_odometry(self._config, None)
             compiling.wait_for_all(logger.info)
         self._graph = begin_graph(self._config)
-        self._stages = Stages(self._odometry, make_localiser(self._config), self._config.global_map, self._graph)
+        self._log, self._faults = ScanLog(), Faults()
+        self._imu = make_imu_stream(self._config, self._log.warn)
+        localiser = make_localiser(self._config, self._imu)
+        self._stages = Stages(self._odometry, localiser, self._config.global_map, self._graph)
         self._builder = BackgroundWorker("map", _SCANS_BEHIND)
         self._blas = ThreadpoolController()
-        self._log, self._faults = ScanLog(), Faults()
         self._count, self._longest_interval_s = 0, 0.0
         self._last_stamp: float | None = None
         self._counts_stamps = False  # whether stamps are made from the rate
@@ -98,12 +101,37 @@ class Slam:
             self._require_working()
             started = time.perf_counter()
             scan = self._take(points, point_times, stamp)
+            if self._imu is not None:
+                scan = self._imu.take_up(scan)
             with self._failing(), self._blas.limit(limits=1, user_api="blas"):
                 estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
                 localised = self._stages.localise(estimated)
                 total_ms = 1e3 * (time.perf_counter() - started)
                 self._submit(estimated, localised, total_ms)
             return RegisteredScan.of(scan.stamp, localised)
+
+    def register_imu(self, stamp: float, gyroscope: ArrayLike, acceleration: ArrayLike) -> None:
+        """Take the next sample of the IMU; with `odometry.method` `learned+imu` or `imu`.
+
+        A scan is registered with the samples that have come before it: give those of its sweep first. Where
+        `odometry.imu_rotation_deg` is not configured, the rotation is found by the turns of the first scans.
+
+        Args:
+            stamp: seconds on the clock of the scans, after that of the sample before.
+            gyroscope: (3,) angular velocity in the IMU's axes, rad/s.
+            acceleration: (3,) specific force, m/s^2: about +9.8 along the axis that points up at rest.
+
+        Raises:
+            InputError: a number is not finite, or the stamp not after the last one. Nothing has changed; go on.
+            ConfigError: the configured odometry uses no IMU.
+        """
+        self._require_open()
+        if self._imu is None:
+            raise ConfigError(
+                f"odometry.method={self._config.odometry.method} uses no IMU; choose odometry.method=learned+imu"
+            )
+        vectors = make_vector("gyroscope", gyroscope), make_vector("acceleration", acceleration)
+        self._imu.add(check_stamp(stamp, None), *vectors)
 
     def trajectory(self) -> Trajectory:
         """The poses of all scans so far, corrected by the loops that the pose graph has closed.
@@ -143,6 +171,8 @@ class Slam:
             self._settle()
             if not self._log.points_read:
                 raise InputError("there is nothing to save: no scan with points was registered")
+            for warning in self._imu.warnings if self._imu is not None else ():
+                self._log.warn(warning)
             self._stages.map.slides.finish()
             save_run(Path(directory), overwrite, self._config, self._built())
 
@@ -222,9 +252,12 @@ class Slam:
     @contextmanager
     def _entered(self) -> Iterator[None]:
         with self._lock:
-            if self._closed:
-                raise LidarSlamError("this Slam is closed; call trajectory(), map() and save() before close()")
+            self._require_open()
             yield
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LidarSlamError("this Slam is closed; call trajectory(), map() and save() before close()")
 
     @contextmanager
     def _failing(self) -> Iterator[None]:

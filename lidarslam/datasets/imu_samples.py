@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.imu import ImuSamples
@@ -60,13 +61,13 @@ def usable_samples(
     return ImuSamples(stamps[rows][kept], angular_velocities[rows][kept], force[kept], T_lidar_imu, notes)
 
 
-def _saturated(vectors: FloatArray, least: float) -> FloatArray:
+def _saturated(vectors: FloatArray, least: float) -> NDArray[np.bool_]:
     """(N,) whether a component of a vector (N, 3) is one of several equal ones in a row, at the largest of them all."""
     sizes = np.abs(vectors)
     largest = sizes.max(axis=0)
     at_limit = (sizes == largest) & (largest > least)
     runs = np.lib.stride_tricks.sliding_window_view(np.pad(at_limit, ((_REPEATED - 1,) * 2, (0, 0))), _REPEATED, axis=0)
-    whole = runs.all(axis=-1)
+    whole = np.asarray(runs.all(axis=-1))
     return np.asarray(np.any([whole[n : n + len(vectors)] for n in range(_REPEATED)], axis=(0, 2)))
 
 

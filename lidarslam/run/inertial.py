@@ -10,18 +10,21 @@ import numpy as np
 
 from lidarslam.config.settings import Config
 from lidarslam.core.errors import ConfigError, InputError
-from lidarslam.core.geometry import FloatArray, exp, make_transform
+from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.intake import take_in
 from lidarslam.datasets.mounting.recording import recorded_axes
+from lidarslam.datasets.mounting.rotation import transform_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.odometry.config import OdometryConfig
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.inertial.comparison import Comparison
     from lidarslam.mapping.inertial.inertial import Inertial
+    from lidarslam.pipeline.imu_stream import ImuStream
 
 logger = logging.getLogger(__name__)
 
@@ -31,8 +34,6 @@ _ROTATION = "--set odometry.imu_rotation_deg=[R,P,Y]"
 _MOST_SCANS, _EVERY = 600, 10
 # Scans that clock and rotation are compared in at most, turns at least, and how often. Until the clock is this certain.
 _COMPARED_SCANS, _COMPARED_TURNS, _ALIGNED_TIMES, _CLOCK_SIGMA_S = 60, 30, 3, 0.001
-# Errors are corrected from here on, and by so many deviations.
-_LEAST_OFFSET_S, _LEAST_ROTATION, _DEVIATIONS = 0.003, np.deg2rad(1.0), 4.0
 
 
 def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
@@ -75,8 +76,7 @@ def open_inertial(
     for note in samples.notes:
         warn(note)
     T_lidar_imu = samples.T_lidar_imu
-    if config.odometry.imu_rotation_deg is not None:
-        T_recorded_imu = make_transform(_rotation(config.odometry.imu_rotation_deg), np.zeros(3))
+    if (T_recorded_imu := given_extrinsics(config.odometry)) is not None:
         T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
     poses = _Poses(config, recording, chosen)
     if T_lidar_imu is None:
@@ -86,10 +86,33 @@ def open_inertial(
     return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn))
 
 
-def _rotation(roll_pitch_yaw_deg: tuple[float, float, float]) -> FloatArray:
+def given_extrinsics(config: OdometryConfig) -> FloatArray | None:
+    """T_recorded_imu (4, 4) of the configuration, in the LiDAR's recorded axes; None where it has none."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_euler("xyz", roll_pitch_yaw_deg, degrees=True).as_matrix(), dtype=np.float64)
+    if config.imu_rotation_deg is None:
+        return None
+    R = Rotation.from_euler("xyz", config.imu_rotation_deg, degrees=True).as_matrix()
+    return make_transform(np.asarray(R, dtype=np.float64), np.array(config.imu_position_m))
+
+
+def make_imu_stream(
+    config: Config, warn: Callable[[str], None], T_lidar_imu: FloatArray | None = None
+) -> "ImuStream | None":
+    """The IMU's part in a run whose samples come one after the other; None where the odometry uses no IMU.
+
+    Args:
+        config: the configuration; its extrinsic calibration is used before others.
+        warn: called with what is corrected, or wrong.
+        T_lidar_imu: (4, 4) extrinsic calibration of another source, in upright axes.
+    """
+    if not config.odometry.uses_imu:
+        return None
+    from lidarslam.pipeline.imu_stream import ImuStream
+
+    if (T_recorded_imu := given_extrinsics(config.odometry)) is not None:
+        T_lidar_imu = transform_of(config.reader.mounting) @ T_recorded_imu
+    return ImuStream(T_lidar_imu, warn)
 
 
 class _Poses:
@@ -156,7 +179,7 @@ def _aligned(
     Raises:
         InputError: they show that the samples, or their axes, are something else.
     """
-    offset_s, rotation = 0.0, np.zeros(3)
+    said: list[str] = []
     for _ in range(_ALIGNED_TIMES):
         for comparison in poses.compared(samples, T_lidar_imu, _COMPARED_SCANS):
             found = comparison.alignment()
@@ -165,21 +188,11 @@ def _aligned(
         contradiction = comparison.contradiction()
         if contradiction is not None:
             raise InputError(f"{name}: {contradiction}; correct the IMU's data, give {_ROTATION}, or {_INSTEAD}")
-        is_late = abs(found.offset_s) > max(_LEAST_OFFSET_S, _DEVIATIONS * found.offset_sigma_s)
-        is_turned = np.linalg.norm(found.rotation) > max(_LEAST_ROTATION, _DEVIATIONS * found.rotation_sigma)
-        if is_late:
-            offset_s += found.offset_s
-            samples = replace(samples, stamps=samples.stamps - found.offset_s)
-        if is_turned:
-            turn = exp(np.pad(found.rotation, (0, 3)))[:3, :3]
-            T_lidar_imu = make_transform(turn @ T_lidar_imu[:3, :3], T_lidar_imu[:3, 3])
-            rotation = rotation + found.rotation
-        if not (is_late or is_turned):
+        if not (sentences := found.sentences()):
             break
-    if offset_s:
-        late = "late" if offset_s > 0.0 else "early"
-        warn(f"the IMU's stamps are {1e3 * abs(offset_s):.0f} ms {late}; corrected")
-    if rotation.any():
-        degrees = np.rad2deg(np.linalg.norm(rotation))
-        warn(f"the IMU is turned by {degrees:.1f} degrees against its extrinsic calibration; corrected")
+        said = said or sentences
+        samples = replace(samples, stamps=samples.stamps - found.significant_offset_s)
+        T_lidar_imu = found.corrected(T_lidar_imu)
+    for sentence in said:
+        warn(sentence)
     return samples, T_lidar_imu

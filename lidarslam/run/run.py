@@ -172,13 +172,11 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
     return make_odometry(config.odometry, None if prior is None else read_tum(prior))
 
 
-def require_scans_only(config: Config) -> None:
-    """Refuse an odometry that takes more of a recording than its scans, one after the other.
+def require_no_trajectory(config: Config) -> None:
+    """Refuse an odometry that takes more of a recording than what comes one after the other.
 
     Raises:
-        ConfigError: it needs a trajectory or an IMU.
+        ConfigError: it needs a trajectory.
     """
     if config.odometry.method == "external":
         raise ConfigError("odometry.method=external needs a whole trajectory beforehand: use lidarslam run --prior")
-    if config.odometry.uses_imu:
-        raise ConfigError(f"odometry.method={config.odometry.method} needs the IMU of a recording: use lidarslam run")

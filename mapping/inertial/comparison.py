@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, log, make_transform
+from lidarslam.core.geometry import FloatArray, exp, log, make_transform
 from lidarslam.core.imu import ImuSamples
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.preintegration import Preintegration
@@ -25,6 +25,10 @@ _MOST_SIGMA, _MOST_REMAINING = np.deg2rad(1.0), 0.3
 # Deviations before the comparison: of the clock, seconds, of the rotation, radians, and of the bias, rad/s.
 _CLOCK_S, _ROTATION, _BIAS = 0.1, np.deg2rad(5.0), 0.1
 _SHIFT_S = 1e-3
+# Errors of clock and rotation are corrected from here on, and by so many deviations.
+_LEAST_OFFSET_S, _LEAST_ROTATION, _SIGNIFICANT = 0.003, np.deg2rad(1.0), 4.0
+# Turns and changes of the velocity that are kept.
+_KEPT = 600
 # Turns about an axis are seen where their power is so many times that of errors; axes that agree correlate.
 _CLEAR, _CORRELATED = 100.0, 0.8
 # Accelerations are reversed where their ratio is below this, and zero by so many deviations.
@@ -54,6 +58,33 @@ class Alignment:
     rotation: FloatArray  # (3,) rotation vector from its axes, as they were given, to the LiDAR's
     rotation_sigma: float  # of its worst axis, radians
 
+    @property
+    def significant_offset_s(self) -> float:
+        """The error of the clock where it is clear; else zero."""
+        is_clear = abs(self.offset_s) > max(_LEAST_OFFSET_S, _SIGNIFICANT * self.offset_sigma_s)
+        return self.offset_s if is_clear else 0.0
+
+    @property
+    def significant_rotation(self) -> FloatArray:
+        """(3,) the rotation where it is clear; else zero."""
+        is_clear = np.linalg.norm(self.rotation) > max(_LEAST_ROTATION, _SIGNIFICANT * self.rotation_sigma)
+        return self.rotation if is_clear else np.zeros(3)
+
+    def corrected(self, T_lidar_imu: FloatArray) -> FloatArray:
+        """The extrinsic calibration (4, 4) without an error of the rotation that is clear."""
+        turn = exp(np.pad(self.significant_rotation, (0, 3)))[:3, :3]
+        return make_transform(turn @ T_lidar_imu[:3, :3], T_lidar_imu[:3, 3])
+
+    def sentences(self) -> list[str]:
+        """The errors that are clear, one sentence each."""
+        sentences, degrees = [], np.rad2deg(np.linalg.norm(self.significant_rotation))
+        if self.significant_offset_s:
+            late = "late" if self.offset_s > 0.0 else "early"
+            sentences.append(f"the IMU's stamps are {1e3 * abs(self.offset_s):.0f} ms {late}; corrected")
+        if degrees:
+            sentences.append(f"the IMU is turned by {degrees:.1f} degrees against its extrinsic calibration; corrected")
+        return sentences
+
 
 class Comparison:
     """The motion since half a second before each registered pose, by both.
@@ -64,18 +95,22 @@ class Comparison:
     """
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
-        self._gyroscope = Gyroscope(samples, T_lidar_imu[:3, :3])
-        self._preintegration = Preintegration(samples, T_lidar_imu[:3, :3])
-        self._lever = T_lidar_imu[:3, 3]
+        self._T_lidar_imu = T_lidar_imu
+        self.use(samples)
         self._recent: deque[tuple[float, FloatArray]] = deque()
         # Rows (13,): rotation vectors of LiDAR and IMU, the latter's change per second of the clock, the time, and the
         # integral of the angular velocity.
-        self._turns: list[FloatArray] = []
+        self._turns: deque[FloatArray] = deque(maxlen=_KEPT)
         # Rotations (3, 3) and changes of the velocity (3,) by LiDAR and IMU, of the world.
-        self._velocities: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self._velocities: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque(maxlen=_KEPT)
 
     def __len__(self) -> int:
         return len(self._turns)
+
+    def use(self, samples: ImuSamples) -> None:
+        """Go on with other samples of the same IMU, such as the latest ones."""
+        self._gyroscope = Gyroscope(samples, self._T_lidar_imu[:3, :3])
+        self._preintegration = Preintegration(samples, self._T_lidar_imu[:3, :3])
 
     def add(self, stamp: float, T_world_lidar: FloatArray, is_connected: bool) -> None:
         """Take a registered pose (4, 4); one that does not follow from those before begins anew."""
@@ -191,7 +226,7 @@ class Comparison:
         """The velocity's change from the middle of one span to that of the next; gravity is a term of its own."""
         stamps = np.array([stamp for stamp, _ in poses])
         rotations = np.stack([T[:3, :3] for _, T in poses])
-        positions = np.stack([T[:3, 3] + T[:3, :3] @ self._lever for _, T in poses])
+        positions = np.stack([T[:3, 3] + T[:3, :3] @ self._T_lidar_imu[:3, 3] for _, T in poses])
         first, second = np.diff(stamps)
         pims = [self._preintegration.between(a, b, np.zeros(6)) for a, b in pairwise(stamps)]
         lidar = (positions[2] - positions[1]) / second - (positions[1] - positions[0]) / first
@@ -211,9 +246,10 @@ def _robust_fit(J: FloatArray, y: FloatArray, prior: FloatArray, least: float) -
         prior: (K, K) information of zero.
     """
     weight, error = np.ones(len(y)), least
-    x, covariance = np.zeros(len(prior)), np.linalg.inv(prior)
+    x: FloatArray = np.zeros(len(prior))
+    covariance: FloatArray = np.asarray(np.linalg.inv(prior), dtype=np.float64)
     for _ in range(_REWEIGHTED if len(y) else 0):
-        covariance = np.linalg.inv(np.einsum("n,nij,nik->jk", weight, J, J) / error**2 + prior)
+        covariance = np.asarray(np.linalg.inv(np.einsum("n,nij,nik->jk", weight, J, J) / error**2 + prior))
         x = covariance @ np.einsum("n,nij,ni->j", weight, J, y) / error**2
         squares = ((y - J @ x) ** 2).mean(axis=1)
         error = max(least, 1.2 * float(np.sqrt(np.median(squares))))

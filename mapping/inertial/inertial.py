@@ -59,15 +59,19 @@ class Inertial(Stateful):
     _differences2: float
 
     def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
-        self._samples, self._extrinsics = samples, T_lidar_imu
+        self._extrinsics = T_lidar_imu
         self._T_lidar_imu = make_transform(np.eye(3), T_lidar_imu[:3, 3])  # of samples in the LiDAR's axes
-        self.gyroscope = Gyroscope(samples, T_lidar_imu[:3, :3])
-        self._preintegration = Preintegration(samples, T_lidar_imu[:3, :3])
+        self._integrate(samples)
         self._window = InertialWindow(self._preintegration)
         self._predicted: Knot | None = None
         self._registered_s, self._measured_s, self._direction = None, None, None
         self._up_world, self._up_sigma = None, np.pi
         self._turns, self._angles2, self._differences2 = 0, 0.0, 0.0
+
+    def use(self, samples: ImuSamples) -> None:
+        """Go on with other samples of the same IMU, such as the latest ones."""
+        self._integrate(samples)
+        self._window.use(self._preintegration)
 
     def anew(self) -> "Inertial":
         """A new one of the same samples."""
@@ -154,6 +158,11 @@ class Inertial(Stateful):
         return GravityDirection(
             up, self._up_world, across @ covariance[:3, :3] @ across.T + self._up_sigma**2 * np.eye(3)
         )
+
+    def _integrate(self, samples: ImuSamples) -> None:
+        self._samples = samples
+        self.gyroscope = Gyroscope(samples, self._extrinsics[:3, :3])
+        self._preintegration = Preintegration(samples, self._extrinsics[:3, :3])
 
     def _begin(self, scan: Scan, T_world_imu: FloatArray) -> None:
         if self.gyroscope.covers(scan.stamp, scan.stamp):

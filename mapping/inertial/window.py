@@ -88,6 +88,10 @@ class InertialWindow(Stateful):
         self._measurements: dict[float, gtsam.PreintegratedCombinedMeasurements] = {}
         self._knots, self._prior, self._latest = [], None, np.eye(_SIZE)
 
+    def use(self, preintegration: Preintegration) -> None:
+        """Integrate these samples from here on."""
+        self._preintegration = preintegration
+
     @property
     def last(self) -> Knot | None:
         """The latest state; None before the first."""

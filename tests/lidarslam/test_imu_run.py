@@ -13,10 +13,14 @@ import pytest
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 
+import lidarslam
 from lidarslam.cli import main
+from lidarslam.core.errors import ConfigError, InputError, LidarSlamError
 from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform, rotation_angle
 from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
+from lidarslam.datasets.faults import Faults
+from lidarslam.datasets.registry import open_recording
 from lidarslam.simulation.sensors.imu import MEMS_IMU, sample_imu
 
 SCANS = 20
@@ -172,9 +176,63 @@ def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Pat
     assert not (out / "trajectory.tum").exists()
 
 
-def test_a_programs_own_loop_has_no_imu() -> None:
-    import lidarslam
-    from lidarslam.core.errors import ConfigError
+def register_all(slam: Any, source: Path, until: Callable[[int], bool] = lambda _: True) -> None:
+    """Give a recording's samples and scans to a program's own loop, each when it is complete."""
+    recording = open_recording(source)
+    imu = recording.imu
+    assert imu is not None
+    rows = list(zip(imu.stamps, imu.angular_velocities, imu.accelerations, strict=True))
+    for number, scan in enumerate(recording.scans(faults=Faults())):
+        assert scan.time_offsets is not None
+        while rows and rows[0][0] < scan.stamp + scan.time_offsets.max():
+            sample = rows.pop(0)
+            if until(number):
+                slam.register_imu(*sample)
+        slam.register_frame(scan)
 
-    with pytest.raises(ConfigError, match=r"odometry.method=imu needs the IMU of a recording"):
-        lidarslam.Slam({"odometry.method": "imu"})
+
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_programs_own_loop_takes_the_samples_as_they_come(longer: Path, is_given: bool) -> None:
+    angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
+    given = {"imu_rotation_deg": angles, "imu_position_m": MODEL.T_lidar_imu[:3, 3].tolist()} if is_given else {}
+    with lidarslam.Slam({"odometry": {"method": "imu", **given}, "mapping.keypoints": 800}) as slam:
+        register_all(slam, longer)
+        trajectory = slam.trajectory()
+    motions = trajectory.relative_motions()[0 if is_given else 32 :]
+    true = read_tum(longer / "ground_truth.tum").relative_motions()[-len(motions) :]
+    assert np.rad2deg(np.sqrt((rotation_angle(inverse(motions) @ true) ** 2).mean())) < 0.15
+
+
+def test_a_late_clock_is_corrected_on_the_way(longer: Path, tmp_path: Path) -> None:
+    late = flawed(longer, tmp_path / "late", lambda rows: rows + np.eye(7)[0] * 0.02)
+    angles = Rotation.from_matrix(MODEL.T_lidar_imu[:3, :3]).as_euler("xyz", degrees=True).tolist()
+    with lidarslam.Slam({"odometry": {"method": "imu", "imu_rotation_deg": angles}, "mapping.keypoints": 800}) as slam:
+        register_all(slam, late)
+        slam.save(tmp_path / "run")
+    warnings = json.loads((tmp_path / "run" / "summary.json").read_text())["warnings"]
+    assert any(re.search(r"stamps are (1[6-9]|2[0-4]) ms late; corrected", warning) for warning in warnings), warnings
+
+
+def test_samples_are_checked(tmp_path: Path) -> None:
+    with lidarslam.Slam({"odometry.method": "imu"}) as slam:
+        slam.register_imu(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
+        for stamp, rates, why in (
+            (1.0, [0.0, 0.0, 0.0], "stamps must increase"),
+            (2.0, [0.0, np.nan, 0.0], "gyroscope must be three finite numbers"),
+            (2.0, [0.0, 0.0], "gyroscope must be three finite numbers"),
+            (np.inf, [0.0, 0.0, 0.0], "stamp must be a finite number"),
+        ):
+            with pytest.raises(InputError, match=why):
+                slam.register_imu(stamp, rates, [0.0, 0.0, 9.8])
+    with pytest.raises(LidarSlamError, match="this Slam is closed"):
+        slam.register_imu(3.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
+    with lidarslam.Slam() as slam, pytest.raises(ConfigError, match=r"choose odometry.method=learned\+imu"):
+        slam.register_imu(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
+
+
+def test_without_samples_scans_are_registered_all_the_same(longer: Path, tmp_path: Path) -> None:
+    with lidarslam.Slam({"odometry.method": "imu", "mapping.keypoints": 800}) as slam:
+        register_all(slam, longer, until=lambda _: False)
+        slam.save(tmp_path / "run")
+    metrics = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert "no sample of the IMU came" in metrics["warnings"]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from lidarslam.config.settings import Config
@@ -27,6 +28,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.pipeline.estimates import Localised, SweepMotion
 from lidarslam.run.modes.live.clouds import CloudDecoder
 from lidarslam.run.modes.live.discovery import find_topic
+from lidarslam.run.modes.live.imu import find_imu
 from lidarslam.run.modes.live.incoming import IncomingQueue, Received
 from lidarslam.run.modes.live.live import bounded
 from lidarslam.run.modes.live.messages import serialize_transform
@@ -374,3 +376,58 @@ def test_without_the_extra_one_line_names_it(tmp_path: Path) -> None:
     assert done.stderr.splitlines() == [
         "lidarslam: cyclonedds is not installed, which live needs; pip install 'lidarslam[live]'"
     ]
+
+
+def play(bag: Path, domain: int) -> None:
+    """Publish all topics of a bag at the times at which they were recorded, once somebody takes its clouds."""
+    from lidarslam.run.modes.live.dds import DdsNode
+
+    node = DdsNode(domain)
+    with AnyReader([bag]) as reader:
+        publishers = {
+            connection.topic: node.publisher(connection.topic, connection.msgtype, connection.topic == "/tf_static")
+            for connection in reader.connections
+        }
+        messages = [(connection.topic, time_ns, bytes(raw)) for connection, time_ns, raw in reader.messages()]
+    while not publishers["/velodyne_points"]._writer.get_matched_subscriptions():
+        time.sleep(0.05)
+    begin, first_ns = time.monotonic() + 0.5, messages[0][1]
+    for topic, time_ns, raw in messages:
+        time.sleep(max(0.0, begin + (time_ns - first_ns) / 1e9 - time.monotonic()))
+        publishers[topic].publish(raw)
+
+
+def test_an_imu_beside_the_clouds_takes_part(
+    tmp_path: Path, domain: int, started: Callable[..., "subprocess.Popen[str]"]
+) -> None:
+    """Its place on the LiDAR comes from /tf_static."""
+    walk, scans = tmp_path / "walk", 30
+    options = ["--scans", str(scans), "--sensor", "vlp-16", "--imu", "--format", "mcap"]
+    subprocess.run([*LIDARSLAM, "simulate", "-o", str(walk), *options], check=True, capture_output=True)
+    errors = {}
+    for method in ("imu", "constant-velocity"):
+        live = tmp_path / method
+        options = ["--domain", str(domain), "--duration", "2.5", "-o", str(live), "--odometry", method, "--no-report"]
+        lidarslam = started(*LIDARSLAM, "live", *options, "--set", "mapping.budget_ms=1e6")
+        play(walk, domain)
+        output, said = lidarslam.communicate(timeout=60)
+        assert lidarslam.returncode == 0, said
+        assert "no sample of the IMU" not in output
+        found, truth = read_tum(live / "trajectory.tum"), read_tum(walk / "ground_truth.tum")
+        assert len(found) > scans - 8
+        true = truth.relative_motions()[np.searchsorted(truth.stamps, found.stamps[0] - 1e-6) :][: len(found) - 1]
+        turns = log(inverse(found.relative_motions()) @ true)[:, :3]
+        errors[method] = float(np.rad2deg(np.sqrt((turns**2).sum(axis=1).mean())))
+    assert 3.0 * errors["imu"] < errors["constant-velocity"], errors
+
+
+def test_the_only_imu_is_chosen() -> None:
+    kind, other = "sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"
+
+    def topics(*names: str) -> Callable[[], list[Topic]]:
+        return lambda: [Topic("/points", other), *(Topic(name, kind) for name in names)]
+
+    assert find_imu(topics("/imu"), None).name == "/imu"
+    assert find_imu(topics("/a/imu", "/b/imu"), "b/imu").name == "/b/imu"
+    with pytest.raises(InputError, match=r"published on /a, /b; choose one with --set reader.imu_topic"):
+        find_imu(topics("/a", "/b"), None)

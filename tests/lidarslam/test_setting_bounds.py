@@ -47,7 +47,7 @@ BESIDE = {
     ("mapping.tracking.lost_below", 1.0): "mapping.tracking.degraded_below=1",
 }
 # Lists of three numbers.
-VECTORS = ("odometry.imu_rotation_deg", "reader.mounting")
+VECTORS = ("odometry.imu_rotation_deg", "odometry.imu_position_m", "reader.mounting")
 # At one of their bounds no point of this recording is left for the map.
 MAY_EMPTY = ("global_map.max_range_m", "global_map.min_hits")
 

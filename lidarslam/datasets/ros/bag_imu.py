@@ -19,12 +19,12 @@ from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_message import BagMessage, StampSource, find_stamp_source
 from lidarslam.datasets.ros.static_transforms import static_transform
 
-_IMU_TYPE = "sensor_msgs/msg/Imu"
+IMU_TYPE = "sensor_msgs/msg/Imu"
 # Enough for the median of a rate.
 _SAMPLES_LOOKED_AT = 200
 # Behind the header, in float64: orientation 4, its covariance 9, angular velocity 3, covariance 9, acceleration 3, 9.
 _NUMBERS = 37
-_ANGULAR_VELOCITY, _ACCELERATION = slice(13, 16), slice(25, 28)
+ANGULAR_VELOCITY, ACCELERATION = slice(13, 16), slice(25, 28)
 
 
 class CloudTopic(NamedTuple):
@@ -65,7 +65,7 @@ class BagImu:
         rows: list[FloatArray] = []
         damaged = 0
         for message in messages:
-            numbers = None if message.damage is not None else _numbers(message.raw, self._bag.ros2)
+            numbers = None if message.damage is not None else imu_numbers(message.raw, self._bag.ros2)
             if numbers is None:
                 damaged += 1
                 continue
@@ -80,7 +80,7 @@ class BagImu:
         if damaged:
             notes = (*notes, f"{count(damaged, 'damaged IMU message')} left out.")
         table = np.stack(rows)
-        return usable_samples(stamps, table[:, _ANGULAR_VELOCITY], table[:, _ACCELERATION], T_lidar_imu, notes)
+        return usable_samples(stamps, table[:, ANGULAR_VELOCITY], table[:, ACCELERATION], T_lidar_imu, notes)
 
     def _extrinsic(self, frame_id: str) -> tuple[FloatArray | None, tuple[str, ...]]:
         lidar = self._clouds.frame_id
@@ -92,7 +92,7 @@ class BagImu:
 
 def _choose(bag: BagFile, clouds: CloudTopic, wanted: str | None) -> Topic | None:
     """The wanted topic, or of several the nearest by the names of topic and frame, of these the fastest."""
-    imus = [topic for topic in bag.topics if topic.message_type == _IMU_TYPE and topic.messages]
+    imus = [topic for topic in bag.topics if topic.message_type == IMU_TYPE and topic.messages]
     if wanted is not None:
         named = (topic for topic in imus if topic.name.lstrip("/") == wanted.lstrip("/"))
         if (found := next(named, None)) is None:
@@ -123,7 +123,7 @@ def _common(first: Sequence[str], second: Sequence[str]) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(first, second, strict=False)))
 
 
-def _numbers(raw: bytes, ros2: bool) -> FloatArray | None:
+def imu_numbers(raw: bytes, ros2: bool) -> FloatArray | None:
     """The numbers (37,) of a serialised message, all of one size behind its header; None if it is cut off."""
     order = ">" if ros2 and raw[1] != 1 else "<"
     (characters,) = struct.unpack_from(f"{order}I", raw, 12)

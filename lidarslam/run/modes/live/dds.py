@@ -75,10 +75,10 @@ class DdsNode:
                 reliable[key] = reliable.get(key, True) and _is_reliable(endpoint.qos)
         return tuple(sorted(PublishedTopic(*key, is_reliable) for key, is_reliable in reliable.items()))
 
-    def subscribe(self, topic: PublishedTopic, is_kept: bool = False) -> "Subscription":
-        """Receive a topic; of a kept one, such as /tf_static, what was published before too."""
-        qos = _qos(topic.is_reliable, is_kept)
-        return Subscription(self._participant, DataReader(self._participant, self._topic(topic), qos))
+    def subscribe(self, topic: PublishedTopic, is_kept: bool = False, depth: int = _DEPTH) -> "Subscription":
+        """Receive a topic, of which so many messages may wait; of a kept one, such as /tf_static, earlier ones too."""
+        qos = _qos(topic.is_reliable, is_kept, depth)
+        return Subscription(self._participant, DataReader(self._participant, self._topic(topic), qos), depth)
 
     def publisher(self, name: str, message_type: str, is_kept: bool = False) -> "Publisher":
         """Publish a topic, reliably, as ROS does odometry and /tf; a kept one to those too who subscribe later."""
@@ -92,8 +92,8 @@ class DdsNode:
 class Subscription:
     """The messages of a topic, in the order in which they came."""
 
-    def __init__(self, participant: Any, reader: Any) -> None:
-        self._reader = reader
+    def __init__(self, participant: Any, reader: Any, depth: int) -> None:
+        self._reader, self._depth = reader, depth
         self._any = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
         self._waiting = WaitSet(participant)
         self._waiting.attach(self._any)
@@ -101,7 +101,7 @@ class Subscription:
     def take(self, timeout_s: float) -> Iterator[Received]:
         """What has come, waiting for it so long at most."""
         self._waiting.wait(duration(seconds=timeout_s))
-        for message in self._reader.take(_DEPTH, self._any):
+        for message in self._reader.take(self._depth, self._any):
             if message.sample_info.valid_data:  # else it says that a publisher has gone
                 yield Received(message.raw, message.sample_info.source_timestamp)
 
@@ -131,12 +131,12 @@ def open_node(domain: int) -> DdsNode:
         ) from error
 
 
-def _qos(is_reliable: bool, is_kept: bool) -> Any:
+def _qos(is_reliable: bool, is_kept: bool, depth: int = _DEPTH) -> Any:
     reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
     return Qos(
         reliable if is_reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if is_kept else Policy.Durability.Volatile,
-        Policy.History.KeepLast(_DEPTH),
+        Policy.History.KeepLast(depth),
         Policy.DataRepresentation(use_cdrv0_representation=True),
     )
 

@@ -13,8 +13,10 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.datasets.ros.bag_message import TRANSFORMS_TYPE, read_header
 from lidarslam.datasets.ros.made_messages import ODOMETRY_TYPE
 from lidarslam.datasets.ros.static_transforms import Edges, add_edges, chain
-from lidarslam.run.modes.live.clouds import CloudDecoder
+from lidarslam.pipeline.imu_stream import ImuStream
+from lidarslam.run.modes.live.clouds import CloudDecoder, LiveScan
 from lidarslam.run.modes.live.dds import DdsNode, PublishedTopic
+from lidarslam.run.modes.live.imu import ImuReceiver
 from lidarslam.run.modes.live.incoming import Arrived, IncomingQueue
 from lidarslam.run.modes.live.publishing import PosePublisher
 from lidarslam.run.modes.live.request import LiveRequest
@@ -44,16 +46,25 @@ class Follower:
         node: where topics are subscribed to and published.
         session: registers the scans.
         decoder: makes scans of messages.
+        imu: receives the samples beside them, with the stream that they go to.
     """
 
-    def __init__(self, request: LiveRequest, node: DdsNode, session: LiveSession, decoder: CloudDecoder) -> None:
-        self._request, self._session, self._decoder = request, session, decoder
+    def __init__(
+        self,
+        request: LiveRequest,
+        node: DdsNode,
+        session: LiveSession,
+        decoder: CloudDecoder,
+        imu: tuple[ImuReceiver, ImuStream] | None = None,
+    ) -> None:
+        self._request, self._session, self._decoder, self._imu = request, session, decoder, imu
         self._statistics = LiveStatistics()
         self._publish_odometry = node.publisher(ODOMETRY_TOPIC, ODOMETRY_TYPE).publish
         self._publish_tf = node.publisher(TF_TOPIC, TRANSFORMS_TYPE).publish if request.publish_tf else None
         self._static = None
-        if request.base_frame is not None:
+        if request.base_frame is not None or imu is not None:
             self._static = node.subscribe(PublishedTopic(TF_STATIC_TOPIC, TRANSFORMS_TYPE, True), is_kept=True)
+        self._edges: Edges = {}
         self._poses: PosePublisher | None = None
         self._received = self._silent = 0  # messages until the last report, and reports without any more
 
@@ -112,35 +123,51 @@ class Follower:
             return False
         if self._poses is None:
             self._poses = self._pose_publisher(live.frame_id)
+        if self._imu is not None:
+            self._wait_for_imu(self._imu, live)
         localised = self._session.register(live.scan, started)
         self._poses.publish(live.stamp_ns, localised)
         self._statistics.registered(live.scan.stamp, message.arrived_s)
         return True
 
+    def _wait_for_imu(self, imu: tuple[ImuReceiver, ImuStream], live: LiveScan) -> None:
+        """Wait for the samples of the sweep; before the first one, for the place of the IMU."""
+        receiver, stream = imu
+        offsets = live.scan.time_offsets
+        receiver.wait_for(live.scan.stamp + (0.0 if offsets is None or not len(offsets) else float(offsets.max())))
+        if not stream.is_placed and receiver.frame_id is not None:
+            T_recorded_imu: FloatArray | None = np.eye(4)
+            if receiver.frame_id.lstrip("/") != live.frame_id.lstrip("/"):
+                T_recorded_imu = self._static_transform(live.frame_id, receiver.frame_id)
+                if T_recorded_imu is None:
+                    logger.info("%s does not hold the place of the IMU; its turns have to show it", TF_STATIC_TOPIC)
+            stream.place(None if T_recorded_imu is None else self._decoder.T_upright_recorded @ T_recorded_imu)
+
     def _pose_publisher(self, lidar_frame: str) -> PosePublisher:
-        """Once the frame of the LiDAR is known."""
+        """Once the frame of the LiDAR is known.
+
+        Raises:
+            InputError: no static transforms connect it with the base frame.
+        """
         body = self._request.base_frame or lidar_frame
         T_body_lidar = np.eye(4) if self._request.base_frame is None else self._static_transform(body, lidar_frame)
+        if T_body_lidar is None:
+            raise InputError(
+                f"{TF_STATIC_TOPIC} does not connect --base-frame {body} with {lidar_frame}, the frame of the clouds;"
+                f" its frames: {', '.join(sorted(self._edges)) or 'none'}"
+            )
         T_body_lidar = T_body_lidar @ inverse(self._decoder.T_upright_recorded)
         return PosePublisher(self._publish_odometry, self._publish_tf, self._request.odom_frame, body, T_body_lidar)
 
-    def _static_transform(self, base: str, lidar: str) -> FloatArray:
-        """The pose (4, 4) of the LiDAR on the robot.
-
-        Raises:
-            InputError: no static transforms connect the two.
-        """
-        edges: Edges = {}
+    def _static_transform(self, target: str, source: str) -> FloatArray | None:
+        """T_target_source (4, 4), once static transforms connect both; None if they do not."""
         begin = time.monotonic()
         while self._static is not None and time.monotonic() - begin < _STATIC_WITHIN_S:
+            if (T_target_source := chain(self._edges, target, source)) is not None:
+                return T_target_source
             for message in self._static.take(_POLL_S):
-                add_edges(edges, message.raw, ros2=True)
-            if (T_base_lidar := chain(edges, base, lidar)) is not None:
-                return T_base_lidar
-        raise InputError(
-            f"{TF_STATIC_TOPIC} does not connect --base-frame {base} with {lidar}, the frame of the clouds; its frames:"
-            f" {', '.join(sorted(edges)) or 'none'}"
-        )
+                add_edges(self._edges, message.raw, ros2=True)
+        return chain(self._edges, target, source)
 
 
 def _is_done(future: "Future[None]") -> bool:

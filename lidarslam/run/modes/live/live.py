@@ -13,6 +13,7 @@ from lidarslam.core.errors import ConfigError, InputError
 from lidarslam.datasets.faults import Faults
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
+from lidarslam.run.inertial import make_imu_stream
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops
 from lidarslam.run.modes.live.clouds import CloudDecoder
@@ -22,15 +23,17 @@ from lidarslam.run.modes.live.request import LiveRequest
 from lidarslam.run.modes.live.session import LiveSession, warm_up
 from lidarslam.run.modes.live.statistics import LiveCounts
 from lidarslam.run.results import RunOutcome, final_map, write_results
-from lidarslam.run.run import open_odometry, require_scans_only, viewing
+from lidarslam.run.run import open_odometry, require_no_trajectory, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.storage.directory import RunDirectory
 from lidarslam.viewer.rerun_program import require_window
 from lidarslam.viewer.web_page import WebPage
 
 if TYPE_CHECKING:
+    from lidarslam.pipeline.imu_stream import ImuStream
     from lidarslam.run.modes.live.dds import DdsNode
     from lidarslam.run.modes.live.following import Follower
+    from lidarslam.run.modes.live.imu import ImuReceiver
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
     if request.rerun == "spawn":
         require_window("serve a browser with --rerun web, or write a file with --rerun save")
     config, log, faults = bounded(request.config), ScanLog(), Faults()
-    require_scans_only(config)
+    require_no_trajectory(config)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
@@ -76,21 +79,26 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
                 warm_up(config, rehearsing)
             show("waiting for clouds")
             topic = find_topic(node.published, request.topic, request.domain)
+            imu = _receive_imu(config, node, log)
             show(f"{topic.name}: waiting for the first scan")
             with viewing(request.rerun, config.viewer, topic.name, directory, log, page) as viewer:
                 with (
                     threadpool_limits(1, "blas"),
-                    LiveSession(config, odometry, graph, log, faults, viewer, TileStore(request.out)) as session,
+                    LiveSession(
+                        config, odometry, graph, log, faults, viewer, TileStore(request.out), imu and imu[1]
+                    ) as session,
                 ):
+                    if imu is not None:
+                        stack.enter_context(imu[0])
                     decoder = CloudDecoder(config.reader, topic.message_type, faults)
-                    follower = _follower(request, node, session, decoder)
+                    follower = _follower(request, node, session, decoder, imu)
                     incoming = IncomingQueue(node.subscribe(topic).take, request.queue, follower.on_arrival)
                     counts, is_interrupted = follower.follow(incoming, show)
                     interruptions.protect_results()
                     show("writing the results")
                     tracked = session.finish()
                 _require_scans(topic.name, log, faults)
-                for warning in counts.warnings():
+                for warning in [*counts.warnings(), *(imu[1].warnings if imu is not None else ())]:
                     log.warn(warning)
                 closed = close_loops(graph, tracked.global_map, log, viewer)
                 drawn = final_map(tracked, closed, config.global_map, directory)
@@ -117,10 +125,31 @@ def bounded(config: Config) -> Config:
     return config.model_copy(update={"mapping": mapping, "pose_graph": graph})
 
 
-def _follower(request: LiveRequest, node: "DdsNode", session: LiveSession, decoder: CloudDecoder) -> "Follower":
+def _follower(
+    request: LiveRequest,
+    node: "DdsNode",
+    session: LiveSession,
+    decoder: CloudDecoder,
+    imu: "tuple[ImuReceiver, ImuStream] | None",
+) -> "Follower":
     from lidarslam.run.modes.live.following import Follower  # loads cyclonedds
 
-    return Follower(request, node, session, decoder)
+    return Follower(request, node, session, decoder, imu)
+
+
+def _receive_imu(config: Config, node: "DdsNode", log: ScanLog) -> "tuple[ImuReceiver, ImuStream] | None":
+    """The receiver of the IMU's samples and the stream they go to; None where the odometry uses none.
+
+    Raises:
+        InputError: no IMU is published, or several.
+    """
+    stream = make_imu_stream(config, log.warn)
+    if stream is None:
+        return None
+    from lidarslam.run.modes.live.imu import DEPTH, ImuReceiver, find_imu
+
+    topic = find_imu(node.published, config.reader.imu_topic)
+    return ImuReceiver(node.subscribe(topic, depth=DEPTH).take, stream), stream
 
 
 def _open_node(domain: int) -> "DdsNode":

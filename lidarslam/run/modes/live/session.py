@@ -24,6 +24,7 @@ from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
+    from lidarslam.pipeline.imu_stream import ImuStream
 
 # Scans whose points may wait for the map, to bound the memory they hold.
 _SCANS_BEHIND = 8
@@ -38,6 +39,7 @@ class LiveSession:
         log, faults: of the scans.
         viewer: shown every scan, on the thread of the map.
         store: of the global map, see `lidarslam.pipeline.map_building.MapBuilder`.
+        imu: the samples that come beside the scans.
     """
 
     def __init__(
@@ -49,8 +51,10 @@ class LiveSession:
         faults: Faults,
         viewer: Viewer,
         store: TileStore | None = None,
+        imu: "ImuStream | None" = None,
     ) -> None:
-        self._stages = Stages(odometry, make_localiser(config), config.global_map, graph, store)
+        self._imu = imu
+        self._stages = Stages(odometry, make_localiser(config, imu), config.global_map, graph, store)
         self._builder = BackgroundWorker("map", _SCANS_BEHIND)
         self._log, self._faults, self._viewer = log, faults, viewer
 
@@ -66,6 +70,8 @@ class LiveSession:
     def register(self, scan: Scan, started: float) -> Localised:
         """The pose of the next scan, whose message was taken up at this reading of `time.perf_counter`."""
         scan = look_at(scan, self._faults)
+        if self._imu is not None:
+            scan = self._imu.take_up(scan)
         estimated = self._stages.estimate(scan, 1e3 * (time.perf_counter() - started))
         localised = self._stages.localise(estimated)
         self._builder.submit(self._build, estimated, localised, 1e3 * (time.perf_counter() - started))
