@@ -150,6 +150,8 @@ def _notes(info: RecordingInfo) -> Iterator[str]:
     faults = Faults()
     look_at(info.first, faults)
     yield from (*info.notes, *faults.warnings(), *(info.imu.notes if info.imu else ()))
+    if info.imu is not None:
+        yield "An IMU is there: run with --odometry learned+imu."
 
 
 def _instant(stamp: float) -> str:

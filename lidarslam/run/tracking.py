@@ -27,7 +27,7 @@ from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.pipeline.localisation import Localiser, make_localiser
+from lidarslam.pipeline.localisation import Localiser, Mapper, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
@@ -88,7 +88,7 @@ def track(
     viewer: Viewer,
     progress: Progress,
     unfinished: Unfinished | None = None,
-    localiser: Localiser | None = None,
+    mapper: Mapper | None = None,
 ) -> Tracked:
     """Take the chosen scans of a recording through the pipeline.
 
@@ -98,7 +98,7 @@ def track(
         odometry, log, graph: new, but for a graph that is resumed.
         viewer, progress: called for every scan.
         unfinished: where checkpoints are saved; None: nowhere.
-        localiser: estimates the poses; None: as configured.
+        mapper: registers the scans; None: as configured.
 
     Raises:
         NoScanError: no scan could be used.
@@ -111,7 +111,10 @@ def track(
         scans = map(inertial.gyroscope.evened, scans)
     checkpoints = None if unfinished is None else Checkpoints(unfinished, config.checkpoints, odometry, log, graph)
     estimator = ElevationEstimator()
-    if localiser is None:
+    localiser: Localiser
+    if mapper is not None:
+        localiser = ScanToMap(mapper, inertial)
+    else:
         localiser = make_localiser(config, inertial, estimator, _start(config, recording, chosen, inertial))
     store = TileStore(request.out, None if unfinished is None else unfinished.files.tiles)
     pipeline = Pipeline(odometry, localiser, config.global_map, graph, checkpoints, store)

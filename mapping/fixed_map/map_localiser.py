@@ -80,7 +80,8 @@ class MapLocaliser(Stateful):
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
         """Register the next scan."""
         sampled = self._sampler.sample(scan)
-        own = None if self._local is None else self._local.add(sampled, prior)
+        # What an IMU predicts is a pose in the map.
+        own = None if self._local is None else self._local.add(sampled, replace(prior, inertial=None))
         if self._tracker is not None and self._last is not None:
             mapped = self._track(sampled, prior, self._tracker, self._last)
             if mapped.status is Status.LOST and own is not None:  # the place was not confirmed

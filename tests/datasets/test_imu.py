@@ -112,6 +112,7 @@ def test_the_extrinsic_goes_along_the_chain_of_frames(bag_kit, make_sweep, sampl
     np.testing.assert_allclose(recording.imu.T_lidar_imu, T_LIDAR_BASE @ T_BASE_IMU, atol=1e-12)
     text = describe_source(path, ReaderConfig())
     assert "/imu, 41 samples at 200 Hz, extrinsic known" in text
+    assert "An IMU is there: run with --odometry learned+imu." in text
 
 
 def test_frames_that_are_not_connected(ros2_kit, make_sweep, samples):

@@ -176,6 +176,16 @@ def test_a_reversed_gyroscope_is_refused_in_one_line(longer: Path, tmp_path: Pat
     assert not (out / "trajectory.tum").exists()
 
 
+def test_in_a_finished_map_the_imu_takes_part(longer: Path, tmp_path: Path, run: Any) -> None:
+    result, out = run(longer, "--odometry", "imu")
+    assert result.exit_code == 0, result.output
+    found = tmp_path / "found"
+    arguments = ["--map", str(out), "--out", str(found), "--odometry", "imu", "--guess", "0", "0", "0", *FAST]
+    result = CliRunner().invoke(main, ["localise", str(longer), *arguments])
+    assert result.exit_code == 0, result.output
+    assert rotation_error_deg(found, longer) < 0.15
+
+
 def register_all(slam: Any, source: Path, until: Callable[[int], bool] = lambda _: True) -> None:
     """Give a recording's samples and scans to a program's own loop, each when it is complete."""
     recording = open_recording(source)

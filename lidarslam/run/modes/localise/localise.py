@@ -16,7 +16,6 @@ from lidarslam.mapping.fixed_map.map_localiser import MapLocaliser
 from lidarslam.mapping.global_map.drawing import DrawnMap
 from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
-from lidarslam.pipeline.localisation import ScanToMap
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
 from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
@@ -115,7 +114,7 @@ def execute(
                 phase("searching for the place")
                 tracked = track(
                     run, recording, chosen, odometry, log, None, PlacedViewer(viewer), progress,
-                    localiser=ScanToMap(localiser),
+                    mapper=localiser,
                 )  # fmt: skip
             interruptions.protect_results()
             phase("writing the results")
