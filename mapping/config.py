@@ -189,5 +189,6 @@ class PoseGraphConfig(BaseModel):
     corrects_local_map: bool = Field(
         True, description="surfels only: draw the local map anew after a loop closure, while the run goes on"
     )
+    gnss: bool = Field(False, description="hold the graph by the recording's GNSS positions; lidarslam run alone")
     keyframes: KeyframeConfig = KeyframeConfig()
     loops: LoopConfig = LoopConfig()

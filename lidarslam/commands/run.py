@@ -8,6 +8,7 @@ import click
 
 from lidarslam.commands.shared.options import (
     FILE,
+    GNSS,
     OVERWRITE,
     POSE_GRAPH,
     REPORT,
@@ -43,6 +44,7 @@ from lidarslam.commands.shared.terminal import EXIT_LOST, EXIT_MENDABLE, note, s
 @click.option("--prior", type=FILE, metavar="TUM_FILE", help="External trajectory to use as the odometry.")
 @mapping_options
 @POSE_GRAPH
+@GNSS
 @scan_options
 @RERUN
 @map_options

@@ -18,7 +18,12 @@ from lidarslam.exports.gnss import read_gnss
 from lidarslam.exports.new_file import require_new
 from lidarslam.exports.projection import Utm, utm_at
 from lidarslam.exports.source import read_source
-from lidarslam.mapping.global_map.products.georeference import Georeference, GnssTrack, align_to_track
+from lidarslam.mapping.global_map.products.georeference import (
+    Georeference,
+    GnssTrack,
+    TooFewPositionsError,
+    align_to_track,
+)
 from lidarslam.mapping.global_map.survey_formats import write_laz
 from lidarslam.storage.finished_run import load_map, read_trajectory
 
@@ -52,7 +57,7 @@ def georeference(run: Path) -> GeoRun:
     utm = utm_at(*track.geodetic[0, :2].tolist())
     try:
         placed = align_to_track(trajectory, track, utm.project(track.geodetic), utm.scale)
-    except ValueError as error:
+    except TooFewPositionsError as error:
         raise InputError(f"{source.path}: {error}") from error
     if placed.heading_sigma_deg > _LARGEST_HEADING_SIGMA_DEG:
         raise InputError(

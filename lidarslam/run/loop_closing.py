@@ -17,6 +17,7 @@ from lidarslam.run.scan_log import ScanLog
 from lidarslam.viewer.viewer import Viewer
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
+    from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
     from lidarslam.mapping.pose_graph.correction import Corrected
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 
@@ -89,17 +90,36 @@ def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph | None
 
 
 def close_loops(
-    graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog, viewer: Viewer
+    graph: "SlamGraph | None",
+    global_map: GlobalMap | None,
+    log: ScanLog,
+    viewer: Viewer,
+    track: "ProjectedTrack | None" = None,
 ) -> GraphOutcome | None:
-    """Correct the log, and show it, once all scans are there; None where there is nothing to correct."""
+    """Correct the log, and show it, once all scans are there; None where there is nothing to correct.
+
+    A GNSS track, if it is given, holds the graph.
+    """
     if graph is None or global_map is None:
         return None
     logger.info("optimising the pose graph")
-    closed = _corrected(graph, graph.finish(), global_map, log)
+    result = graph.finish() if track is None else _placed(graph, log, track)
+    closed = _corrected(graph, result, global_map, log)
     if closed is not None:
         pairs = [loop.scans for loop in closed.loops if loop.accepted and loop.scans[1] < len(log)]
         viewer.show_closed(log.trajectory.positions, pairs)
     return closed
+
+
+def _placed(graph: "SlamGraph", log: ScanLog, track: "ProjectedTrack") -> "Corrected | None":
+    """The graph with a GNSS track, or without where that has too few positions."""
+    from lidarslam.mapping.global_map.products.georeference import TooFewPositionsError  # loads SciPy
+
+    try:
+        return graph.finish((log.trajectory.stamps, track))
+    except TooFewPositionsError as error:
+        log.warn(f"without GNSS: {error}")
+        return graph.present()
 
 
 def loops_so_far(graph: "SlamGraph | None", global_map: GlobalMap | None, log: ScanLog) -> "GraphOutcome | None":

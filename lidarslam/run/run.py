@@ -15,6 +15,7 @@ from lidarslam.odometry.interface import Odometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.elevation import with_elevations
+from lidarslam.run.gnss import gnss_track, write_in_utm
 from lidarslam.run.inertial import imu_samples
 from lidarslam.run.interruption import Interruptions
 from lidarslam.run.loop_closing import begin_graph, close_loops, restore_graph
@@ -63,6 +64,7 @@ def execute(
     chosen = choose_scans(recording, request.source, request.start, request.stop, request.step)
     log_choices(request, chosen, len(recording))
     imu_samples(config, recording)
+    track_of_gnss = gnss_track(request)
     with Interruptions() as interruptions:
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
@@ -87,7 +89,7 @@ def execute(
                 interruptions.protect_results()
                 compiling.wait_for_all(phase)
                 phase("writing the results")
-                closed = close_loops(graph, tracked.global_map, log, viewer)
+                closed = close_loops(graph, tracked.global_map, log, viewer, track_of_gnss)
                 drawn = final_map(tracked, closed, config.global_map, directory)
                 if drawn.cloud is not None:
                     viewer.show_final_map(drawn.cloud.points)
@@ -97,12 +99,19 @@ def execute(
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.files.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
+        if track_of_gnss is not None:
+            phase("writing the results in UTM")
+            write_in_utm(request)
         if request.report:
-            from lidarslam.viewer.page.run_report import Accuracy, leave_report
-
-            phase("drawing the report")
-            leave_report(request.out, Accuracy(outcome.metrics))
+            _draw_report(request, outcome, phase)
     return outcome
+
+
+def _draw_report(request: RunRequest, outcome: RunOutcome, phase: Callable[[str], None]) -> None:
+    from lidarslam.viewer.page.run_report import Accuracy, leave_report
+
+    phase("drawing the report")
+    leave_report(request.out, Accuracy(outcome.metrics))
 
 
 def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished | None) -> "SlamGraph | None":

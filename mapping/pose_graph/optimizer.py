@@ -1,9 +1,9 @@
 """Pose-graph optimisation with GTSAM: maximum-likelihood keyframe poses given relative poses with covariances.
 
 The first pose of each connected component is held. Loop closures are robust: under Cauchy's kernel while a run lasts,
-by graduated non-convexity (Yang et al., RA-L 2020) in the end. False closures that agree with one another and outnumber
-the true ones are kept; so is a single closure between two components, which nothing contradicts. Attitudes by gravity
-hold roll and pitch.
+by graduated non-convexity (Yang et al., RA-L 2020) in the end, as are positions of GNSS. False closures that agree with
+one another and outnumber the true ones are kept; so is a single closure between two components, which nothing
+contradicts. Attitudes by gravity hold roll and pitch.
 """
 
 from collections.abc import Sequence
@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.antenna import AntennaPosition
 from lidarslam.mapping.pose_graph.attitude import Attitude
 from lidarslam.mapping.pose_graph.edges import first_connected
 
 # Standard deviations of a pose that is held, radians and metres: firm beside every edge, but no singular system.
 _HELD = np.array([np.deg2rad(0.01)] * 3 + [0.001] * 3)
+# Of a pose that positions hold, after their alignment.
+_ALIGNED = np.array([np.deg2rad(5.0)] * 3 + [100.0] * 3)
 # No edge is more precise than this, nor less by more than the ratio: the conditioning of double precision.
 _LEAST = np.array([np.deg2rad(0.001)] * 3 + [0.0002] * 3)
 _LARGEST_RATIO = 1e7
@@ -37,10 +40,11 @@ _factors: WeakKeyDictionary[RelativePose, gtsam.BetweenFactorPose3] = WeakKeyDic
 
 @dataclass(frozen=True, eq=False)
 class Optimised:
-    """An optimised graph: poses (N, 4, 4) T_world_lidar, and which loop closures (L,) are inliers."""
+    """An optimised graph: poses (N, 4, 4) T_world_lidar, and which loop closures (L,) and positions are inliers."""
 
     poses: FloatArray
     inliers: NDArray[np.bool_]
+    position_inliers: NDArray[np.bool_]
 
 
 def relax(
@@ -67,15 +71,20 @@ def optimise(
     edges: Sequence[RelativePose],
     loops: Sequence[RelativePose],
     attitudes: Sequence[Attitude] = (),
+    positions: Sequence[AntennaPosition] = (),
 ) -> Optimised:
-    """All poses (N, 4, 4) together, and which loop closures are inliers; the other edges are never rejected."""
-    inliers = np.ones(len(loops), dtype=np.bool_)
-    if loops:
-        poses = relax(poses, edges, loops, attitudes)
-        graph = _graph(poses, edges, loops, attitudes)
+    """All poses (N, 4, 4) together, and which loop closures and positions are inliers; others are never rejected.
+
+    Poses are those of the map where there are positions, which hold it; else the first one of each component is held.
+    """
+    uncertain = [*map(_factor, loops), *map(_position_factor, positions)]
+    inliers = np.ones(len(uncertain), dtype=np.bool_)
+    if uncertain:
+        poses = relax(poses, edges, loops, attitudes) if loops else poses
+        graph = _graph(poses, edges, loops, attitudes, is_placed=bool(positions))
         known_inliers = list(range(graph.size()))
-        for loop in loops:
-            graph.add(_factor(loop))
+        for factor in uncertain:
+            graph.add(factor)
         parameters = gtsam.GncLMParams()
         parameters.setLossType(gtsam.GncLossType.TLS)
         parameters.setKnownInliers(known_inliers)
@@ -83,11 +92,15 @@ def optimise(
         gnc.setInlierCostThresholds(0.5 * _INLIER_SIGMAS**2)
         poses = _matrices(gnc.optimize())
         inliers = np.asarray(gnc.getWeights())[len(known_inliers) :] > 0.5
-    kept = [loop for loop, inlier in zip(loops, inliers, strict=True) if inlier]
-    graph = _graph(poses, edges, kept, attitudes)
+    kept = [loop for loop, inlier in zip(loops, inliers, strict=False) if inlier]
+    graph = _graph(poses, edges, kept, attitudes, is_placed=bool(positions))
     for loop in kept:
         graph.add(_factor(loop))
-    return Optimised(_matrices(_solve(graph, _values(poses), _CONVERGED)), inliers)
+    for position, inlier in zip(positions, inliers[len(loops) :], strict=True):
+        if inlier:
+            graph.add(_position_factor(position, position.repeats))
+    optimised = _matrices(_solve(graph, _values(poses), _CONVERGED))
+    return Optimised(optimised, inliers[: len(loops)], inliers[len(loops) :])
 
 
 def _graph(
@@ -95,9 +108,11 @@ def _graph(
     edges: Sequence[RelativePose],
     loops: Sequence[RelativePose],
     attitudes: Sequence[Attitude],
+    is_placed: bool = False,
 ) -> gtsam.NonlinearFactorGraph:
     """The edges and attitudes, and a prior on the first pose of each component that they and the loops make."""
-    graph, held = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Diagonal.Sigmas(_HELD)
+    graph = gtsam.NonlinearFactorGraph()
+    held = gtsam.noiseModel.Diagonal.Sigmas(_ALIGNED if is_placed else _HELD)
     pairs = [(edge.first, edge.second) for edge in (*edges, *loops)]
     for key in np.unique(first_connected(len(poses), pairs)).tolist():
         graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(poses[key]), held))
@@ -118,6 +133,11 @@ def _factor(edge: RelativePose) -> gtsam.BetweenFactorPose3:
         noise = gtsam.noiseModel.Gaussian.Covariance(bounded(edge.covariance))
         _factors[edge] = gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.T_first_second), noise)
     return _factors[edge]
+
+
+def _position_factor(position: AntennaPosition, repeats: float = 1.0) -> gtsam.GPSFactorArm:
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(repeats) * position.sigmas)
+    return gtsam.GPSFactorArm(position.key, position.measured, position.antenna, noise)
 
 
 def bounded(covariance: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ Several recordings of one place are tracked each by itself, and added one after 
 those that are connected end up in one frame.
 """
 
+import logging
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -20,12 +21,14 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.state.stateful import TRANSFORM
+from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import PoseGraphConfig
 from lidarslam.mapping.global_map.global_map import GlobalMap, VoxelMeans, means_points
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
 from lidarslam.mapping.loops.detection import LoopDetector
 from lidarslam.mapping.loops.refinement import refine
+from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
 from lidarslam.mapping.pose_graph.correction import Corrected, corrected_recordings, in_frames, recordings_of
 from lidarslam.mapping.pose_graph.edges import first_connected, squared_error
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
@@ -33,10 +36,12 @@ from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.pose_graph.keyframes import Keyframe
 from lidarslam.mapping.pose_graph.laid_submaps import LaidSubmaps, connected_with_last
 from lidarslam.mapping.pose_graph.neighbourhoods import REACH, Neighbourhoods
-from lidarslam.mapping.pose_graph.optimizer import optimise, relax
+from lidarslam.mapping.pose_graph.optimizer import Optimised, optimise, relax
 from lidarslam.mapping.pose_graph.relaxing import RelaxSchedule
 from lidarslam.mapping.pose_graph.restored import require_edges, require_poses, require_rows
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -121,14 +126,18 @@ class SlamGraph(KeyframeGraph):
         self.redraws += [] if drawn is None else [len(self.keyframes)]
         return drawn
 
-    def finish(self) -> Corrected | None:
-        """Optimise everything; None when there is no keyframe."""
+    def finish(self, placed: tuple[FloatArray, ProjectedTrack] | None = None) -> Corrected | None:
+        """Optimise everything, with the stamps (M,) of all scans and a GNSS track; None when there is no keyframe.
+
+        Raises:
+            TooFewPositionsError: too few positions are within the time of the scans.
+        """
         if not self.keyframes:
             return None
         self._close_submap()
         self._closures += self._detector.finish()
         self._refine_closures(until=len(self.keyframes))
-        return self._corrected(self._closures)
+        return self._corrected(self._closures, placed)
 
     def present(self) -> Corrected | None:
         """Optimise what there is, and stay as it is; None when there is no keyframe.
@@ -140,10 +149,14 @@ class SlamGraph(KeyframeGraph):
         waiting = set(self._unrefined)
         return self._corrected([self._refined(c) if row in waiting else c for row, c in enumerate(self._closures)])
 
-    def _corrected(self, closures: Sequence[LoopClosure]) -> Corrected:
+    def _corrected(
+        self, closures: Sequence[LoopClosure], placed: tuple[FloatArray, ProjectedTrack] | None = None
+    ) -> Corrected:
         """All poses, optimised with these loop closures, of which rejected ones are only listed."""
         accepted = [closure for closure in closures if closure.accepted]
         optimised = optimise(np.array(self._poses), self.edges, accepted, self.attitudes)
+        if placed is not None:
+            optimised = self._placed(optimised.poses, accepted, *placed)
         kept = iter(optimised.inliers.tolist())
         inliers = tuple(closure.accepted and next(kept) for closure in closures)
         loops = [closure for closure, inlier in zip(closures, inliers, strict=True) if inlier]
@@ -164,6 +177,22 @@ class SlamGraph(KeyframeGraph):
             if recordings is None or recording in recordings:
                 drawn.add_means(self.means(index), pose)
         return drawn
+
+    def _placed(
+        self, poses: FloatArray, loops: Sequence[LoopClosure], stamps: FloatArray, track: ProjectedTrack
+    ) -> Optimised:
+        """The optimised poses (K, 4, 4) of keyframes, optimised with positions of GNSS in their map; of the world."""
+        scans = [keyframe.scan for keyframe in self.keyframes]
+        registered = Trajectory(stamps, np.array(self.scan_poses))
+        T_world_lidar = corrected_recordings(registered.T_world_lidar, np.array([0]), np.array(scans), poses)
+        T_map_world = track.aligned(Trajectory(stamps, T_world_lidar))
+        up = T_map_world[:3, :3]
+        attitudes = [replace(attitude, world=up @ attitude.world) for attitude in self.attitudes]
+        positions = track.positions(registered, scans)
+        optimised = optimise(T_map_world @ poses, self.edges, loops, attitudes, positions)
+        T_world_map = poses[0] @ inverse(optimised.poses[0])
+        logger.info("GNSS: %d of %d positions are inliers", optimised.position_inliers.sum(), len(positions))
+        return replace(optimised, poses=T_world_map @ optimised.poses)
 
     def _accepted(self) -> list[LoopClosure]:
         return [closure for closure in self._closures if closure.accepted]

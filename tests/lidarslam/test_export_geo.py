@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,6 +22,8 @@ from lidarslam.datasets.ros.made_messages import POINT_CLOUD2_TYPE
 from lidarslam.exports.ros_messages import RosMessages, nanoseconds
 from lidarslam.mapping.global_map.global_map import PointCloud
 from lidarslam.mapping.global_map.map_io import write_cloud
+
+from ..conftest import Room
 
 pyproj = pytest.importorskip("pyproj")
 
@@ -59,10 +62,18 @@ def run(tmp_path_factory: pytest.TempPathFactory, truth: FloatArray) -> Path:
     return out
 
 
-def write_bag(path: Path, stamps: FloatArray, T_utm_lidar: FloatArray) -> None:
+def write_bag(
+    path: Path,
+    stamps: FloatArray,
+    T_utm_lidar: FloatArray,
+    clouds: list[FloatArray] | None = None,
+    T_utm_fix: FloatArray | None = None,
+    variance: float = 0.01,
+) -> None:
     messages = RosMessages(ros2=False)
     types = messages.store.types
-    antenna = T_utm_lidar[:, :3, :3] @ ANTENNA + T_utm_lidar[:, :3, 3]
+    T = T_utm_lidar if T_utm_fix is None else T_utm_fix
+    antenna = T[:, :3, :3] @ ANTENNA + T[:, :3, 3]
     longitude, latitude = pyproj.Transformer.from_crs(32756, 4326, always_xy=True).transform(*antenna[:, :2].T)
     with Writer(path) as bag:
         topics = {"/points": POINT_CLOUD2_TYPE, "/fix": "sensor_msgs/msg/NavSatFix", "/tf_static": TRANSFORMS_TYPE}
@@ -71,12 +82,15 @@ def write_bag(path: Path, stamps: FloatArray, T_utm_lidar: FloatArray) -> None:
         bag.write(opened["/tf_static"], nanoseconds(stamps[0]), messages.serialize(fixed))
         for n, stamp in enumerate(stamps):
             ns = nanoseconds(stamp)
-            cloud = messages.cloud(stamp, "lidar", np.eye(3) + n, PointAttributes())
+            points = np.eye(3) + n if clouds is None else clouds[n]
+            cloud = messages.cloud(stamp, "lidar", points, PointAttributes())
             bag.write(opened["/points"], ns, messages.serialize(cloud))
             header = messages.cloud(stamp, "gps", np.eye(3), PointAttributes()).header
             status = types["sensor_msgs/msg/NavSatStatus"](status=-1 if n < 5 else 0, service=1)
             at = (0.0, 0.0, 0.0) if n < 5 else (latitude[n], longitude[n], antenna[n, 2])
-            fix = types["sensor_msgs/msg/NavSatFix"](header, status, *at, np.diag([0.01, 0.01, 0.04]).ravel(), 2)
+            fix = types["sensor_msgs/msg/NavSatFix"](
+                header, status, *at, (variance * np.diag([1.0, 1.0, 4.0])).ravel(), 2
+            )
             bag.write(opened["/fix"], ns, messages.serialize(fix))
 
 
@@ -143,3 +157,34 @@ def test_a_recording_without_gnss(run: Path, tmp_path: Path) -> None:
         (tmp_path / "config.yaml").rename(run / "config.yaml")
     assert refused.exit_code == 1
     assert "has no GNSS positions" in refused.stderr
+
+
+def test_a_run_is_held_by_gnss_and_written_in_utm(tmp_path: Path, room: Room) -> None:
+    def walk(times: FloatArray) -> FloatArray:
+        t = np.asarray(times, dtype=np.float64)
+        places = np.stack([2.5 * np.sin(0.6 * t), 1.5 * np.cos(0.9 * t) - 1.5, 0.0 * t], axis=-1)
+        return make_transform(exp(np.multiply.outer(0.1 * t, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))[..., :3, :3], places)
+
+    east, north = pyproj.Transformer.from_crs(4326, 32756, always_xy=True).transform(PLACE[1], PLACE[0])
+    T_utm_world = make_transform(exp([0.0, 0.0, -0.8, 0.0, 0.0, 0.0])[:3, :3], [east, north, PLACE[2]])
+    times = 0.1 * np.arange(1, 61)
+    truth = T_utm_world @ walk(times)
+    still = replace(room, points=4000, period_s=0.001)
+    clouds = [still.sweep(walk, float(time)).points for time in times]
+    fixes = truth.copy()
+    fixes[30:36, :3, 3] += [4.0, -3.0, 5.0]  # of a reflection
+    write_bag(tmp_path / "walk.bag", FIRST_STAMP + times, truth, clouds, fixes, variance=1e-4)
+    out = tmp_path / "run"
+    options = ["--odometry", "constant-velocity", "--no-report", "--set", "mapping.keypoints=800"]
+    done = lidarslam("run", tmp_path / "walk.bag", "--out", out, "--gnss", *options)
+    assert done.exit_code == 0, done.output
+    written = read_tum(out / "utm" / "trajectory_utm.tum")
+    np.testing.assert_allclose(written.positions, truth[:, :3, 3], atol=0.05)
+    assert (out / "utm" / "map.laz").exists()
+
+
+def test_gnss_needs_positions_and_the_graph(small_recording: Path, tmp_path: Path) -> None:
+    done = lidarslam("run", small_recording, "--out", tmp_path / "run", "--gnss")
+    assert done.exit_code == 1
+    assert "has no GNSS positions" in done.output
+    assert lidarslam("run", small_recording, "--gnss", "--no-pose-graph").exit_code == 2

@@ -70,6 +70,11 @@ def _together(*decorators: _Decorator) -> _Decorator:
 
 # Of the commands that leave a run directory.
 POSE_GRAPH = click.option("--pose-graph/--no-pose-graph", default=None, help="Close loops.  [default: no-pose-graph]")
+GNSS = click.option(
+    "--gnss/--no-gnss",
+    default=None,
+    help="Hold the pose graph by GNSS positions, and write map and trajectory in UTM, too.  [default: no-gnss]",
+)
 RERUN = click.option(
     "--rerun",
     type=click.Choice(["off", "save", "web", "spawn"]),
@@ -222,7 +227,13 @@ def _method_settings(options: dict[str, Any]) -> list[str]:
         mapping = "off"
     if mapping is not None:
         settings.append(f"mapping.method={mapping}")
-    pose_graph = options.pop("pose_graph", None)
+    pose_graph, gnss = options.pop("pose_graph", None), options.pop("gnss", None)
+    if gnss:
+        if pose_graph is False:
+            raise click.UsageError("--gnss holds the pose graph; leave --no-pose-graph out")
+        pose_graph = True
+    if gnss is not None:
+        settings.append(f"pose_graph.gnss={str(gnss).lower()}")
     if pose_graph is not None:
         settings.append(f"pose_graph.enabled={str(pose_graph).lower()}")
     return settings

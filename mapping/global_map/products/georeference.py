@@ -16,6 +16,10 @@ _MAD, _LEAST_SCALE_M, _CAUCHY = 1.4826, 0.01, 2.385
 _FEWEST = 5
 
 
+class TooFewPositionsError(ValueError):
+    """Too few GNSS positions are within the time of a trajectory."""
+
+
 @dataclass(frozen=True, eq=False)
 class GnssTrack:
     """Positions of an antenna."""
@@ -56,12 +60,13 @@ def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArr
         scale: of the projection at this place.
 
     Raises:
-        ValueError: fewer than five positions are within the time of the trajectory.
+        TooFewPositionsError: fewer than five are within the time of the trajectory.
     """
     within = (track.stamps >= trajectory.stamps[0]) & (track.stamps <= trajectory.stamps[-1])
     within &= np.isfinite(projected).all(axis=1)
     if within.sum() < _FEWEST:
-        raise ValueError(f"{within.sum()} GNSS positions are within the time of the run, expected {_FEWEST} or more")
+        count = int(within.sum())
+        raise TooFewPositionsError(f"{count} GNSS positions are within the time of the run, expected {_FEWEST} or more")
     poses = trajectory.at(track.stamps[within])
     measured = projected[within]
     antenna = scale * (poses[:, :3, :3] @ track.lidar_antenna + poses[:, :3, 3])

@@ -1,0 +1,66 @@
+"""Positions of GNSS in the graph, on a drive whose edges drift."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from lidarslam.core.geometry import FloatArray, exp, inverse, make_transform
+from lidarslam.core.trajectory import Trajectory
+from lidarslam.mapping.global_map.products.georeference import GnssTrack, TooFewPositionsError
+from lidarslam.mapping.loops.closure import RelativePose
+from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
+from lidarslam.mapping.pose_graph.optimizer import optimise
+
+SCANS, EVERY, PERIOD_S = 600, 10, 0.1
+ANTENNA = np.array([-0.5, 0.2, 1.0])
+SIGMA_M = 0.05
+T_MAP_WORLD = make_transform(exp([0.02, -0.03, 2.0, 0.0, 0.0, 0.0])[:3, :3], [691_000.0, 5_334_000.0, 520.0])
+COVARIANCE = np.diag([np.deg2rad(0.3)] * 3 + [0.05] * 3) ** 2
+
+
+def drive(yaw_drift: float) -> FloatArray:
+    """Poses (N, 4, 4) of 600 m in bends and over hills, whose heading drifts."""
+    poses = [np.eye(4)]
+    for n in range(1, SCANS):
+        turn = [0.0, 0.003 * np.cos(0.05 * n), 0.02 * np.cos(0.02 * n) + yaw_drift]
+        poses.append(poses[-1] @ exp([*turn, 1.0, 0.0, 0.0]))
+    return np.array(poses)
+
+
+@pytest.fixture
+def track(rng: np.random.Generator) -> ProjectedTrack:
+    """Fixes at 5 Hz, of which a stretch of a fifth is 20 to 40 m off."""
+    poses = T_MAP_WORLD @ drive(0.0)[::2]
+    antenna = poses[:, :3, :3] @ ANTENNA + poses[:, :3, 3] + rng.normal(0.0, SIGMA_M, (SCANS // 2, 3))
+    antenna[100:160] += np.array([20.0, 20.0, 10.0]) + rng.normal(0.0, 5.0, (60, 3))
+    stamps = PERIOD_S * np.arange(0, SCANS, 2)
+    gnss = GnssTrack(stamps, np.zeros((len(stamps), 3)), np.full(len(stamps), SIGMA_M), ANTENNA)
+    return ProjectedTrack(gnss, antenna, 1.0)
+
+
+def test_positions_take_the_drift_away_and_outliers_are_rejected(track: ProjectedTrack) -> None:
+    true, drifted = drive(0.0), drive(2e-4)
+    scans = np.arange(0, SCANS, EVERY)
+    registered = Trajectory(PERIOD_S * np.arange(SCANS), drifted)
+    edges = [
+        RelativePose(n, n + 1, inverse(drifted[a]) @ drifted[b], COVARIANCE) for n, (a, b) in enumerate(pairwise(scans))
+    ]
+    T_map_world = track.aligned(registered)
+    positions = track.positions(registered, scans.tolist())
+    found = optimise(T_map_world @ drifted[scans], edges, [], [], positions)
+    placed = T_MAP_WORLD @ true[scans]
+    errors = np.linalg.norm(found.poses[:, :3, 3] + track.projected[0] - placed[:, :3, 3], axis=1)
+    drift = np.linalg.norm(drifted[scans][:, :3, 3] - true[scans][:, :3, 3], axis=1)
+    assert drift.max() > 20.0
+    assert errors.max() < 0.3
+    rejected = np.flatnonzero(~found.position_inliers)
+    assert set(range(100, 160)) <= set(rejected.tolist())
+    assert len(rejected) < 70
+
+
+def test_positions_outside_of_the_run_are_refused(track: ProjectedTrack) -> None:
+    later = Trajectory(1000.0 + PERIOD_S * np.arange(SCANS), drive(0.0))
+    with pytest.raises(TooFewPositionsError, match="0 GNSS positions are within the time of the run"):
+        track.aligned(later)
+    assert track.positions(later, [0]) == []
