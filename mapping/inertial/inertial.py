@@ -5,13 +5,13 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, make_transform, rotation_angle, skew
+from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, rotation_angle, skew
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.preintegration import STANDARD_GRAVITY, Preintegration
-from lidarslam.mapping.inertial.window import InertialWindow, Knot
+from lidarslam.mapping.inertial.window import LEVER, SCALE, InertialWindow, Knot
 from lidarslam.mapping.motion.prediction import GravityDirection, MotionState, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
@@ -19,6 +19,8 @@ from lidarslam.mapping.tracking.mapped_scan import MappedScan
 _REGISTRATION = np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3)
 # Error of a sweep's mean velocity, of which the motion is none: rotation, rad/s, and translation, m/s.
 _UNEVEN = np.array([0.01] * 3 + [0.03] * 3)
+# Standard deviations of the lever arm's components, given and found.
+KNOWN_LEVER_M, UNKNOWN_LEVER_M = 0.02, 0.3
 # Directions of which a registration has at least this much information, beside the prediction, are measured.
 _LEAST_GAIN = 0.1
 # Time around a stamp over which the specific force is taken as gravity, seconds.
@@ -45,6 +47,7 @@ class Inertial(Stateful):
     Args:
         samples: of the IMU.
         T_lidar_imu: (4, 4) extrinsic calibration.
+        lever_sigma_m: standard deviation of its translation, along each axis.
     """
 
     _window: InertialWindow
@@ -58,11 +61,10 @@ class Inertial(Stateful):
     _angles2: float
     _differences2: float
 
-    def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray) -> None:
-        self._extrinsics = T_lidar_imu
-        self._T_lidar_imu = make_transform(np.eye(3), T_lidar_imu[:3, 3])  # of samples in the LiDAR's axes
+    def __init__(self, samples: ImuSamples, T_lidar_imu: FloatArray, lever_sigma_m: float = KNOWN_LEVER_M) -> None:
+        self._extrinsics, self._lever_sigma_m = T_lidar_imu, lever_sigma_m
         self._integrate(samples)
-        self._window = InertialWindow(self._preintegration)
+        self._window = InertialWindow(self._preintegration, T_lidar_imu[:3, 3], lever_sigma_m)
         self._predicted: Knot | None = None
         self._registered_s, self._measured_s, self._direction = None, None, None
         self._up_world, self._up_sigma = None, np.pi
@@ -75,14 +77,14 @@ class Inertial(Stateful):
 
     def anew(self) -> "Inertial":
         """A new one of the same samples."""
-        return Inertial(self._samples, self._extrinsics)
+        return Inertial(self._samples, self._extrinsics, self._lever_sigma_m)
 
     def reversed(self, about_s: float) -> "Inertial":
         """A new one of the same samples, with time reversed about an instant."""
         samples = self._samples
         stamps = 2.0 * about_s - samples.stamps[::-1]
         reversed_ = ImuSamples(stamps, -samples.angular_velocities[::-1], samples.accelerations[::-1])
-        return Inertial(reversed_, self._extrinsics)
+        return Inertial(reversed_, self._extrinsics, self._lever_sigma_m)
 
     @property
     def warnings(self) -> list[str]:
@@ -123,20 +125,19 @@ class Inertial(Stateful):
     def update(self, scan: Scan, mapped: MappedScan) -> None:
         """Take the result of a scan: biases, velocity and gravity follow it."""
         knot, self._predicted, self._direction = self._predicted, None, None
-        T_world_imu = mapped.state.T_world_lidar @ self._T_lidar_imu
         follows = mapped.registered and mapped.is_connected
         if knot is None or (mapped.registered and not mapped.is_connected):
             self._up_world = None
             if mapped.registered or self._window.last is None:
-                self._begin(scan, T_world_imu)
+                self._begin(scan, mapped.state.T_world_lidar)
             return
         if follows and mapped.predicted_covariance is not None:
             self._compare(knot, mapped)
             innovation = log(inverse(mapped.T_world_predicted) @ mapped.state.T_world_lidar)
             predicted, registered = mapped.predicted_covariance[:6, :6], mapped.state.covariance[:6, :6]
             step, information = gained(predicted, registered, innovation)
-            measured = mapped.state.T_world_lidar @ exp(step) @ self._T_lidar_imu
-            knot = replace(knot, T_world_imu=measured, sqrt_information=self._root(information))
+            measured = mapped.state.T_world_lidar @ exp(step)
+            knot = replace(knot, T_world_lidar=measured, sqrt_information=_root(information))
             self._registered_s = scan.stamp
         self._window.add(knot)
         self._direction = self._gravity(knot.stamp)
@@ -164,38 +165,32 @@ class Inertial(Stateful):
         self.gyroscope = Gyroscope(samples, self._extrinsics[:3, :3])
         self._preintegration = Preintegration(samples, self._extrinsics[:3, :3])
 
-    def _begin(self, scan: Scan, T_world_imu: FloatArray) -> None:
+    def _begin(self, scan: Scan, T_world_lidar: FloatArray) -> None:
         if self.gyroscope.covers(scan.stamp, scan.stamp):
             instants = self.gyroscope.within(scan.stamp - _LEVEL_S, scan.stamp + _LEVEL_S, _STEP_S)
             turns = self.gyroscope.rotations(instants, np.zeros(3))
             at = self.gyroscope.turn(scan.stamp, instants[0], np.zeros(3))
             up = at @ np.einsum("nij,nj->i", turns[:-1], self._preintegration.means(instants)[:, 3:])
-            self._window.begin(scan.stamp, T_world_imu, self._root(np.diag(_REGISTRATION**-2)), up)
+            self._window.begin(scan.stamp, T_world_lidar, np.diag(1.0 / _REGISTRATION), up)
             self._registered_s = scan.stamp
-
-    def _root(self, information: FloatArray) -> FloatArray:
-        """(6, 6) square root of the IMU pose's information by the LiDAR pose's."""
-        values, vectors = np.linalg.eigh(information)
-        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-        return np.asarray(root @ adjoint(self._T_lidar_imu), dtype=np.float64)
 
     def _lidar_state(self, scan: Scan, knot: Knot, covariance: FloatArray) -> MotionState:
         """The LiDAR's pose and velocity during a sweep, with their covariance (12, 12), of a state of the IMU."""
-        T_imu_lidar = inverse(self._T_lidar_imu)
-        T_nav_lidar = knot.T_nav_imu @ T_imu_lidar
-        T_world_lidar = inverse(knot.T_nav_world) @ T_nav_lidar
-        R, lever = T_nav_lidar[:3, :3], T_imu_lidar[:3, 3]
+        T_nav_lidar, lever = knot.T_nav_imu @ knot.T_imu_lidar, -knot.lever
+        T_world_lidar, R = knot.T_world_estimated, T_nav_lidar[:3, :3]
         begin, end = _sweep(scan)
         around = scan.stamp + (np.array([begin, end]) if end > begin else np.array([-0.005, 0.005]))
         mean = self._preintegration.means(around)[0]
         rate = self.gyroscope.mean_rate(scan)
         rate = (mean[:3] if rate is None else rate) - knot.bias[3:]
-        acceleration = mean[3:] - knot.bias[:3] - R[2] * STANDARD_GRAVITY
+        acceleration = (mean[3:] - knot.bias[:3] - R[2] * STANDARD_GRAVITY) / knot.scale
         translation = R.T @ knot.velocity + np.cross(rate, lever) + 0.5 * (begin + end) * acceleration
-        J = np.zeros((12, 21))
-        J[:6, :6], J[:6, 15:] = adjoint(self._T_lidar_imu), -adjoint(inverse(T_world_lidar))
+        J = np.zeros((12, len(covariance)))
+        J[:6, :6], J[:6, 15:21] = adjoint(inverse(knot.T_imu_lidar)), -adjoint(inverse(T_world_lidar))
+        J[3:6, LEVER] = -np.eye(3)
         J[6:9, 12:15] = -np.eye(3)
         J[9:, :3], J[9:, 6:9], J[9:, 12:15] = skew(R.T @ knot.velocity), R.T, skew(lever)
+        J[9:, SCALE], J[9:, LEVER] = -0.5 * (begin + end) * acceleration, -skew(rate)
         P = J @ covariance @ J.T
         P[6:, 6:] += np.diag(_UNEVEN**2)
         return MotionState(scan.stamp, T_world_lidar, np.concatenate([rate, translation]), P)
@@ -204,10 +199,16 @@ class Inertial(Stateful):
         last = self._window.last
         assert last is not None
         turn = last.T_nav_imu[:3, :3].T @ knot.T_nav_imu[:3, :3]
-        moved = last.T_world_imu[:3, :3].T @ mapped.state.T_world_lidar[:3, :3]
+        moved = last.T_world_lidar[:3, :3].T @ mapped.state.T_world_lidar[:3, :3]
         self._turns += 1
         self._angles2 += float(rotation_angle(turn)) ** 2
         self._differences2 += float(rotation_angle(turn.T @ moved)) ** 2
+
+
+def _root(information: FloatArray) -> FloatArray:
+    """(6, 6) square root of an information."""
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, dtype=np.float64)
 
 
 def gained(prior: FloatArray, posterior: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -2,7 +2,8 @@
 
 A square-root information smoother: the factors are GTSAM's, the oldest state is marginalised (Dong-Si and Mourikis,
 ICRA 2011; Leutenegger et al., IJRR 2015). The world's pose in a levelled frame is part of the state: its tilt is the
-direction of gravity.
+direction of gravity. So are the lever arm, and the scale of the accelerations, beside gravity, against the LiDAR's
+positions.
 """
 
 from dataclasses import dataclass, replace
@@ -15,23 +16,25 @@ from gtsam.imuBias import ConstantBias
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import solve_triangular
 
-from lidarslam.core.geometry import FloatArray, adjoint, inverse, log
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, log, make_transform
 from lidarslam.core.state.stateful import TRANSFORM, Shape, Stateful
 from lidarslam.mapping.inertial.preintegration import Preintegration
 
 # Scans of the window, and iterations after each.
 _SCANS, _ITERATIONS = 10, 4
 _CONVERGED = 0.005
-# Degrees of freedom: pose, velocity, biases, pose of the world.
-_SIZE = 21
-# Standard deviations of the first state: velocity, m/s; biases of accelerometer and gyroscope; tilt of the world.
-_VELOCITY, _FORCE_BIAS, _RATE_BIAS, _TILT = 15.0, 0.15, 0.01, np.deg2rad(5.0)
-# Walk of gravity in the world, which follows the drift of the map: rad/sqrt(s); no other drift.
+# Degrees of freedom: pose, velocity, biases, pose of the world, logarithm of the scale, lever arm.
+_SIZE = 25
+_POSE, _VELOCITY, _BIASES, _WORLD = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 21)
+SCALE, LEVER = 21, slice(22, 25)
+# Standard deviations of the first state: velocity, m/s; biases of accelerometer and gyroscope; tilt; scale.
+_SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT, _SCALE = 15.0, 0.15, 0.01, np.deg2rad(5.0), 0.1
+# Walk of gravity in the world, which follows the drift of the map: rad/sqrt(s); nothing else of the calibration walks.
 _TILT_WALK, _FIXED = np.deg2rad(0.01), 1e-5
 # Registrations off by more deviations count less.
 _HUBER = 4.0
 # Columns of two knots that GTSAM's factor has in order: poses and velocities, then biases, and the right-hand side.
-_OF_IMU = np.r_[0:9, 21:30, 9:15, 30:36, 42]
+_OF_IMU = np.r_[0:9, _SIZE : _SIZE + 9, 9:15, _SIZE + 9 : _SIZE + 15, 2 * _SIZE]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,26 +47,42 @@ class Knot:
     bias: Annotated[FloatArray, Shape(6)]  # (6,) of accelerometer, m/s^2, and gyroscope, rad/s
     T_nav_world: Annotated[FloatArray, TRANSFORM]  # (4, 4)
     integrated_at: Annotated[FloatArray, Shape(6)]  # (6,) bias at which samples since the last are integrated
-    T_world_imu: Annotated[FloatArray, TRANSFORM]  # (4, 4) as registered
+    scale: float  # accelerations, beside gravity, are so many times those of the LiDAR's positions
+    lever: Annotated[FloatArray, Shape(3)]  # (3,) position of the IMU in the LiDAR frame, whose axes are the IMU's, too
+    T_world_lidar: Annotated[FloatArray, TRANSFORM]  # (4, 4) as registered
     sqrt_information: Annotated[FloatArray, Shape(6, 6)]  # of the registration; zero where there was none
 
+    @property
+    def T_imu_lidar(self) -> FloatArray:
+        """(4, 4) of the lever arm."""
+        return make_transform(np.eye(3), -self.lever)
+
+    @property
+    def T_world_estimated(self) -> FloatArray:
+        """(4, 4) pose of the LiDAR in the world."""
+        return np.asarray(inverse(self.T_nav_world) @ self.T_nav_imu @ self.T_imu_lidar, dtype=np.float64)
+
     def moved(self, step: FloatArray) -> "Knot":
-        """The state after a step (21,)."""
+        """The state after a step (25,)."""
         return replace(
             self,
-            T_nav_imu=_matrix(gtsam.Pose3(self.T_nav_imu).retract(step[:6])),
-            velocity=self.velocity + step[6:9],
-            bias=self.bias + step[9:15],
-            T_nav_world=_matrix(gtsam.Pose3(self.T_nav_world).retract(step[15:])),
+            T_nav_imu=_matrix(gtsam.Pose3(self.T_nav_imu).retract(step[_POSE])),
+            velocity=self.velocity + step[_VELOCITY],
+            bias=self.bias + step[_BIASES],
+            T_nav_world=_matrix(gtsam.Pose3(self.T_nav_world).retract(step[_WORLD])),
+            scale=self.scale * float(np.exp(step[SCALE])),
+            lever=self.lever + step[LEVER],
         )
 
     def away_from(self, other: "Knot") -> FloatArray:
-        """(21,) the step from another state to this one."""
+        """(25,) the step from another state to this one."""
         return np.concatenate([
             log(inverse(other.T_nav_imu) @ self.T_nav_imu),
             self.velocity - other.velocity,
             self.bias - other.bias,
             log(inverse(other.T_nav_world) @ self.T_nav_world),
+            [np.log(self.scale / other.scale)],
+            self.lever - other.lever,
         ])  # fmt: skip
 
 
@@ -77,14 +96,21 @@ class _Prior:
 
 
 class InertialWindow(Stateful):
-    """The latest knots; the first of all begins it."""
+    """The latest knots; the first of all begins it.
+
+    Args:
+        preintegration: of the samples, in the LiDAR's axes.
+        lever: (3,) position of the IMU in the LiDAR frame.
+        lever_sigma_m: its standard deviation along each axis.
+    """
 
     _knots: list[Knot]
     _prior: _Prior | None
     _latest: Annotated[FloatArray, Shape(_SIZE, _SIZE)]  # square root of the latest state's information
 
-    def __init__(self, preintegration: Preintegration) -> None:
+    def __init__(self, preintegration: Preintegration, lever: FloatArray, lever_sigma_m: float) -> None:
         self._preintegration = preintegration
+        self._lever, self._lever_sigma_m = lever, lever_sigma_m
         self._measurements: dict[float, gtsam.PreintegratedCombinedMeasurements] = {}
         self._knots, self._prior, self._latest = [], None, np.eye(_SIZE)
 
@@ -97,21 +123,23 @@ class InertialWindow(Stateful):
         """The latest state; None before the first."""
         return self._knots[-1] if self._knots else None
 
-    def begin(self, stamp: float, T_world_imu: FloatArray, sqrt_information: FloatArray, up: FloatArray) -> None:
-        """Begin at a registered pose (4, 4), with the specific force (3,) there; biases and gravity stay."""
+    def begin(self, stamp: float, T_world_lidar: FloatArray, sqrt_information: FloatArray, up: FloatArray) -> None:
+        """Begin at a registered pose (4, 4), with the specific force (3,) there; the calibration and gravity stay."""
         last, sigmas = self.last, np.full(_SIZE, np.inf)
-        sigmas[6:9], sigmas[9:12], sigmas[12:15], sigmas[15:] = _VELOCITY, _FORCE_BIAS, _RATE_BIAS, _TILT
-        A, bias = np.diag(1.0 / sigmas), np.zeros(6)
+        sigmas[_VELOCITY], sigmas[9:12], sigmas[12:15], sigmas[_WORLD] = _SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT
+        sigmas[SCALE], sigmas[LEVER] = _SCALE, self._lever_sigma_m
+        A = np.diag(1.0 / sigmas)
         if last is None:
             T_nav_world: FloatArray = np.eye(4)
-            T_nav_world[:3, :3] = _turn_to_vertical(T_world_imu[:3, :3] @ up)
+            T_nav_world[:3, :3] = _turn_to_vertical(T_world_lidar[:3, :3] @ up)
+            bias, scale, lever = np.zeros(6), 1.0, self._lever
         else:
-            T_nav_world, bias = last.T_nav_world, last.bias
-            # Of the marginal of biases and tilt.
-            kept = np.linalg.inv(self.covariance()[9:, 9:])
-            A[9:, 9:] = np.linalg.cholesky(kept).T
+            T_nav_world, bias, scale, lever = last.T_nav_world, last.bias, last.scale, last.lever
+            # Of the marginal of biases, tilt, scale and lever arm.
+            A[9:, 9:] = np.linalg.cholesky(np.linalg.inv(self.covariance()[9:, 9:])).T
+        T_nav_imu = T_nav_world @ T_world_lidar @ make_transform(np.eye(3), lever)
         knot = Knot(
-            stamp, T_nav_world @ T_world_imu, np.zeros(3), bias, T_nav_world, bias, T_world_imu, sqrt_information
+            stamp, T_nav_imu, np.zeros(3), bias, T_nav_world, bias, scale, lever, T_world_lidar, sqrt_information
         )
         self._knots, self._measurements = [knot], {}
         self._prior = _Prior(knot, A, np.zeros(_SIZE))
@@ -122,14 +150,15 @@ class InertialWindow(Stateful):
         last = self._knots[-1]
         pim = self._preintegration.between(last.stamp, stamp, last.bias)
         self._measurements[stamp] = pim
-        state = pim.predict(
-            gtsam.NavState(gtsam.Pose3(last.T_nav_imu), last.velocity), ConstantBias(last.bias[:3], last.bias[3:])
-        )
+        pose, velocity = _scaled(last, last)
+        state = pim.predict(gtsam.NavState(pose, velocity), ConstantBias(last.bias[:3], last.bias[3:]))
         T = _matrix(state.pose())
-        return Knot(
-            stamp, T, state.velocity(), last.bias, last.T_nav_world, last.bias,
-            inverse(last.T_nav_world) @ T, np.zeros((6, 6)),
+        T[:3, 3] = last.T_nav_imu[:3, 3] + T[:3, 3] / last.scale
+        knot = replace(
+            last, stamp=stamp, T_nav_imu=T, velocity=state.velocity() / last.scale, integrated_at=last.bias,
+            sqrt_information=np.zeros((6, 6)),
         )  # fmt: skip
+        return replace(knot, T_world_lidar=knot.T_world_estimated)
 
     def add(self, knot: Knot) -> None:
         """Take the next state, with its registration if there is one: all states follow."""
@@ -147,7 +176,7 @@ class InertialWindow(Stateful):
             self._measurements.pop(second.stamp, None)
 
     def covariance(self, following: Knot | None = None) -> FloatArray:
-        """(21, 21) of the latest state, or of a predicted one that follows it."""
+        """(25, 25) of the latest state, or of a predicted one that follows it."""
         root, last = self._latest, self._knots[-1]
         if following is not None:
             own = np.pad(root, ((0, 0), (0, 1)))
@@ -156,7 +185,7 @@ class InertialWindow(Stateful):
         return np.asarray(inverse_root @ inverse_root.T, dtype=np.float64)
 
     def _step(self) -> FloatArray:
-        """Gauss-Newton step of all states, by elimination in their order; that of the latest (21,)."""
+        """Gauss-Newton step of all states, by elimination in their order; that of the latest (25,)."""
         rows, prior = [], self._prior
         assert prior is not None
         for first, second in pairwise(self._knots):
@@ -172,25 +201,42 @@ class InertialWindow(Stateful):
         return steps[0]
 
     def _between_rows(self, first: Knot, second: Knot) -> FloatArray:
-        """Whitened rows `[first | second | b]` (21, 43) of the IMU between two knots and the walk of gravity."""
-        values = gtsam.Values()
-        for n, knot in enumerate((first, second)):
-            values.insert(X(n), gtsam.Pose3(knot.T_nav_imu))
-            values.insert(V(n), knot.velocity)
+        """Whitened rows `[first | second | b]` (25, 51) of the IMU between two knots, and the walk of gravity.
+
+        In positions and velocities that are scaled, accelerations are the measured ones.
+        """
+        values, scaled = gtsam.Values(), [_scaled(knot, first) for knot in (first, second)]
+        for n, (knot, (pose, velocity)) in enumerate(zip((first, second), scaled, strict=True)):
+            values.insert(X(n), pose)
+            values.insert(V(n), velocity)
             values.insert(B(n), ConstantBias(knot.bias[:3], knot.bias[3:]))
         pim = self._measured(first, second)
         factor = gtsam.CombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), pim).linearize(values)
         rows: FloatArray = np.zeros((_SIZE, 2 * _SIZE + 1))
         rows[:15, _OF_IMU] = factor.augmentedJacobian()
-        root = 1.0 / np.array([_TILT_WALK * np.sqrt(second.stamp - first.stamp)] * 3 + [_FIXED] * 3)
-        away = log(inverse(first.T_nav_world) @ second.T_nav_world)
-        rows[15:, 15:21], rows[15:, 36:42], rows[15:, -1] = -np.diag(root), np.diag(root), -root * away
+        for begin, (pose, velocity) in zip((0, _SIZE), scaled, strict=True):
+            position, speed = slice(begin + 3, begin + 6), slice(begin + 6, begin + 9)
+            along = pose.rotation().matrix().T @ pose.translation()
+            rows[:15, SCALE] += rows[:15, position] @ along + rows[:15, speed] @ velocity
+            rows[:15, position] *= first.scale
+            rows[:15, speed] *= first.scale
+        root = 1.0 / np.array([_TILT_WALK * np.sqrt(second.stamp - first.stamp)] * 3 + [_FIXED] * 7)
+        away = second.away_from(first)[15:]
+        rows[15:, 15:_SIZE], rows[15:, _SIZE + 15 : -1] = -np.diag(root), np.diag(root)
+        rows[15:, -1] = -root * away
         return rows
 
     def _measured(self, before: Knot, knot: Knot) -> gtsam.PreintegratedCombinedMeasurements:
         if knot.stamp not in self._measurements:
             self._measurements[knot.stamp] = self._preintegration.between(before.stamp, knot.stamp, knot.integrated_at)
         return self._measurements[knot.stamp]
+
+
+def _scaled(knot: Knot, origin: Knot) -> tuple[gtsam.Pose3, FloatArray]:
+    """Pose and velocity about the position of another knot, in lengths of the accelerometer."""
+    T = knot.T_nav_imu.copy()
+    T[:3, 3] = origin.scale * (T[:3, 3] - origin.T_nav_imu[:3, 3])
+    return gtsam.Pose3(T), origin.scale * knot.velocity
 
 
 def _matrix(pose: gtsam.Pose3) -> FloatArray:
@@ -216,20 +262,21 @@ def _remaining(second: Knot, R: FloatArray) -> _Prior:
 
 
 def _own_rows(prior: _Prior, knot: Knot) -> FloatArray:
-    """Whitened rows `[own | b]` (27, 22) of a knot's Gaussian and its registered pose."""
+    """Whitened rows `[own | b]` (31, 26) of a knot's Gaussian and its registered pose."""
     away = (prior.b - prior.A @ knot.away_from(prior.mean))[:, None]
     return np.vstack([np.hstack([prior.A, away]), _registered_rows(knot)])
 
 
 def _registered_rows(knot: Knot) -> FloatArray:
-    """Whitened rows `[own | b]` (6, 22) of a registered pose, robust by Huber's kernel."""
-    expected = inverse(knot.T_nav_world) @ knot.T_nav_imu
-    residual = knot.sqrt_information @ log(inverse(knot.T_world_imu) @ expected)
+    """Whitened rows `[own | b]` (6, 26) of a registered pose, robust by Huber's kernel."""
+    expected, root = knot.T_world_estimated, knot.sqrt_information
+    residual = root @ log(inverse(knot.T_world_lidar) @ expected)
     norm = float(np.linalg.norm(residual))
     weight = np.sqrt(_HUBER / norm) if norm > _HUBER else 1.0
     rows: FloatArray = np.zeros((6, _SIZE + 1))
-    rows[:, :6], rows[:, 15:21] = knot.sqrt_information, -knot.sqrt_information @ adjoint(inverse(expected))
-    rows[:, -1] = -residual
+    rows[:, _POSE] = root @ adjoint(inverse(knot.T_imu_lidar))
+    rows[:, _WORLD] = -root @ adjoint(inverse(expected))
+    rows[:, LEVER], rows[:, -1] = -root[:, 3:], -residual
     return weight * rows
 
 
