@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from lidarslam.core.geometry import FloatArray, adjoint, exp, inverse, log, rotation_angle, skew
+from lidarslam.core.geometry import FloatArray, adjoint, inverse, rotation_angle, skew
 from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
@@ -21,8 +21,6 @@ _REGISTRATION = np.array([np.deg2rad(0.05)] * 3 + [0.005] * 3)
 _UNEVEN = np.array([0.01] * 3 + [0.03] * 3)
 # Standard deviations of the lever arm's components, given and found.
 KNOWN_LEVER_M, UNKNOWN_LEVER_M = 0.02, 0.3
-# Directions of which a registration has at least this much information, beside the prediction, are measured.
-_LEAST_GAIN = 0.1
 # Time around a stamp over which the specific force is taken as gravity, seconds.
 _LEVEL_S, _STEP_S = 1.0, 0.02
 # Dead reckoning by the IMU alone ends after this time, seconds.
@@ -131,13 +129,10 @@ class Inertial(Stateful):
             if mapped.registered or self._window.last is None:
                 self._begin(scan, mapped.state.T_world_lidar)
             return
-        if follows and mapped.predicted_covariance is not None:
+        if follows and mapped.measured is not None:
             self._compare(knot, mapped)
-            innovation = log(inverse(mapped.T_world_predicted) @ mapped.state.T_world_lidar)
-            predicted, registered = mapped.predicted_covariance[:6, :6], mapped.state.covariance[:6, :6]
-            step, information = gained(predicted, registered, innovation)
-            measured = mapped.state.T_world_lidar @ exp(step)
-            knot = replace(knot, T_world_lidar=measured, sqrt_information=_root(information))
+            root = _root_of(mapped.measured.information)
+            knot = replace(knot, T_world_lidar=mapped.measured.T_world_lidar, sqrt_information=root)
             self._registered_s = scan.stamp
         self._window.add(knot)
         self._direction = self._gravity(knot.stamp)
@@ -183,14 +178,17 @@ class Inertial(Stateful):
         mean = self._preintegration.means(around)[0]
         rate = self.gyroscope.mean_rate(scan)
         rate = (mean[:3] if rate is None else rate) - knot.bias[3:]
-        acceleration = (mean[3:] - knot.bias[:3] - R[2] * STANDARD_GRAVITY) / knot.scale
-        translation = R.T @ knot.velocity + np.cross(rate, lever) + 0.5 * (begin + end) * acceleration
+        acceleration, own = (mean[3:] - knot.bias[:3] - R[2] * STANDARD_GRAVITY) / knot.scale, R.T @ knot.velocity
+        # At the middle of the sweep; a twist turns with the sensor.
+        middle_s = 0.5 * (begin + end)
+        translation = own + np.cross(rate, lever) + middle_s * (acceleration - np.cross(rate, own))
         J = np.zeros((12, len(covariance)))
         J[:6, :6], J[:6, 15:21] = adjoint(inverse(knot.T_imu_lidar)), -adjoint(inverse(T_world_lidar))
         J[3:6, LEVER] = -np.eye(3)
         J[6:9, 12:15] = -np.eye(3)
-        J[9:, :3], J[9:, 6:9], J[9:, 12:15] = skew(R.T @ knot.velocity), R.T, skew(lever)
-        J[9:, SCALE], J[9:, LEVER] = -0.5 * (begin + end) * acceleration, -skew(rate)
+        turned = np.eye(3) - middle_s * skew(rate)
+        J[9:, :3], J[9:, 6:9], J[9:, 12:15] = turned @ skew(own), turned @ R.T, skew(lever) - middle_s * skew(own)
+        J[9:, SCALE], J[9:, LEVER] = -middle_s * acceleration, -skew(rate)
         P = J @ covariance @ J.T
         P[6:, 6:] += np.diag(_UNEVEN**2)
         return MotionState(scan.stamp, T_world_lidar, np.concatenate([rate, translation]), P)
@@ -205,28 +203,11 @@ class Inertial(Stateful):
         self._differences2 += float(rotation_angle(turn.T @ moved)) ** 2
 
 
-def _root(information: FloatArray) -> FloatArray:
-    """(6, 6) square root of an information."""
-    values, vectors = np.linalg.eigh(information)
+def _root_of(information: FloatArray) -> FloatArray:
+    """(6, 6) square root of a registered pose's information, with the errors that no registration reports."""
+    added = np.linalg.solve(np.eye(6) + information * _REGISTRATION**2, information)
+    values, vectors = np.linalg.eigh(0.5 * (added + added.T))
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, dtype=np.float64)
-
-
-def gained(prior: FloatArray, posterior: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What a registration measured beside its prediction: the pose from the registered one (6,), and its information.
-
-    The quotient of two Gaussians, the prediction's and the registered pose's, with covariances (6, 6) and the step (6,)
-    between them; with errors of registered poses that no registration reports.
-    """
-    L = np.linalg.cholesky(prior)
-    S = L.T @ np.linalg.solve(posterior, L) - np.eye(6)
-    values, Q = np.linalg.eigh(0.5 * (S + S.T))
-    values = np.maximum(values, 0.0)
-    measured = values > _LEAST_GAIN
-    shares = np.where(measured, 1.0 / np.where(measured, values, 1.0), 0.0)
-    inverse_root = Q.T @ np.linalg.inv(L)
-    G = inverse_root.T @ (values[:, None] * inverse_root)
-    information = np.linalg.solve(np.eye(6) + G * _REGISTRATION**2, G)
-    return L @ Q @ (shares * (inverse_root @ step)), np.asarray(0.5 * (information + information.T), dtype=np.float64)
 
 
 def _sweep(scan: Scan) -> tuple[float, float]:

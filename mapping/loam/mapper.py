@@ -99,7 +99,7 @@ class LoamMapper(Stateful):
             degenerate=names,
             iterations=registration.iterations,
             added=is_added,
-            predicted_covariance=predicted.covariance,
+            measured=registration.measured,
         )
 
     def _with_mean_velocity(self, state: MotionState, middle_s: float, last: MotionState) -> MotionState:

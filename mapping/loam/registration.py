@@ -15,6 +15,7 @@ from lidarslam.mapping.least_squares.gauss_newton import (
 )
 from lidarslam.mapping.loam.feature_map import FeatureMap, match_lines, match_planes
 from lidarslam.mapping.loam.features import Features
+from lidarslam.mapping.motion.measured_pose import MeasuredPose
 from lidarslam.mapping.motion.prediction import MotionState
 from lidarslam.mapping.tracking.fit import Fit
 
@@ -46,6 +47,7 @@ class LoamRegistration:
 
     T_world_lidar: FloatArray  # (4, 4) at the stamp
     covariance: FloatArray  # (6, 6) of the pose's error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first
+    measured: MeasuredPose  # by the correspondences alone
     degeneracy: Degeneracy  # directions along which the prediction was kept
     fit: Fit
     iterations: int  # of Gauss-Newton
@@ -81,16 +83,17 @@ def register(
         )
         if solution is None:
             return None
-        information = solution[1]
-        if len(degeneracy):
-            along = degeneracy.part_along()
-            observed, known = np.eye(6) - along, np.linalg.inv(predicted.covariance[:6, :6])
-            information = observed.T @ (information - held) @ observed + along.T @ known @ along
+        along = degeneracy.part_along()
+        observed, known = np.eye(6) - along, np.linalg.inv(predicted.covariance[:6, :6])
+        measured = observed.T @ (solution[1] - held) @ observed
+        information = measured + along.T @ known @ along if len(degeneracy) else solution[1]
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     except np.linalg.LinAlgError:  # the correspondences constrain less than they did at the prediction
         return None
     T_world_lidar = orthonormalize(solution[0])
-    return LoamRegistration(T_world_lidar, covariance, degeneracy, problem.fit(T_world_lidar), problem.iterations)
+    alone = MeasuredPose.minimum(T_world_lidar, measured, np.zeros(6))
+    fit = problem.fit(T_world_lidar)
+    return LoamRegistration(T_world_lidar, covariance, alone, degeneracy, fit, problem.iterations)
 
 
 class _Problem:

@@ -13,6 +13,7 @@ from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
 from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, degenerate_directions
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
+from lidarslam.mapping.motion.measured_pose import MeasuredPose
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
 from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
 from lidarslam.mapping.surfels.large_surfaces import INFLATION, inflation_of_small
@@ -54,6 +55,7 @@ class Registration:
     # (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`: rotation first, in
     # the LiDAR frame, as GTSAM has it.
     covariance: FloatArray
+    measured: MeasuredPose  # by the correspondences alone
     degeneracy: Degeneracy  # the directions along which the prediction was kept
     iterations: int  # of Gauss-Newton
     matcher: Matcher  # with the correspondences of the keypoints in the finest cells
@@ -104,9 +106,12 @@ def register(
                     # An odometry saw the same small surfaces.
                     inflation, unknown, prior = found, prediction.covariance, prior / INFLATION**2
         covariance = solution.covariance(_INFORMATION_SHARE)
+        measured = solution.measured(orthonormalize(T_world_lidar), velocity - prediction.velocity)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
-    return Registration(orthonormalize(T_world_lidar), velocity, covariance, solution.degeneracy, iterations, matcher)
+    return Registration(
+        orthonormalize(T_world_lidar), velocity, covariance, measured, solution.degeneracy, iterations, matcher
+    )
 
 
 def with_mean_velocity(
@@ -194,15 +199,36 @@ class _Solution:
 
     step: FloatArray
     hessian: FloatArray
+    gradient: FloatArray  # (12,) of the correspondences, before the step
     prior: FloatArray
     degeneracy: Degeneracy
 
     def covariance(self, share: float = 1.0) -> FloatArray:
         """(12, 12) with a share of the correspondences' information, none of it along degenerate directions."""
+        observed = self._observed
+        return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
+
+    def measured(self, T_world_lidar: FloatArray, velocity_error: FloatArray) -> MeasuredPose:
+        """What the correspondences alone measured, at the pose (4, 4) and the velocity's error (6,) after the step.
+
+        The velocity, which bends the sweep, is as uncertain as predicted.
+        """
+        H, g = (
+            self._observed.T @ self.hessian @ self._observed,
+            self._observed.T @ (self.gradient + self.hessian @ self.step),
+        )
+        known = np.linalg.inv(np.linalg.inv(self.prior)[6:, 6:])
+        H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ velocity_error
+        gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T
+        pose = MeasuredPose.minimum(T_world_lidar, H[:6, :6] - gain @ H[6:, :6], g[:6] - gain @ g[6:])
+        return replace(pose, information=_INFORMATION_SHARE * pose.information)
+
+    @property
+    def _observed(self) -> FloatArray:
+        """(12, 12) projector onto the directions that are not degenerate."""
         scale = np.array([self.degeneracy.lever_m] * 3 + [1.0] * 3)
         D = self.degeneracy.directions
-        observed = np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
-        return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
+        return np.kron(np.eye(2), np.eye(6) - (D / scale).T @ (D * scale))
 
 
 def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
@@ -211,4 +237,4 @@ def _solve(system: _System, prior: FloatArray, error: FloatArray) -> _Solution:
     holding[:6, :6], holding[6:, 6:] = held, held * system.squared_time
     b = -(prior + holding) @ error - system.gradient
     step: FloatArray = np.asarray(np.linalg.solve(system.hessian + prior + holding, b), dtype=np.float64)
-    return _Solution(step, system.hessian, prior, system.degeneracy)
+    return _Solution(step, system.hessian, system.gradient, prior, system.degeneracy)

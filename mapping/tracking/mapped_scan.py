@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.tracking import Status
+from lidarslam.mapping.motion.measured_pose import MeasuredPose
 from lidarslam.mapping.motion.prediction import MotionState
 from lidarslam.mapping.tracking.fit import Fit
 
@@ -24,4 +25,4 @@ class MappedScan:
     added: bool = False  # whether the scan is good enough for the map, and was inserted
     # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
     is_connected: bool = True
-    predicted_covariance: FloatArray | None = None  # (12, 12) of the prediction; None where nothing was registered
+    measured: MeasuredPose | None = None  # by the correspondences alone; None where nothing was registered

@@ -137,7 +137,7 @@ class Tracker(Stateful):
         return MappedScan(
             state=state,
             T_world_predicted=attempt.prediction.T_world_lidar,
-            predicted_covariance=attempt.prediction.covariance,
+            measured=registration.measured,
             registered=True,
             status=status,
             message=message,
