@@ -13,16 +13,18 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.mapping.inertial.comparison import Comparison, MountingError
-from lidarslam.mapping.inertial.inertial import Inertial
+from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity
+from lidarslam.mapping.inertial.inertial import KNOWN_LEVER_M, UNKNOWN_LEVER_M, Inertial
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 # Samples that are kept, seconds; scans between two comparisons, and turns that one needs.
 _KEPT_S, _EVERY, _FEWEST_TURNS = 6.0, 10, 30
-# Clock and rotation are corrected once the clock is this certain, seconds.
-_CLOCK_SIGMA_S = 0.001
+# Clock and rotation are corrected once the clock is this certain, seconds, and so many times at most.
+_CLOCK_SIGMA_S, _CORRECTIONS = 0.001, 3
 _FEWEST_SAMPLES = 3
+# Samples that come too late for this share of the sweeps are a fault.
+_LATE_SHARE, _FEWEST_SWEEPS = 0.2, 20
 
 
 class ImuStream(Stateful):
@@ -38,18 +40,26 @@ class ImuStream(Stateful):
 
     def __init__(self, T_lidar_imu: FloatArray | None, warn: Callable[[str], None]) -> None:
         self._T_lidar_imu, self._warn = T_lidar_imu, warn
+        self._lever_sigma_m = KNOWN_LEVER_M
         self.is_placed = T_lidar_imu is not None  # whether somebody has said where it is, or that it is not known
         self._rows: deque[FloatArray] = deque()
         self._last_s, self._lock = -np.inf, Lock()
         self._offset_s = 0.0
         self._inertial: Inertial | None = None
         self._comparison: Comparison | None = None
-        self._scans, self._is_wrong = 0, False
+        self._corrections_left = _CORRECTIONS
+        self._scans, self._late, self._is_wrong = 0, 0, False
+        self._said: set[str] = set()
 
     @property
     def last_s(self) -> float:
         """The stamp of the last sample, seconds; minus infinity before the first."""
         return self._last_s
+
+    @property
+    def offset_s(self) -> float:
+        """The samples' stamps were found to be late by so much."""
+        return self._offset_s
 
     @property
     def direction(self) -> GravityDirection | None:
@@ -63,11 +73,15 @@ class ImuStream(Stateful):
             return ["no sample of the IMU came"]
         if self._inertial is None and not self._is_wrong:
             return ["the IMU's rotation was not observable, and it was not used: give odometry.imu_rotation_deg"]
-        return [] if self._inertial is None else self._inertial.warnings
+        warnings = [] if self._inertial is None else self._inertial.warnings
+        if self._scans >= _FEWEST_SWEEPS and self._late > _LATE_SHARE * self._scans:
+            warnings.append(f"samples of the IMU came too late for {self._late} of {self._scans} sweeps")
+        return warnings
 
     def place(self, T_lidar_imu: FloatArray | None) -> None:
         """Take the extrinsic calibration (4, 4) that became known since; None: it will not."""
-        self._T_lidar_imu, self.is_placed = T_lidar_imu, True
+        self.is_placed = True
+        self._begin_anew(T_lidar_imu)
 
     def add(self, stamp: float, angular_velocity: FloatArray, acceleration: FloatArray) -> None:
         """Take the next sample, from any thread: seconds on the clock of the scans, rad/s and m/s^2 (3,) each.
@@ -85,18 +99,24 @@ class ImuStream(Stateful):
 
     def take_up(self, scan: Scan) -> Scan:
         """Use the samples that have come; the sweep as if the sensor had turned evenly. Call it before `prior`."""
-        samples = self._samples()
-        if samples is None or self._is_wrong:
+        samples = None if self._is_wrong else self._samples()
+        if samples is None:
             return scan
-        if self._comparison is None:
-            T = np.eye(4) if self._T_lidar_imu is None else self._T_lidar_imu
-            self._comparison = Comparison(samples, T)
-        self._comparison.use(samples)
-        if self._T_lidar_imu is None:
+        if (wrong := no_gravity(samples)) is not None:
+            self._give_up(wrong)
             return scan
-        if self._inertial is None:
-            self._inertial = Inertial(samples, self._T_lidar_imu)
+        T_lidar_imu = self._T_lidar_imu
+        if self._corrections_left:
+            self._comparison = self._comparison or Comparison(
+                samples, np.eye(4) if T_lidar_imu is None else T_lidar_imu
+            )
+            self._comparison.use(samples)
+        if T_lidar_imu is None:
+            return scan
+        self._inertial = self._inertial or Inertial(samples, T_lidar_imu, self._lever_sigma_m)
         self._inertial.use(samples)
+        end_s = scan.stamp + (scan.time_offsets.max() if scan.time_offsets is not None and len(scan) else 0.0)
+        self._late += not self._inertial.gyroscope.covers(scan.stamp, float(end_s))
         return self._inertial.gyroscope.evened(scan)
 
     def prior(self, scan: Scan, prior: Prior) -> Prior:
@@ -107,15 +127,18 @@ class ImuStream(Stateful):
         """Follow the result of a scan, and compare the IMU with the scans so far."""
         if self._inertial is not None:
             self._inertial.update(scan, mapped)
+        self._scans += 1
         if self._comparison is None:
             return
-        follows = mapped.registered and mapped.is_connected
-        self._comparison.add(scan.stamp, mapped.state.T_world_lidar, follows)
-        self._scans += 1
+        # The IMU has no part in what the correspondences measured alone.
+        follows = mapped.measured is not None and mapped.is_connected
+        pose = mapped.state.T_world_lidar if mapped.measured is None else mapped.measured.T_world_lidar
+        self._comparison.add(scan.stamp, pose, follows)
         if self._scans % _EVERY:
             return
         if self._T_lidar_imu is None:
             with suppress(MountingError):
+                self._lever_sigma_m = UNKNOWN_LEVER_M
                 self._begin_anew(make_transform(self._comparison.mounting().R_lidar_imu, np.zeros(3)))
         elif len(self._comparison) >= _FEWEST_TURNS:
             self._align(self._comparison, self._T_lidar_imu)
@@ -124,16 +147,24 @@ class ImuStream(Stateful):
         """Correct the errors of clock and rotation that are clear; an IMU that contradicts the scans is left alone."""
         contradiction, found = comparison.contradiction(), comparison.alignment()
         if contradiction is not None:
-            self._warn(f"{contradiction}; it was not used from scan {self._scans} on")
-            self._begin_anew(T_lidar_imu)
-            self._is_wrong = True
-        elif found.offset_sigma_s < _CLOCK_SIGMA_S and (sentences := found.sentences()):
+            self._give_up(contradiction)
+        elif found.offset_sigma_s < _CLOCK_SIGMA_S:
+            sentences = found.sentences()
+            self._corrections_left = self._corrections_left - 1 if sentences else 0
             for sentence in sentences:
                 self._warn(sentence)
             self._offset_s += found.significant_offset_s
-            self._begin_anew(found.corrected(T_lidar_imu))
+            if sentences:
+                self._begin_anew(found.corrected(T_lidar_imu))
+            if not self._corrections_left:
+                self._comparison = None
 
-    def _begin_anew(self, T_lidar_imu: FloatArray) -> None:
+    def _give_up(self, reason: str) -> None:
+        self._warn(f"{reason}; it was not used from scan {self._scans} on")
+        self._begin_anew(self._T_lidar_imu)
+        self._is_wrong = True
+
+    def _begin_anew(self, T_lidar_imu: FloatArray | None) -> None:
         self._T_lidar_imu, self._inertial, self._comparison = T_lidar_imu, None, None
 
     def _samples(self) -> ImuSamples | None:
@@ -142,4 +173,9 @@ class ImuStream(Stateful):
         if len(rows) < _FEWEST_SAMPLES:
             return None
         samples = usable_samples(rows[:, 0] - self._offset_s, rows[:, 1:4], rows[:, 4:], None)
+        for note in samples.notes if samples is not None else ():
+            kind = "".join(character for character in note if not character.isdigit())
+            if kind not in self._said:
+                self._said.add(kind)
+                self._warn(note.rstrip("."))
         return samples if samples is not None and len(samples) >= _FEWEST_SAMPLES else None

@@ -71,19 +71,23 @@ def open_inertial(
     samples = imu_samples(config, recording)
     if samples is None:
         return None
-    from lidarslam.mapping.inertial.inertial import Inertial
+    from lidarslam.mapping.inertial.comparison import no_gravity
+    from lidarslam.mapping.inertial.inertial import KNOWN_LEVER_M, UNKNOWN_LEVER_M, Inertial
 
     for note in samples.notes:
         warn(note)
+    if (wrong := no_gravity(samples)) is not None:
+        raise InputError(f"{recording.name}: {wrong}; correct the IMU's data, or {_INSTEAD}")
     T_lidar_imu = samples.T_lidar_imu
     if (T_recorded_imu := given_extrinsics(config.odometry)) is not None:
         T_lidar_imu = recorded_axes(recording)[1] @ T_recorded_imu
     poses = _Poses(config, recording, chosen)
+    lever_sigma_m = KNOWN_LEVER_M
     if T_lidar_imu is None:
         logger.info("finding how the IMU is mounted")
-        T_lidar_imu = _found(poses, recording.name, samples)
+        T_lidar_imu, lever_sigma_m = _found(poses, recording.name, samples), UNKNOWN_LEVER_M
     logger.info("comparing the IMU with the first scans")
-    return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn))
+    return Inertial(*_aligned(poses, recording.name, samples, T_lidar_imu, warn), lever_sigma_m)
 
 
 def given_extrinsics(config: OdometryConfig) -> FloatArray | None:
@@ -120,7 +124,7 @@ class _Poses:
 
     def __init__(self, config: Config, recording: Recording, chosen: range) -> None:
         self._scans = take_in(recording, chosen, Faults())
-        self._mapper = SurfelMapper(config.mapping)
+        self._mapper = SurfelMapper(config.mapping.model_copy(update={"budget_ms": None}))
         self._poses: list[tuple[float, FloatArray, bool]] = []
 
     def compared(self, samples: ImuSamples, T_lidar_imu: FloatArray, most: int) -> "Iterator[Comparison]":

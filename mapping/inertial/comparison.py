@@ -34,7 +34,17 @@ _CLEAR, _CORRELATED = 100.0, 0.8
 # Accelerations are reversed where their ratio is below this, and zero by so many deviations.
 _REVERSED, _DEVIATIONS = 0.3, 4.0
 _REWEIGHTED = 8
+# Median of the specific force's size: what is carried feels gravity on average, m/s^2.
+_GRAVITY = (7.0, 15.0)
 _AXES = np.array(["x", "y", "z"])
+
+
+def no_gravity(samples: ImuSamples) -> str | None:
+    """Why specific forces show no gravity, and cannot be used; None where they do."""
+    size = float(np.median(np.linalg.norm(samples.accelerations, axis=1)))
+    if _GRAVITY[0] < size < _GRAVITY[1]:
+        return None
+    return f"the IMU's accelerations have a median of {size:.3g} m/s^2, which is not gravity"
 
 
 class MountingError(ValueError):

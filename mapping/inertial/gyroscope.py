@@ -96,11 +96,6 @@ class Gyroscope:
             rotations[n + 1] = rotations[n] @ step
         return rotations
 
-    def change(self, first_s: float, last_s: float) -> FloatArray:
-        """(3,) by how much the angular velocity changes between two instants, rad/s."""
-        rates = self._angle.rates(np.clip([first_s, last_s], self._stamps[0], self._stamps[-1]))
-        return np.asarray(rates[1] - rates[0], dtype=np.float64)
-
     def mean_rate(self, scan: Scan) -> FloatArray | None:
         """(3,) the constant rate during a sweep, rad/s, with the bias; None where sweep or samples have no times."""
         turns = self._turns(scan)

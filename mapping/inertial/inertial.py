@@ -166,7 +166,8 @@ class Inertial(Stateful):
             turns = self.gyroscope.rotations(instants, np.zeros(3))
             at = self.gyroscope.turn(scan.stamp, instants[0], np.zeros(3))
             up = at @ np.einsum("nij,nj->i", turns[:-1], self._preintegration.means(instants)[:, 3:])
-            self._window.begin(scan.stamp, T_world_lidar, np.diag(1.0 / _REGISTRATION), up)
+            is_level = self._registered_s is not None and scan.stamp - self._registered_s < _DEAD_RECKONING_S
+            self._window.begin(scan.stamp, T_world_lidar, np.diag(1.0 / _REGISTRATION), up, is_level)
             self._registered_s = scan.stamp
 
     def _lidar_state(self, scan: Scan, knot: Knot, covariance: FloatArray) -> MotionState:

@@ -123,20 +123,25 @@ class InertialWindow(Stateful):
         """The latest state; None before the first."""
         return self._knots[-1] if self._knots else None
 
-    def begin(self, stamp: float, T_world_lidar: FloatArray, sqrt_information: FloatArray, up: FloatArray) -> None:
-        """Begin at a registered pose (4, 4), with the specific force (3,) there; the calibration and gravity stay."""
+    def begin(
+        self, stamp: float, T_world_lidar: FloatArray, sqrt_information: FloatArray, up: FloatArray, is_level: bool
+    ) -> None:
+        """Begin at a registered pose (4, 4), with the specific force (3,) there; the calibration stays.
+
+        Gravity stays where the world is level as before; it may be another world where the sensor was lost for long.
+        """
         last, sigmas = self.last, np.full(_SIZE, np.inf)
         sigmas[_VELOCITY], sigmas[9:12], sigmas[12:15], sigmas[_WORLD] = _SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT
         sigmas[SCALE], sigmas[LEVER] = _SCALE, self._lever_sigma_m
         A = np.diag(1.0 / sigmas)
-        if last is None:
-            T_nav_world: FloatArray = np.eye(4)
-            T_nav_world[:3, :3] = _turn_to_vertical(T_world_lidar[:3, :3] @ up)
-            bias, scale, lever = np.zeros(6), 1.0, self._lever
-        else:
-            T_nav_world, bias, scale, lever = last.T_nav_world, last.bias, last.scale, last.lever
-            # Of the marginal of biases, tilt, scale and lever arm.
-            A[9:, 9:] = np.linalg.cholesky(np.linalg.inv(self.covariance()[9:, 9:])).T
+        T_nav_world: FloatArray = np.eye(4)
+        T_nav_world[:3, :3] = _turn_to_vertical(T_world_lidar[:3, :3] @ up)
+        bias, scale, lever = np.zeros(6), 1.0, self._lever
+        if last is not None:
+            bias, scale, lever = last.bias, last.scale, last.lever
+            kept = np.r_[9:_SIZE] if is_level else np.r_[9:15, SCALE:_SIZE]
+            A[np.ix_(kept, kept)] = np.linalg.cholesky(np.linalg.inv(self.covariance()[np.ix_(kept, kept)])).T
+            T_nav_world = last.T_nav_world if is_level else T_nav_world
         T_nav_imu = T_nav_world @ T_world_lidar @ make_transform(np.eye(3), lever)
         knot = Knot(
             stamp, T_nav_imu, np.zeros(3), bias, T_nav_world, bias, scale, lever, T_world_lidar, sqrt_information

@@ -20,6 +20,8 @@ DEPTH = 1000
 _DISCOVERY_S, _POLL_S = 5.0, 0.1
 # A scan waits so long at most for the samples of its sweep, seconds.
 _PATIENCE_S, _STEP_S = 0.05, 0.002
+# A stamp so far ahead, seconds, is taken when so many in a row are.
+_FAR_S, _STRAYS = 5.0, 10
 
 P = TypeVar("P", bound=Published)
 
@@ -55,7 +57,7 @@ class ImuReceiver:
 
     def __init__(self, receive: Callable[[float], Iterable[Received]], stream: ImuStream) -> None:
         self._receive, self._stream = receive, stream
-        self._is_ended = False
+        self._is_ended, self._strays = False, 0
         self._thread = threading.Thread(target=self._run, name="imu", daemon=True)
         self.frame_id: str | None = None  # of the first message
 
@@ -68,9 +70,10 @@ class ImuReceiver:
         self._thread.join()
 
     def wait_for(self, stamp: float) -> None:
-        """Wait for the sample at a stamp, a moment at most."""
-        end = time.monotonic() + _PATIENCE_S
-        while self._stream.last_s < stamp and time.monotonic() < end:
+        """Wait for the sample at a stamp on the clock of the scans, a moment at most beside a clock that is late."""
+        late_s = self._stream.offset_s
+        end = time.monotonic() + _PATIENCE_S + max(0.0, late_s)
+        while self._stream.last_s - late_s < stamp and time.monotonic() < end:
             time.sleep(_STEP_S)
 
     def _run(self) -> None:
@@ -86,9 +89,14 @@ class ImuReceiver:
         except ValueError:
             return
         stamp = (stamp_ns or message.published_ns) / 10**9
-        if numbers is None or stamp <= self._stream.last_s:
+        if numbers is None or stamp <= self._stream.last_s or self._is_stray(stamp):
             return
         rates, forces = numbers[ANGULAR_VELOCITY], numbers[ACCELERATION]
         if np.isfinite(rates).all() and np.isfinite(forces).all():
             self._stream.add(stamp, rates, forces)
             self.frame_id = self.frame_id or frame_id
+
+    def _is_stray(self, stamp: float) -> bool:
+        """Whether a stamp is far ahead of the last one, and few such have come: a single one would stop all others."""
+        self._strays = self._strays + 1 if stamp > self._stream.last_s + _FAR_S else 0
+        return np.isfinite(self._stream.last_s) and 0 < self._strays < _STRAYS
