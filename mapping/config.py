@@ -192,3 +192,9 @@ class PoseGraphConfig(BaseModel):
     gnss: bool = Field(False, description="hold the graph by the recording's GNSS positions; lidarslam run alone")
     keyframes: KeyframeConfig = KeyframeConfig()
     loops: LoopConfig = LoopConfig()
+
+    @model_validator(mode="after")
+    def _gnss_has_a_graph(self) -> Self:
+        if self.gnss and not self.enabled:
+            raise ValueError("gnss needs enabled: true")
+        return self

@@ -69,6 +69,12 @@ class OdometryConfig(BaseModel):
         (0.0, 0.0, 0.0), description="of the IMU in the LiDAR's recorded axes, beside imu_rotation_deg"
     )
 
+    @model_validator(mode="after")
+    def _position_has_a_rotation(self) -> Self:
+        if any(self.imu_position_m) and self.imu_rotation_deg is None:
+            raise ValueError("imu_position_m needs imu_rotation_deg")
+        return self
+
     @property
     def is_learned(self) -> bool:
         """Whether the network runs."""

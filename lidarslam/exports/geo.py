@@ -54,7 +54,7 @@ def georeference(run: Path) -> GeoRun:
     """
     trajectory, source = read_trajectory(run), read_source(run, "has the GNSS positions")
     track = read_gnss(source.path, source.reader)
-    utm = utm_at(*track.geodetic[0, :2].tolist())
+    utm = utm_at(*np.median(track.geodetic[:, :2], axis=0).tolist())
     try:
         placed = align_to_track(trajectory, track, utm.project(track.geodetic), utm.scale)
     except TooFewPositionsError as error:

@@ -64,7 +64,8 @@ def _of_bag(bag: BagFile, lidar_frame: str) -> GnssTrack | None:
             fix = deserialize(message.raw, _FIX_TYPE, bag.ros2)
             if fix.status.status == _NO_FIX or not np.isfinite([fix.latitude, fix.longitude, fix.altitude]).all():
                 continue
-            variance = fix.position_covariance.reshape(3, 3)[:2, :2].trace() if fix.position_covariance_type else np.nan
+            horizontal = fix.position_covariance.reshape(3, 3)[:2, :2]
+            variance = 0.5 * horizontal.trace() if fix.position_covariance_type else np.nan
             stamps.append((message.header_ns or message.record_ns) / 10**9)
             geodetic.append([fix.latitude, fix.longitude, fix.altitude])
             sigmas.append(float(np.sqrt(variance)))

@@ -3,6 +3,8 @@
 import logging
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from lidarslam.core.errors import InputError
 from lidarslam.run.request import RunRequest
 
@@ -29,7 +31,7 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
     from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
 
     track = read_gnss(request.source, request.config.reader)
-    utm = utm_at(*track.geodetic[0, :2].tolist())
+    utm = utm_at(*np.median(track.geodetic[:, :2], axis=0).tolist())
     return ProjectedTrack(track, utm.project(track.geodetic), utm.scale)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidarslam.config.settings import Config
+from lidarslam.core.errors import ConfigError
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle
 from lidarslam.core.state.stateful import Saved
 from lidarslam.mapping.global_map.global_map import GlobalMap
@@ -67,8 +68,16 @@ class GraphOutcome:
     keyframe_ms: tuple[float, ...]  # wall time of each keyframe, on a thread of its own
 
 
-def begin_graph(config: Config, directory: Path | None = None, file: Path | None = None) -> "SlamGraph | None":
-    """A pose graph, when the configuration asks for one; its submaps lie in the directory, or in the file."""
+def begin_graph(
+    config: Config, directory: Path | None = None, file: Path | None = None, takes_gnss: bool = False
+) -> "SlamGraph | None":
+    """A pose graph, when the configuration asks for one; its submaps lie in the directory, or in the file.
+
+    Raises:
+        ConfigError: it asks for GNSS positions where none are taken.
+    """
+    if config.pose_graph.gnss and not takes_gnss:
+        raise ConfigError("pose_graph.gnss is of lidarslam run alone")
     if not config.pose_graph.enabled:
         return None
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
@@ -83,7 +92,7 @@ def restore_graph(config: Config, saved: Saved, file: Path) -> "SlamGraph | None
     Raises:
         InputError: one of them is damaged.
     """
-    graph = begin_graph(config, file=file)
+    graph = begin_graph(config, file=file, takes_gnss=True)
     if graph is not None:
         graph.restore(saved)
     return graph

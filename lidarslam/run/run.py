@@ -99,11 +99,11 @@ def execute(
             unfinished.end(outcome.stopped is not None)
             is_resumable = outcome.stopped is not None and unfinished.files.state.is_file()
             outcome = replace(outcome, is_resumable=is_resumable)
+        if request.report:
+            _draw_report(request, outcome, phase)
         if track_of_gnss is not None:
             phase("writing the results in UTM")
             write_in_utm(request)
-        if request.report:
-            _draw_report(request, outcome, phase)
     return outcome
 
 
@@ -121,10 +121,10 @@ def _open_graph(config: Config, directory: RunDirectory, unfinished: Unfinished 
         InputError: the checkpoint is damaged.
     """
     if unfinished is None:
-        return begin_graph(config, directory.path)
+        return begin_graph(config, directory.path, takes_gnss=True)
     saved = unfinished.saved
     if saved is None:
-        return begin_graph(config, file=unfinished.files.submaps)
+        return begin_graph(config, file=unfinished.files.submaps, takes_gnss=True)
     return restore_graph(config, saved.part("graph"), unfinished.files.submaps) if saved.has("graph") else None
 
 

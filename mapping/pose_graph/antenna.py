@@ -58,8 +58,8 @@ class ProjectedTrack:
         T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])
         antennas = np.einsum("nij,nj->ni", T_keyframe_world, antennas)[:, :3]
         measured = (self.projected[rows] - self.projected[0]) / self.scale
-        interval_s = float(np.median(np.diff(track.stamps[rows]))) if len(rows) > 1 else _CORRELATED_S
-        repeats = max(1.0, _CORRELATED_S / interval_s)
+        epochs = np.unique(track.stamps[rows])  # receivers may state whole seconds, several times each
+        repeats = max(1.0, len(rows) * _CORRELATED_S / max(float(epochs[-1] - epochs[0]), _CORRELATED_S))
         stated = np.where(np.isfinite(track.sigma_m[rows]), track.sigma_m[rows], _UNKNOWN_M)
         sigmas = np.maximum(stated, _LEAST_M)[:, None] * np.array([1.0, 1.0, _HEIGHT])
         return [

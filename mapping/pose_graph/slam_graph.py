@@ -186,8 +186,7 @@ class SlamGraph(KeyframeGraph):
         registered = Trajectory(stamps, np.array(self.scan_poses))
         T_world_lidar = corrected_recordings(registered.T_world_lidar, np.array([0]), np.array(scans), poses)
         T_map_world = track.aligned(Trajectory(stamps, T_world_lidar))
-        up = T_map_world[:3, :3]
-        attitudes = [replace(attitude, world=up @ attitude.world) for attitude in self.attitudes]
+        attitudes = [replace(attitude, world=np.array([0.0, 0.0, 1.0])) for attitude in self.attitudes]
         positions = track.positions(registered, scans)
         optimised = optimise(T_map_world @ poses, self.edges, loops, attitudes, positions)
         T_world_map = poses[0] @ inverse(optimised.poses[0])

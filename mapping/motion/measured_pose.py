@@ -1,0 +1,27 @@
+"""What correspondences alone measured of a pose, without a prediction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp
+
+# A direction of less information is not measured: standard deviations of rotation, radians, and translation, metres.
+_LARGEST = np.array([0.1] * 3 + [1.0] * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPose:
+    """A pose, and the information of its error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first."""
+
+    T_world_lidar: FloatArray  # (4, 4); along directions that are not measured, any
+    information: FloatArray  # (6, 6), zero along directions that are not measured
+
+    @classmethod
+    def minimum(cls, T_world_lidar: FloatArray, hessian: FloatArray, gradient: FloatArray) -> "MeasuredPose":
+        """The minimum of a cost with Hessian (6, 6) and gradient (6,) at a pose (4, 4)."""
+        values, vectors = np.linalg.eigh(hessian * np.outer(_LARGEST, _LARGEST))
+        axes, values = vectors[:, values > 1.0], values[values > 1.0]
+        step = -_LARGEST * (axes @ ((axes.T @ (_LARGEST * gradient)) / values))
+        rows = axes / _LARGEST[:, None]
+        return cls(T_world_lidar @ exp(step), np.asarray((rows * values) @ rows.T, dtype=np.float64))
