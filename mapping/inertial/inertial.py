@@ -33,6 +33,7 @@ _BETTER = 0.7
 _FEWEST_TURNS, _MOST_DIFFERENT, _REGISTRATION_ERROR = 50, 0.2, np.deg2rad(0.15)
 # Biases are reported from here on, and by so many deviations: sensor, part of the bias, m/s^2 and rad/s; as written.
 _DEVIATIONS = 5.0
+_LARGE_SCALE = 0.05
 _LARGE_BIASES = (
     ("accelerometer", slice(0, 3), 0.5, 1.0 / STANDARD_GRAVITY, "g"),
     ("gyroscope", slice(3, 6), np.deg2rad(0.8), 180.0 / np.pi, "deg/s"),
@@ -94,7 +95,16 @@ class Inertial(Stateful):
                 size, sigma = np.linalg.norm(last.bias[part]), np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1])
                 if size > max(least, _DEVIATIONS * sigma):
                     warnings.append(f"the IMU's {sensor} has a bias of {scale * size:.2f} {unit}; estimated, corrected")
+            sigma = np.sqrt(self._window.covariance()[SCALE, SCALE])
+            if abs(np.log(last.scale)) > max(_LARGE_SCALE, _DEVIATIONS * sigma):
+                times = f"{last.scale:.2f} times those of the LiDAR's positions"
+                warnings.append(f"the IMU's accelerations are {times}; estimated, corrected")
         return warnings
+
+    @property
+    def lever(self) -> FloatArray:
+        """(3,) position of the IMU in the LiDAR frame, as estimated."""
+        return self._extrinsics[:3, 3] if self._window.last is None else self._window.last.lever
 
     @property
     def _disagreement(self) -> str | None:

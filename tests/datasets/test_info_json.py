@@ -77,7 +77,7 @@ def test_all_keys_of_a_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "point_time": {"field": "t", "unit": "ns", "reference": "relative", "first_s": -0.05, "last_s": 0.05},
         "ground_truth": str(bag.with_suffix(".tum")),
         "imu": {"name": "/imu", "samples": 40, "rate_hz": 200.0, "has_extrinsic": False},
-        "notes": ["A note.", "Another."],
+        "notes": ["A note.", "Another.", "An IMU is there: run with --odometry learned+imu."],
         "topics": [
             {"name": "/points", "type": "sensor_msgs/msg/PointCloud2", "messages": 3},
             {"name": "/imu\x7f\x1b", "type": "sensor_msgs/msg/Imu", "messages": 40},

@@ -13,10 +13,11 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Saved, State
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.inertial.comparison import Comparison, MountingError
+from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
-from lidarslam.mapping.inertial.inertial import Inertial, gained
+from lidarslam.mapping.inertial.inertial import UNKNOWN_LEVER_M, Inertial
 from lidarslam.mapping.motion.deskew import move
+from lidarslam.mapping.motion.measured_pose import MeasuredPose
 from lidarslam.mapping.motion.prediction import (
     UNKNOWN_VELOCITY,
     GravityDirection,
@@ -49,6 +50,13 @@ def jerky(times: FloatArray) -> FloatArray:
     return make_transform(Rotation.from_rotvec(vectors).as_matrix(), np.zeros((*t.shape, 3)))
 
 
+def shaken(times: FloatArray) -> FloatArray:
+    """T_world_lidar (N, 4, 4) of a hand in a hurry, which accelerates along all axes."""
+    t = np.asarray(times, dtype=np.float64)
+    positions = np.stack([np.sin(2.1 * t), 0.8 * np.cos(1.7 * t), 0.1 * np.sin(6 * t)], axis=-1)
+    return make_transform(walk(t)[..., :3, :3], positions)
+
+
 def yaw_only(times: FloatArray) -> FloatArray:
     """T_world_lidar (N, 4, 4) of a carrier that turns about its vertical alone."""
     t = np.asarray(times, dtype=np.float64)
@@ -61,12 +69,13 @@ def samples(
     last_s: float,
     bias: FloatArray = BIAS,
     force_bias: FloatArray = FORCE_BIAS,
+    scale: float = 1.0,
 ) -> ImuSamples:
-    """Noiseless samples of a motion, by central differences."""
+    """Noiseless samples of a motion, by central differences; its accelerations scaled."""
     stamps, h = np.arange(0.0, last_s, 1.0 / RATE_HZ), 1e-4
     before, now, after = (motion(stamps + step) @ T_LIDAR_IMU for step in (-h, 0.0, h))
     rates = log(inverse(before) @ after)[:, :3] / (2 * h)
-    acceleration = (before[:, :3, 3] - 2 * now[:, :3, 3] + after[:, :3, 3]) / h**2 + [0.0, 0.0, 9.81]
+    acceleration = scale * (before[:, :3, 3] - 2 * now[:, :3, 3] + after[:, :3, 3]) / h**2 + [0.0, 0.0, 9.81]
     forces = np.einsum("nij,ni->nj", now[:, :3, :3], acceleration)
     return ImuSamples(stamps, rates + bias, forces + force_bias, T_LIDAR_IMU)
 
@@ -81,7 +90,7 @@ def registered(state: MotionState | None, stamp: float, T_world_lidar: FloatArra
     is_registered, is_connected = flags.get("is_registered", True), flags.get("is_connected", True)
     return MappedScan(
         state.fused(measured), state.T_world_lidar, is_registered, Status.OK,
-        is_connected=is_connected, predicted_covariance=state.covariance,
+        is_connected=is_connected, measured=MeasuredPose(T_world_lidar, np.linalg.inv(REGISTRATION)),
     )  # fmt: skip
 
 
@@ -236,7 +245,7 @@ def test_a_direction_without_structure_is_held_by_the_imu(rng: np.random.Generat
             empty(stamp),
             MappedScan(
                 MotionState(stamp, T_world_lidar, state.velocity, covariance), state.T_world_lidar, True, Status.OK,
-                predicted_covariance=state.covariance,
+                measured=MeasuredPose(T_world_lidar, information),
             ),
         )  # fmt: skip
     state = inertial.prior(empty(stamps[-1] + 1e-4), Prior()).inertial
@@ -268,15 +277,76 @@ def test_a_wrong_mounting_or_clock_is_noticed(rng: np.random.Generator) -> None:
         assert any("the IMU's mounting or clock is wrong" in warning for warning in inertial.warnings) != is_right
 
 
-def test_what_a_registration_measured_is_the_quotient_of_the_gaussians(rng: np.random.Generator) -> None:
-    """Where it measured five directions of six, and its errors are large beside those that no registration reports."""
-    root = rng.normal(size=(6, 6))
-    prior, measured = root @ root.T + np.eye(6), np.diag([1.0, 2.0, 3.0, 1.0, 2.0, 0.0])
-    posterior, at = np.linalg.inv(np.linalg.inv(prior) + measured), rng.normal(size=6)
-    registered_at = posterior @ measured @ at
-    step, information = gained(prior, posterior, registered_at)
-    np.testing.assert_allclose(information, measured, atol=2e-4)
-    np.testing.assert_allclose(measured @ (registered_at + step), measured @ at, atol=1e-9)
+def test_scaled_accelerations_are_recovered(rng: np.random.Generator) -> None:
+    """Beside gravity, which is not scaled; the prediction is as good as without."""
+    inertial = Inertial(samples(shaken, 20.0, scale=1.25), T_LIDAR_IMU)
+    for stamp in np.arange(0.5, 19.0, PERIOD_S):
+        error = exp(rng.normal(size=6) * ([np.deg2rad(0.03)] * 3 + [0.003] * 3))
+        take(inertial, stamp, inverse(shaken(0.5)) @ shaken(stamp) @ error)
+    seen = "the IMU's accelerations are 1.25 times those of the LiDAR's positions; estimated, corrected"
+    assert inertial.warnings[-1] == seen
+    state = inertial.prior(empty(19.4), Prior()).inertial
+    assert state is not None
+    error = log(inverse(state.T_world_lidar) @ inverse(shaken(0.5)) @ shaken(19.4))
+    assert np.linalg.norm(error[3:]) < 0.02
+    assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
+
+
+def test_an_unknown_lever_arm_is_recovered(rng: np.random.Generator) -> None:
+    T_turned = make_transform(T_LIDAR_IMU[:3, :3], np.zeros(3))
+    inertial = Inertial(samples(shaken, 20.0), T_turned, UNKNOWN_LEVER_M)
+    for stamp in np.arange(0.5, 19.0, PERIOD_S):
+        error = exp(rng.normal(size=6) * ([np.deg2rad(0.03)] * 3 + [0.003] * 3))
+        take(inertial, stamp, inverse(shaken(0.5)) @ shaken(stamp) @ error)
+    np.testing.assert_allclose(inertial.lever, T_LIDAR_IMU[:3, 3], atol=0.01)
+
+
+@pytest.mark.parametrize("begin_s", [-0.1, -0.05, 0.0])
+def test_the_velocity_of_a_sweep_in_a_curve(begin_s: float, rng: np.random.Generator) -> None:
+    """Begin and end of the sweep, moved by the predicted velocity, lie where the sensor was."""
+
+    def curve(times: FloatArray) -> FloatArray:
+        """T_world_lidar (N, 4, 4) at 5 m/s, turning at half a radian a second."""
+        t = np.asarray(times, dtype=np.float64)
+        R = Rotation.from_rotvec(np.multiply.outer(0.5 * t, [0.0, 0.0, 1.0])).as_matrix()
+        return make_transform(R, 10.0 * np.stack([np.sin(0.5 * t), 1.0 - np.cos(0.5 * t), 0.0 * t], axis=-1))
+
+    inertial = Inertial(samples(curve, 10.0), T_LIDAR_IMU)
+    for stamp in np.arange(0.5, 9.0, PERIOD_S):
+        take(inertial, stamp, inverse(curve(0.5)) @ curve(stamp))
+    offsets = begin_s + np.linspace(0.0, PERIOD_S, 50)
+    state = inertial.prior(Scan(np.zeros((50, 3)), 9.1, offsets), Prior()).inertial
+    assert state is not None
+    for offset in offsets[[0, -1]]:
+        ahead, true = exp(offset * state.velocity), inverse(curve(9.1)) @ curve(9.1 + offset)
+        assert np.linalg.norm((ahead - true)[:3, 3]) < 0.006
+
+
+def test_a_pose_measured_by_correspondences_alone(rng: np.random.Generator) -> None:
+    """The minimum of their cost, and nothing along a direction that they do not constrain."""
+    hessian, step = np.diag([900.0, 900.0, 900.0, 400.0, 400.0, 0.0]), 0.01 * rng.normal(size=6)
+    T = exp(rng.normal(size=6))
+    measured = MeasuredPose.minimum(T, hessian, -hessian @ step)
+    np.testing.assert_allclose(measured.information, hessian, atol=1e-9)
+    np.testing.assert_allclose(log(inverse(T) @ measured.T_world_lidar), step * [1, 1, 1, 1, 1, 0], atol=1e-9)
+
+
+def test_another_world_after_tracking_was_lost_has_another_vertical(rng: np.random.Generator) -> None:
+    inertial = Inertial(samples(walk, 20.0), T_LIDAR_IMU)
+    followed(inertial, 8.0, rng)
+    T_other_world = exp([0.2, -0.1, 0.4, 3.0, 0.0, 0.0])
+    for stamp in np.arange(12.0, 19.0, PERIOD_S):
+        state = take(inertial, stamp, T_other_world @ walk(stamp))
+    assert state is not None
+    error = log(inverse(state.T_world_lidar) @ T_other_world @ walk(stamp))
+    assert np.linalg.norm(error[3:]) < 0.01
+    assert error @ np.linalg.solve(state.covariance[:6, :6], error) < CHI2_6
+
+
+def test_forces_without_gravity_are_refused() -> None:
+    imu = samples(walk, 4.0)
+    assert no_gravity(imu) is None
+    assert "which is not gravity" in str(no_gravity(replace(imu, accelerations=0.0 * imu.accelerations)))
 
 
 def test_states_are_fused_by_their_information(rng: np.random.Generator) -> None:
