@@ -31,7 +31,7 @@ _NEAR = 20
 _LEAST_WAY_M = 0.2
 # A pair contradicts its relative pose when the pose has less than this share of the peak's votes within the tolerance;
 # a peak of fewer votes may be chance, or a vehicle.
-LEAST_VOTES, LARGEST_SHARE = 6.0, 0.5
+LEAST_VOTES, LARGEST_SHARE = 8.0, 0.5
 _TOLERANCE_BINS = 1
 # A stretch is contradicted by so many pairs, in runs of at least so many.
 _LEAST_PAIRS, _FEW_PAIRS = 2, 4
