@@ -107,13 +107,13 @@ class ImuStream(Stateful):
             return scan
         T_lidar_imu = self._T_lidar_imu
         if self._corrections_left:
-            self._comparison = self._comparison or Comparison(
-                samples, np.eye(4) if T_lidar_imu is None else T_lidar_imu
-            )
+            if self._comparison is None:
+                self._comparison = Comparison(samples, np.eye(4) if T_lidar_imu is None else T_lidar_imu)
             self._comparison.use(samples)
         if T_lidar_imu is None:
             return scan
-        self._inertial = self._inertial or Inertial(samples, T_lidar_imu, self._lever_sigma_m)
+        if self._inertial is None:
+            self._inertial = Inertial(samples, T_lidar_imu, self._lever_sigma_m)
         self._inertial.use(samples)
         end_s = scan.stamp + (scan.time_offsets.max() if scan.time_offsets is not None and len(scan) else 0.0)
         self._late += not self._inertial.gyroscope.covers(scan.stamp, float(end_s))
@@ -131,9 +131,9 @@ class ImuStream(Stateful):
         if self._comparison is None:
             return
         # The IMU has no part in what the correspondences measured alone.
-        follows = mapped.measured is not None and mapped.is_connected
-        pose = mapped.state.T_world_lidar if mapped.measured is None else mapped.measured.T_world_lidar
-        self._comparison.add(scan.stamp, pose, follows)
+        alone = None if self._inertial is None else mapped.measured
+        pose = (alone or mapped.state).T_world_lidar
+        self._comparison.add(scan.stamp, pose, mapped.registered and mapped.is_connected)
         if self._scans % _EVERY:
             return
         if self._T_lidar_imu is None:

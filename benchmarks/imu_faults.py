@@ -1,0 +1,128 @@
+"""Faults of an IMU: are they named, and what remains of the accuracy?
+
+    python benchmarks/imu_faults.py sim_stairs sim_corridor_yard
+    python benchmarks/imu_faults.py sim_stairs --faults "1 deg/s bias" "20 ms late" --options --step 5
+
+A recording is a folder of scans with an `imu.csv` and a ground truth. Each fault is put into a copy of the samples, and
+the recording run with `--odometry learned+imu`. Prints a Markdown table: ATE in metres after SE(3) alignment, scans
+that were lost, exit status, and the warnings, or the reason of a refusal, that name the fault.
+"""
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner
+from mapping_accuracy import print_row
+
+from lidarslam.cli import main as lidarslam
+from lidarslam.core.geometry import FloatArray
+
+# Rows of `imu.csv`: stamp, angular velocity (rad/s), specific force (m/s^2).
+RATE, FORCE = slice(1, 4), slice(4, 7)
+# What names a fault.
+ANY = ("IMU", "gyroscope", "accelerometer")
+
+
+def _plus(columns: slice, value: float) -> Callable[[FloatArray], FloatArray]:
+    def change(rows: FloatArray) -> FloatArray:
+        rows[:, columns] += value / np.sqrt(3.0)
+        return rows
+
+    return change
+
+
+def _times(columns: slice, value: float) -> Callable[[FloatArray], FloatArray]:
+    def change(rows: FloatArray) -> FloatArray:
+        rows[:, columns] *= value
+        return rows
+
+    return change
+
+
+def _later(seconds: float) -> Callable[[FloatArray], FloatArray]:
+    def change(rows: FloatArray) -> FloatArray:
+        rows[:, 0] += seconds
+        return rows
+
+    return change
+
+
+def _dropped(rows: FloatArray) -> FloatArray:
+    return np.asarray(rows[np.random.default_rng(0).random(len(rows)) > 0.1])
+
+
+def _swapped(rows: FloatArray) -> FloatArray:
+    return np.asarray(rows[:, [0, 2, 1, 3, 5, 4, 6]])
+
+
+def _saturated(rows: FloatArray) -> FloatArray:
+    """A gyroscope whose range ends at nine tenths of the largest rate."""
+    largest = 0.9 * np.abs(rows[:, RATE]).max()
+    rows[:, RATE] = np.clip(rows[:, RATE], -largest, largest)
+    return rows
+
+
+FAULTS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "none": lambda rows: rows,
+    "0.1 g bias": _plus(FORCE, 0.981),
+    "1 deg/s bias": _plus(RATE, float(np.deg2rad(1.0))),
+    "20 ms late": _later(0.02),
+    "20 ms early": _later(-0.02),
+    "10 % dropped": _dropped,
+    "saturated": _saturated,
+    "deg/s": _times(RATE, float(np.rad2deg(1.0))),
+    "g": _times(FORCE, 1.0 / 9.80665),
+    "gyroscope reversed": _times(RATE, -1.0),
+    "accelerometer reversed": _times(FORCE, -1.0),
+    "x and y swapped": _swapped,
+}
+
+
+def faulty(source: Path, folder: Path, fault: str) -> Path:
+    """A copy of a recording with a fault in its samples; its scans are links."""
+    lines = (source / "imu.csv").read_text().splitlines()
+    header = [line for line in lines if line.startswith("#")]
+    rows = FAULTS[fault](np.loadtxt([line for line in lines if not line.startswith("#")], delimiter=","))
+    copy = folder / source.name
+    copy.mkdir()
+    for file in source.iterdir():
+        if file.name != "imu.csv":
+            (copy / file.name).symlink_to(file.resolve())
+    np.savetxt(copy / "imu.csv", rows, fmt="%.9f", delimiter=",", header="\n".join(header), comments="")
+    return copy
+
+
+def row(source: Path, fault: str, options: list[str]) -> list[str]:
+    """The cells of a recording and a fault."""
+    with tempfile.TemporaryDirectory() as temporary:
+        copy, out = faulty(source, Path(temporary), fault), Path(temporary) / "run"
+        arguments = ["run", str(copy), "--out", str(out), "--odometry", "learned+imu", "--no-report", *options]
+        done = CliRunner().invoke(lidarslam, arguments)
+        if not (out / "summary.json").exists():
+            return [source.name, fault, "-", "-", str(done.exit_code), done.output.strip().splitlines()[-1]]
+        summary = json.loads((out / "summary.json").read_text())
+        metrics = json.loads((out / "metrics.json").read_text())
+    named = [warning for warning in summary["warnings"] if any(word in warning for word in ANY)]
+    ate = f"{metrics['trajectory']['ate_rmse_m']:.3f}"
+    return [source.name, fault, ate, str(summary["lost_scans"]), str(done.exit_code), "; ".join(named)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="+", type=Path, help="folders of scans with imu.csv and a ground truth")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
+    parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of lidarslam run")
+    arguments = parser.parse_args()
+    print_row(["recording", "fault", "ATE, m", "lost", "exit", "said"])
+    print_row(["---"] * 6)
+    for source in arguments.sources:
+        for fault in arguments.faults:
+            print_row(row(source, fault, arguments.options))
+
+
+if __name__ == "__main__":
+    main()
