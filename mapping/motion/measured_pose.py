@@ -1,6 +1,6 @@
 """What correspondences alone measured of a pose, without a prediction."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,3 +25,9 @@ class MeasuredPose:
         step = -_LARGEST * (axes @ ((axes.T @ (_LARGEST * gradient)) / values))
         rows = axes / _LARGEST[:, None]
         return cls(T_world_lidar @ exp(step), np.asarray((rows * values) @ rows.T, dtype=np.float64))
+
+    def without(self, direction: FloatArray) -> "MeasuredPose":
+        """The measurement without what it says of a direction (6,) of the error."""
+        along = self.information @ direction
+        total = float(direction @ along)
+        return self if total <= 0.0 else replace(self, information=self.information - np.outer(along, along) / total)

@@ -173,6 +173,11 @@ class Prediction:
         away = log(inverse(self.T_world_lidar) @ T_world_lidar)
         return float(away @ np.linalg.solve(self.covariance[:6, :6], away)) < _GATE
 
+    def is_known_along(self, direction: FloatArray, distance_m: float) -> bool:
+        """Whether it is an IMU's, with no larger standard deviation along a direction (3,) of the world."""
+        along = self.T_world_lidar[:3, :3].T @ direction
+        return self.is_inertial and bool(along @ self.covariance[3:6, 3:6] @ along < distance_m**2)
+
     def held_along(self, direction: FloatArray) -> "Prediction":
         """The prediction with its translation and velocity along a direction (3,) of the world held."""
         along = self.T_world_lidar[:3, :3].T @ direction

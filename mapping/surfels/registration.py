@@ -60,6 +60,15 @@ class Registration:
     iterations: int  # of Gauss-Newton
     matcher: Matcher  # with the correspondences of the keypoints in the finest cells
 
+    def without(self, direction: FloatArray, prediction: Prediction) -> "Registration":
+        """The registration with a prediction held along a direction (3,) of the world: as uncertain as that was."""
+        along = self.T_world_lidar[:3, :3].T @ direction
+        uncertain = np.zeros((12, 2))
+        uncertain[3:6, 0] = uncertain[9:, 1] = along
+        added = uncertain @ (uncertain.T @ prediction.covariance @ uncertain) @ uncertain.T
+        measured = self.measured.without(uncertain[:6, 0])
+        return replace(self, covariance=self.covariance + added, measured=measured)
+
 
 def register(
     sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap, with_velocity: bool, coarse_first: bool = True,

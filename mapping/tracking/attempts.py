@@ -46,8 +46,9 @@ _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
 _CLEARLY_BETTER = 1.1
 # Evidence below which the first sweeps without rings are held along a direction: their strokes seldom cross.
 _STROKES_EVIDENCE = 10.0
-# Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells.
-_HELD_CELLS = 0.5
+# Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
+# kept along a direction that the scan does not constrain, metres.
+_HELD_CELLS, _KNOWN_M = 0.5, 0.3
 
 
 class ScanMatcher:
@@ -218,11 +219,15 @@ class ScanMatcher:
         keypoints = keypoints or self.scan.keypoints
         attempt = self._registered(prediction, start, coarse_first, patient, keypoints)
         # What hardly anything constrains would be estimated from the errors of the normals.
-        evidence, weakest = attempt.fit.evidence, attempt.fit.weakest
-        if self.scan.has_rings or not self._map.is_young or weakest is None or (evidence or 0.0) > _STROKES_EVIDENCE:
+        if attempt.registration is None or attempt.fit.weakest is None:
             return attempt
-        held = start.held_along(np.array(weakest))
-        return self._registered(prediction, held, coarse_first, patient, keypoints)
+        evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
+        if not attempt.fit.is_constrained and start.is_known_along(direction, _KNOWN_M):
+            held = self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
+            return replace(held, registration=held.registration and held.registration.without(direction, start))
+        if self.scan.has_rings or not self._map.is_young or evidence > _STROKES_EVIDENCE:
+            return attempt
+        return self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
 
     def _registered(
         self, prediction: Prediction, start: Prediction, coarse_first: bool, patient: bool, keypoints: Sweep
