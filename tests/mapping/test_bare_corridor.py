@@ -1,15 +1,20 @@
 """A corridor whose length only the faces of a few boxes show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
+from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction
 from lidarslam.mapping.surfels.registration import register
+from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.surfels.stability import constraining_points
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.attempts import measure_fit
+from lidarslam.mapping.tracking.attempts import ScanMatcher, measure_fit
+from lidarslam.mapping.tracking.budget import Budget
 from lidarslam.mapping.tracking.fit import Fit
 
 CELL = 0.1
@@ -109,3 +114,21 @@ def test_a_scan_that_slid_has_no_evidence_of_the_length(corridor: SurfelMap, key
 def test_without_faces_no_pose_has(rng: np.random.Generator) -> None:
     fit = fit_at(0.0, transform_points(inverse(T_TRUE), scene(rng, 3_000, 0)), map_of(scene(rng, 120_000, 0)))
     assert not fit.is_constrained
+
+
+def test_what_nothing_constrains_keeps_the_imus_prediction(rng: np.random.Generator) -> None:
+    """As uncertain as it was, and it is no measurement."""
+    bare = transform_points(inverse(T_TRUE), scene(rng, 3_000, 0))
+    sampled = SampledScan(0.1, CELL, 3.0, Sweep(bare), elevations(bare), Sweep(bare))
+    sigmas = np.array([0.02] * 3 + [0.1, 0.03, 0.03] + [0.1] * 6)
+    start = Prediction(0.1, T_TRUE @ exp([0.0, 0.0, 0.01, 0.0, 0.02, 0.0]), np.zeros(6), np.diag(sigmas**2))
+    last = MotionState(0.0, np.eye(4), np.zeros(6), UNKNOWN_VELOCITY)
+    matcher = ScanMatcher(sampled, last, map_of(scene(rng, 120_000, 0)), MappingConfig(), Budget())
+    found = matcher.register(replace(start, is_inertial=True), coarse_first=False).registration
+    assert found is not None
+    error = log(inverse(T_TRUE) @ found.T_world_lidar)
+    assert np.linalg.norm(error[3:]) < 0.005
+    along = np.concatenate([np.zeros(3), found.T_world_lidar[:3, :3].T @ [1.0, 0.0, 0.0]])
+    assert np.sqrt(along @ found.covariance[:6, :6] @ along) == pytest.approx(0.1, rel=0.05)
+    assert along @ found.measured.information @ along < 10.0
+    assert found.measured.information[4, 4] > 1e4

@@ -331,6 +331,17 @@ def test_a_pose_measured_by_correspondences_alone(rng: np.random.Generator) -> N
     np.testing.assert_allclose(log(inverse(T) @ measured.T_world_lidar), step * [1, 1, 1, 1, 1, 0], atol=1e-9)
 
 
+def test_a_measured_pose_without_a_direction(rng: np.random.Generator) -> None:
+    """The marginal: nothing of the direction, and of others what is left when it is unknown."""
+    root = rng.normal(size=(6, 6))
+    information, direction = root @ root.T + np.eye(6), np.array([0.0, 0.0, 0.0, 0.6, 0.8, 0.0])
+    left = MeasuredPose(np.eye(4), information).without(direction).information
+    np.testing.assert_allclose(left @ direction, 0.0, atol=1e-9)
+    others = np.linalg.svd(direction[None])[2][1:]
+    unknown = np.linalg.inv(information) + 1e9 * np.outer(direction, direction)
+    np.testing.assert_allclose(others @ left @ others.T, np.linalg.inv(others @ unknown @ others.T), rtol=1e-5)
+
+
 def test_another_world_after_tracking_was_lost_has_another_vertical(rng: np.random.Generator) -> None:
     inertial = Inertial(samples(walk, 20.0), T_LIDAR_IMU)
     followed(inertial, 8.0, rng)
