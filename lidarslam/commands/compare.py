@@ -39,8 +39,8 @@ from lidarslam.commands.shared.terminal import EXIT_GATE, EXIT_MENDABLE, note, s
 @click.option(
     "--methods",
     metavar="NAME,...",
-    help="BASE[@VOXEL][+map|+loam][+graph], BASE one of learned, kiss-icp, kiss-icp-no-deskew, constant-velocity "
-    "and prior; or a peer such as ct-icp, kiss-slam, small-gicp (docs/comparison.md lists them).  "
+    help="BASE[@VOXEL][+map|+loam][+graph], BASE one of learned, kiss-icp, kiss-icp-no-deskew, constant-velocity, "
+    "imu, learned+imu and prior; or a peer such as ct-icp, kiss-slam, small-gicp (docs/comparison.md lists them).  "
     "[default: learned+map,kiss-icp, or the benchmark's]",
 )
 @click.option(

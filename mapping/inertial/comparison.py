@@ -67,18 +67,19 @@ class Alignment:
     offset_sigma_s: float
     rotation: FloatArray  # (3,) rotation vector from its axes, as they were given, to the LiDAR's
     rotation_sigma: float  # of its worst axis, radians
+    agrees: bool  # whether turns are the same without these errors; else the poses of some scans are wrong, or the IMU
 
     @property
     def significant_offset_s(self) -> float:
         """The error of the clock where it is clear; else zero."""
         is_clear = abs(self.offset_s) > max(_LEAST_OFFSET_S, _SIGNIFICANT * self.offset_sigma_s)
-        return self.offset_s if is_clear else 0.0
+        return self.offset_s if is_clear and self.agrees else 0.0
 
     @property
     def significant_rotation(self) -> FloatArray:
         """(3,) the rotation where it is clear; else zero."""
         is_clear = np.linalg.norm(self.rotation) > max(_LEAST_ROTATION, _SIGNIFICANT * self.rotation_sigma)
-        return self.rotation if is_clear else np.zeros(3)
+        return self.rotation if is_clear and self.agrees else np.zeros(3)
 
     def corrected(self, T_lidar_imu: FloatArray) -> FloatArray:
         """The extrinsic calibration (4, 4) without an error of the rotation that is clear."""
@@ -171,7 +172,11 @@ class Comparison:
         prior = np.diag(np.array([_CLOCK_S, *3 * [_ROTATION], *3 * [_BIAS]]) ** -2.0)
         x, covariance = _robust_fit(J, a - b, prior, _TURN_ERROR)
         worst = float(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1]))
-        return Alignment(float(x[0]), float(np.sqrt(covariance[0, 0])), x[1:4], worst)
+        remaining = a - b - J @ x
+        agrees = len(rows) >= _FEWEST and bool(
+            (remaining**2).mean() < _TURN_ERROR**2 or _share(remaining, a) < _MOST_REMAINING
+        )
+        return Alignment(float(x[0]), float(np.sqrt(covariance[0, 0])), x[1:4], worst, agrees)
 
     def contradiction(self) -> str | None:
         """What is seen of axes, signs or units that cannot be right; None where nothing is."""
