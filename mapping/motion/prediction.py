@@ -175,8 +175,12 @@ class Prediction:
 
     def is_known_along(self, direction: FloatArray, distance_m: float) -> bool:
         """Whether it is an IMU's, with no larger standard deviation along a direction (3,) of the world."""
+        return self.is_inertial and self.sigma_along(direction) < distance_m
+
+    def sigma_along(self, direction: FloatArray) -> float:
+        """Standard deviation of the position along a direction (3,) of the world, metres."""
         along = self.T_world_lidar[:3, :3].T @ direction
-        return self.is_inertial and bool(along @ self.covariance[3:6, 3:6] @ along < distance_m**2)
+        return float(np.sqrt(along @ self.covariance[3:6, 3:6] @ along))
 
     def held_along(self, direction: FloatArray) -> "Prediction":
         """The prediction with its translation and velocity along a direction (3,) of the world held."""

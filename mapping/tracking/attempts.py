@@ -48,7 +48,9 @@ _CLEARLY_BETTER = 1.1
 _STROKES_EVIDENCE = 10.0
 # Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
 # kept along a direction that the scan does not constrain, metres.
-_HELD_CELLS, _KNOWN_M = 0.5, 0.3
+_HELD_CELLS, _KNOWN_M = 0.5, 2.0
+# Standard deviations of that over which the scan is tried along the direction, and spacing, cells.
+_FOUND_SIGMAS, _FOUND_CELLS = 2.0, 2.0
 
 
 class ScanMatcher:
@@ -223,11 +225,30 @@ class ScanMatcher:
             return attempt
         evidence, direction = attempt.fit.evidence or 0.0, np.array(attempt.fit.weakest)
         if not attempt.fit.is_constrained and start.is_known_along(direction, _KNOWN_M):
+            if (found := self._found_along(prediction, start, direction, keypoints)) is not None:
+                return found
             held = self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
             return replace(held, registration=held.registration and held.registration.without(direction, start))
         if self.scan.has_rings or not self._map.is_young or evidence > _STROKES_EVIDENCE:
             return attempt
         return self._registered(prediction, start.held_along(direction), coarse_first, patient, keypoints)
+
+    def _found_along(
+        self, prediction: Prediction, start: Prediction, direction: FloatArray, keypoints: Sweep
+    ) -> Attempt | None:
+        """The attempt of most evidence from displacements along a direction (3,) that an IMU leaves open, if any."""
+        reach_m, spacing_m = _FOUND_SIGMAS * start.sigma_along(direction), _FOUND_CELLS * self._map.cell_m
+        best = None
+        for steps in range(1, int(reach_m / spacing_m) + 1):
+            for sign in (-1.0, 1.0):
+                if self._budget.is_spent:
+                    return best
+                moved = start.T_world_lidar.copy()
+                moved[:3, 3] += sign * steps * spacing_m * direction
+                found = self._registered(prediction, replace(start, T_world_lidar=moved), False, False, keypoints)
+                if found.fit.is_constrained and (best is None or found.fit.constraint > best.fit.constraint):
+                    best = found
+        return best
 
     def _registered(
         self, prediction: Prediction, start: Prediction, coarse_first: bool, patient: bool, keypoints: Sweep

@@ -91,7 +91,12 @@ class Fit:
     @property
     def is_constrained(self) -> bool:
         """Whether inliers constrain the translation along every direction."""
-        return self.evidence is None or self.evidence > _LEAST_EVIDENCE
+        return self.evidence is None or self.constraint > 1.0
+
+    @property
+    def constraint(self) -> float:
+        """Evidence along the weakest direction, in units of the least that suffices; one where it is unknown."""
+        return 1.0 if self.evidence is None else self.evidence / _LEAST_EVIDENCE
 
     @property
     def inlier_share(self) -> float:
