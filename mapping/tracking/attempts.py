@@ -48,7 +48,7 @@ _CLEARLY_BETTER = 1.1
 _STROKES_EVIDENCE = 10.0
 # Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
 # kept along a direction that the scan does not constrain, metres.
-_HELD_CELLS, _KNOWN_M = 0.5, 2.0
+_HELD_CELLS, _KNOWN_M = 0.5, 0.3
 # Standard deviations of that over which the scan is tried along the direction, and spacing, cells.
 _FOUND_SIGMAS, _FOUND_CELLS = 2.0, 2.0
 
