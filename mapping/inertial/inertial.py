@@ -218,7 +218,8 @@ def _root_of(information: FloatArray) -> FloatArray:
     """(6, 6) square root of a registered pose's information, with the errors that no registration reports."""
     added = np.linalg.solve(np.eye(6) + information * _REGISTRATION**2, information)
     values, vectors = np.linalg.eigh(0.5 * (added + added.T))
-    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, dtype=np.float64)
+    # In the order of a restored array: products would round otherwise.
+    return np.ascontiguousarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, dtype=np.float64)
 
 
 def _sweep(scan: Scan) -> tuple[float, float]:
