@@ -6,6 +6,9 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray
 
+# Median of the specific force's size, m/s^2: what is carried feels gravity on average.
+GRAVITY_RANGE = (7.0, 15.0)
+
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:

@@ -6,14 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.imu import ImuSamples
+from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.core.text.plain_text import count
 from lidarslam.datasets.recording import ImuSummary
 
 _STANDARD_GRAVITY = 9.80665  # m/s^2, the unit g
-# Medians of the specific force's size, in the unit of the recording: what is carried feels about one g on average.
-_IN_G = (0.7, 1.5)
-_IN_SI = (7.0, 15.0)
+_IN_G = (0.7, 1.5)  # as `GRAVITY_RANGE`, of accelerations in g
 # Ranges of sensors begin here: rad/s and m/s^2. A sensor out of its range repeats its largest value so often in a row.
 _LEAST_RANGES, _REPEATED = (1.0, 15.0), 3
 # Share of missing samples that is noted.
@@ -50,7 +48,7 @@ def usable_samples(
     if _IN_G[0] < size < _IN_G[1]:
         force = force * _STANDARD_GRAVITY
         notes = (*notes, f"The IMU's accelerations are in g (median {size:.2f}) and were converted to m/s^2.")
-    elif not _IN_SI[0] < size < _IN_SI[1]:
+    elif not GRAVITY_RANGE[0] < size < GRAVITY_RANGE[1]:
         notes = (*notes, f"The IMU's accelerations have a median of {size:.3g}, which is gravity in no known unit.")
     kept = ~(_saturated(angular_velocities[rows], _LEAST_RANGES[0]) | _saturated(force, _LEAST_RANGES[1]))
     if (saturated := len(kept) - int(kept.sum())) > 0:

@@ -16,7 +16,7 @@ from lidarslam.core.text.trajectory_io import write_tum
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.exports.gnss import read_gnss
 from lidarslam.exports.new_file import require_new
-from lidarslam.exports.projection import Utm, utm_at
+from lidarslam.exports.projection import Utm, utm_around
 from lidarslam.exports.source import read_source
 from lidarslam.mapping.global_map.products.georeference import (
     Georeference,
@@ -54,7 +54,7 @@ def georeference(run: Path) -> GeoRun:
     """
     trajectory, source = read_trajectory(run), read_source(run, "has the GNSS positions")
     track = read_gnss(source.path, source.reader)
-    utm = utm_at(*np.median(track.geodetic[:, :2], axis=0).tolist())
+    utm = utm_around(track.geodetic)
     try:
         placed = align_to_track(trajectory, track, utm.project(track.geodetic), utm.scale)
     except TooFewPositionsError as error:

@@ -34,8 +34,8 @@ class Utm:
         return np.column_stack([latitude, longitude, projected[:, 2]])
 
 
-def utm_at(latitude_deg: float, longitude_deg: float) -> Utm:
-    """The zone of a place.
+def utm_around(geodetic: FloatArray) -> Utm:
+    """The zone of most positions (N, 3): latitude and longitude in degrees, height.
 
     Raises:
         ConfigError: pyproj is not installed.
@@ -44,6 +44,7 @@ def utm_at(latitude_deg: float, longitude_deg: float) -> Utm:
         pyproj: Any = import_module("pyproj")
     except ModuleNotFoundError as error:
         raise ConfigError("georeferenced output needs pyproj; pip install 'lidarslam[geo]'") from error
+    latitude_deg, longitude_deg = np.median(geodetic[:, :2], axis=0).tolist()
     zone = int((longitude_deg + 180.0) // 6.0) % 60 + 1
     epsg = (_NORTH if latitude_deg >= 0.0 else _SOUTH) + zone
     crs = pyproj.CRS.from_epsg(epsg)

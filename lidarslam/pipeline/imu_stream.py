@@ -13,15 +13,19 @@ from lidarslam.core.imu import ImuSamples
 from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Stateful
 from lidarslam.datasets.imu_samples import usable_samples
-from lidarslam.mapping.inertial.comparison import Comparison, MountingError, no_gravity
+from lidarslam.mapping.inertial.comparison import (
+    FEWEST_COMPARED,
+    MOST_CORRECTIONS,
+    Comparison,
+    MountingError,
+    no_gravity,
+)
 from lidarslam.mapping.inertial.inertial import KNOWN_LEVER_M, UNKNOWN_LEVER_M, Inertial
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
-# Samples that are kept, seconds; scans between two comparisons, and turns that one needs.
-_KEPT_S, _EVERY, _FEWEST_TURNS = 6.0, 10, 30
-# Clock and rotation are corrected once the clock is this certain, seconds, and so many times at most.
-_CLOCK_SIGMA_S, _CORRECTIONS = 0.001, 3
+# Samples that are kept, seconds; scans between two comparisons.
+_KEPT_S, _EVERY = 6.0, 10
 _FEWEST_SAMPLES = 3
 # Samples that come too late for this share of the sweeps are a fault.
 _LATE_SHARE, _FEWEST_SWEEPS = 0.2, 20
@@ -47,7 +51,7 @@ class ImuStream(Stateful):
         self._offset_s = 0.0
         self._inertial: Inertial | None = None
         self._comparison: Comparison | None = None
-        self._corrections_left = _CORRECTIONS
+        self._corrections_left = MOST_CORRECTIONS
         self._scans, self._late, self._is_wrong = 0, 0, False
         self._said: set[str] = set()
 
@@ -140,7 +144,7 @@ class ImuStream(Stateful):
             with suppress(MountingError):
                 self._lever_sigma_m = UNKNOWN_LEVER_M
                 self._begin_anew(make_transform(self._comparison.mounting().R_lidar_imu, np.zeros(3)))
-        elif len(self._comparison) >= _FEWEST_TURNS:
+        elif len(self._comparison) >= FEWEST_COMPARED:
             self._align(self._comparison, self._T_lidar_imu)
 
     def _align(self, comparison: Comparison, T_lidar_imu: FloatArray) -> None:
@@ -148,7 +152,7 @@ class ImuStream(Stateful):
         contradiction, found = comparison.contradiction(), comparison.alignment()
         if contradiction is not None:
             self._give_up(contradiction)
-        elif found.offset_sigma_s < _CLOCK_SIGMA_S:
+        elif found.is_certain:
             sentences = found.sentences()
             self._corrections_left = self._corrections_left - 1 if sentences else 0
             for sentence in sentences:

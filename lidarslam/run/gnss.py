@@ -3,8 +3,6 @@
 import logging
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from lidarslam.core.errors import InputError
 from lidarslam.run.request import RunRequest
 
@@ -27,11 +25,11 @@ def gnss_track(request: RunRequest) -> "ProjectedTrack | None":
     if not (request.config.pose_graph.enabled and request.config.pose_graph.gnss):
         return None
     from lidarslam.exports.gnss import read_gnss
-    from lidarslam.exports.projection import utm_at
+    from lidarslam.exports.projection import utm_around
     from lidarslam.mapping.pose_graph.antenna import ProjectedTrack
 
     track = read_gnss(request.source, request.config.reader)
-    utm = utm_at(*np.median(track.geodetic[:, :2], axis=0).tolist())
+    utm = utm_around(track.geodetic)
     return ProjectedTrack(track, utm.project(track.geodetic), utm.scale)
 
 

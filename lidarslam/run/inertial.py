@@ -32,8 +32,8 @@ _INSTEAD = "choose --odometry learned, which needs none"
 _ROTATION = "--set odometry.imu_rotation_deg=[R,P,Y]"
 # Scans that a rotation is looked for in at most, and after how many.
 _MOST_SCANS, _EVERY = 600, 10
-# Scans that clock and rotation are compared in at most, turns at least, and how often. Until the clock is this certain.
-_COMPARED_SCANS, _COMPARED_TURNS, _ALIGNED_TIMES, _CLOCK_SIGMA_S = 60, 30, 3, 0.001
+# Scans that clock and rotation are compared in at most.
+_COMPARED_SCANS = 60
 
 
 def imu_samples(config: Config, recording: Recording) -> ImuSamples | None:
@@ -183,11 +183,13 @@ def _aligned(
     Raises:
         InputError: they show that the samples, or their axes, are something else.
     """
+    from lidarslam.mapping.inertial.comparison import FEWEST_COMPARED, MOST_CORRECTIONS
+
     said: list[str] = []
-    for _ in range(_ALIGNED_TIMES):
+    for _ in range(MOST_CORRECTIONS):
         for comparison in poses.compared(samples, T_lidar_imu, _COMPARED_SCANS):
             found = comparison.alignment()
-            if len(comparison) >= _COMPARED_TURNS and found.offset_sigma_s < _CLOCK_SIGMA_S:
+            if len(comparison) >= FEWEST_COMPARED and found.is_certain:
                 break
         contradiction = comparison.contradiction()
         if contradiction is not None:

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, log, make_transform
-from lidarslam.core.imu import ImuSamples
+from lidarslam.core.imu import GRAVITY_RANGE, ImuSamples
 from lidarslam.mapping.inertial.gyroscope import Gyroscope
 from lidarslam.mapping.inertial.preintegration import Preintegration
 
@@ -27,22 +27,22 @@ _CLOCK_S, _ROTATION, _BIAS = 0.1, np.deg2rad(5.0), 0.1
 _SHIFT_S = 1e-3
 # Errors of clock and rotation are corrected from here on, and by so many deviations.
 _LEAST_OFFSET_S, _LEAST_ROTATION, _SIGNIFICANT = 0.003, np.deg2rad(1.0), 4.0
-# Turns and changes of the velocity that are kept.
-_KEPT = 600
+# Turns and changes of the velocity that are kept; turns that a correction needs, and how often one is made at most.
+_KEPT, FEWEST_COMPARED, MOST_CORRECTIONS = 600, 30, 3
+# The clock is certain to this then, seconds.
+_CLOCK_SIGMA_S = 0.001
 # Turns about an axis are seen where their power is so many times that of errors; axes that agree correlate.
 _CLEAR, _CORRELATED = 100.0, 0.8
 # Accelerations are reversed where their ratio is below this, and zero by so many deviations.
 _REVERSED, _DEVIATIONS = 0.3, 4.0
 _REWEIGHTED = 8
-# Median of the specific force's size: what is carried feels gravity on average, m/s^2.
-_GRAVITY = (7.0, 15.0)
 _AXES = np.array(["x", "y", "z"])
 
 
 def no_gravity(samples: ImuSamples) -> str | None:
     """Why specific forces show no gravity, and cannot be used; None where they do."""
     size = float(np.median(np.linalg.norm(samples.accelerations, axis=1)))
-    if _GRAVITY[0] < size < _GRAVITY[1]:
+    if GRAVITY_RANGE[0] < size < GRAVITY_RANGE[1]:
         return None
     return f"the IMU's accelerations have a median of {size:.3g} m/s^2, which is not gravity"
 
@@ -68,6 +68,11 @@ class Alignment:
     rotation: FloatArray  # (3,) rotation vector from its axes, as they were given, to the LiDAR's
     rotation_sigma: float  # of its worst axis, radians
     agrees: bool  # whether turns are the same without these errors; else the poses of some scans are wrong, or the IMU
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether more turns would hardly change the error of the clock."""
+        return self.offset_sigma_s < _CLOCK_SIGMA_S
 
     @property
     def significant_offset_s(self) -> float:

@@ -90,12 +90,13 @@ class Inertial(Stateful):
         """What is wrong with the IMU, one sentence each."""
         warnings, last = [] if self._disagreement is None else [self._disagreement], self._window.last
         if last is not None:
-            covariance = self._window.covariance()[9:15, 9:15]
+            whole = self._window.covariance()
+            covariance = whole[9:15, 9:15]
             for sensor, part, least, scale, unit in _LARGE_BIASES:
                 size, sigma = np.linalg.norm(last.bias[part]), np.sqrt(np.linalg.eigvalsh(covariance[part, part])[-1])
                 if size > max(least, _DEVIATIONS * sigma):
                     warnings.append(f"the IMU's {sensor} has a bias of {scale * size:.2f} {unit}; estimated, corrected")
-            sigma = np.sqrt(self._window.covariance()[SCALE, SCALE])
+            sigma = np.sqrt(whole[SCALE, SCALE])
             if abs(np.log(last.scale)) > max(_LARGE_SCALE, _DEVIATIONS * sigma):
                 times = f"{last.scale:.2f} times those of the LiDAR's positions"
                 warnings.append(f"the IMU's accelerations are {times}; estimated, corrected")

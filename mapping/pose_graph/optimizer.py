@@ -92,15 +92,15 @@ def optimise(
         gnc.setInlierCostThresholds(0.5 * _INLIER_SIGMAS**2)
         poses = _matrices(gnc.optimize())
         inliers = np.asarray(gnc.getWeights())[len(known_inliers) :] > 0.5
-    kept = [loop for loop, inlier in zip(loops, inliers, strict=False) if inlier]
+    of_loops, of_positions = inliers[: len(loops)], inliers[len(loops) :]
+    kept = [loop for loop, inlier in zip(loops, of_loops, strict=True) if inlier]
     graph = _graph(poses, edges, kept, attitudes, is_placed=bool(positions))
     for loop in kept:
         graph.add(_factor(loop))
-    for position, inlier in zip(positions, inliers[len(loops) :], strict=True):
+    for position, inlier in zip(positions, of_positions, strict=True):
         if inlier:
             graph.add(_position_factor(position, position.repeats))
-    optimised = _matrices(_solve(graph, _values(poses), _CONVERGED))
-    return Optimised(optimised, inliers[: len(loops)], inliers[len(loops) :])
+    return Optimised(_matrices(_solve(graph, _values(poses), _CONVERGED)), of_loops, of_positions)
 
 
 def _graph(

@@ -55,10 +55,22 @@ class Registration:
     # (12, 12) of pose and velocity. The pose's error is `xi` in `T_true = T_world_lidar @ exp(xi)`: rotation first, in
     # the LiDAR frame, as GTSAM has it.
     covariance: FloatArray
-    measured: MeasuredPose  # by the correspondences alone
-    degeneracy: Degeneracy  # the directions along which the prediction was kept
+    solution: "_Solution"  # of the last iteration
+    velocity_error: FloatArray  # (6,) of the predicted velocity
     iterations: int  # of Gauss-Newton
     matcher: Matcher  # with the correspondences of the keypoints in the finest cells
+    held: FloatArray | None = None  # (6,) direction that is not measured, as the prediction was held along it
+
+    @property
+    def degeneracy(self) -> Degeneracy:
+        """The directions along which the prediction was kept."""
+        return self.solution.degeneracy
+
+    @property
+    def measured(self) -> MeasuredPose:
+        """The pose by the correspondences alone."""
+        measured = self.solution.measured(self.T_world_lidar, self.velocity_error)
+        return measured if self.held is None else measured.without(self.held)
 
     def without(self, direction: FloatArray, prediction: Prediction) -> "Registration":
         """The registration with a prediction held along a direction (3,) of the world: as uncertain as that was."""
@@ -66,8 +78,7 @@ class Registration:
         uncertain = np.zeros((12, 2))
         uncertain[3:6, 0] = uncertain[9:, 1] = along
         added = uncertain @ (uncertain.T @ prediction.covariance @ uncertain) @ uncertain.T
-        measured = self.measured.without(uncertain[:6, 0])
-        return replace(self, covariance=self.covariance + added, measured=measured)
+        return replace(self, covariance=self.covariance + added, held=uncertain[:6, 0])
 
 
 def register(
@@ -115,12 +126,10 @@ def register(
                     # An odometry saw the same small surfaces.
                     inflation, unknown, prior = found, prediction.covariance, prior / INFLATION**2
         covariance = solution.covariance(_INFORMATION_SHARE)
-        measured = solution.measured(orthonormalize(T_world_lidar), velocity - prediction.velocity)
     except np.linalg.LinAlgError:  # neither the map nor the prediction constrains the pose
         return None
-    return Registration(
-        orthonormalize(T_world_lidar), velocity, covariance, measured, solution.degeneracy, iterations, matcher
-    )
+    T_world_lidar, error = orthonormalize(T_world_lidar), velocity - prediction.velocity
+    return Registration(T_world_lidar, velocity, covariance, solution, error, iterations, matcher)
 
 
 def with_mean_velocity(
@@ -222,10 +231,8 @@ class _Solution:
 
         The velocity, which bends the sweep, is as uncertain as predicted.
         """
-        H, g = (
-            self._observed.T @ self.hessian @ self._observed,
-            self._observed.T @ (self.gradient + self.hessian @ self.step),
-        )
+        observed = self._observed
+        H, g = observed.T @ self.hessian @ observed, observed.T @ (self.gradient + self.hessian @ self.step)
         known = np.linalg.inv(np.linalg.inv(self.prior)[6:, 6:])
         H[6:, 6:], g[6:] = H[6:, 6:] + known, g[6:] + known @ velocity_error
         gain = np.linalg.solve(H[6:, 6:], H[6:, :6]).T

@@ -138,9 +138,9 @@ class ScanMatcher:
         for cells in _ALONG_CELLS:
             if self._budget.is_spent:
                 break
-            start = near.T_world_lidar.copy()
-            start[:3, 3] += cells * self._map.cell_m * np.array(near.fit.weakest)
-            other = self._attempt(near.prediction, replace(near.prediction, T_world_lidar=start), coarse_first=False)
+            away = cells * self._map.cell_m * np.array(near.fit.weakest)
+            start = replace(near.prediction, T_world_lidar=_displaced(near.T_world_lidar, away))
+            other = self._attempt(near.prediction, start, coarse_first=False)
             away_m = float(np.linalg.norm(other.T_world_lidar[:3, 3] - near.T_world_lidar[:3, 3]))
             if away_m < _MOST_ALONG_CELLS * self._map.cell_m and other.quality > _CLEARLY_BETTER * near.quality:
                 best = max(best, other, key=lambda attempt: attempt.quality)
@@ -243,8 +243,7 @@ class ScanMatcher:
             for sign in (-1.0, 1.0):
                 if self._budget.is_spent:
                     return best
-                moved = start.T_world_lidar.copy()
-                moved[:3, 3] += sign * steps * spacing_m * direction
+                moved = _displaced(start.T_world_lidar, sign * steps * spacing_m * direction)
                 found = self._registered(prediction, replace(start, T_world_lidar=moved), False, False, keypoints)
                 if found.fit.is_constrained and (best is None or found.fit.constraint > best.fit.constraint):
                     best = found
@@ -264,6 +263,13 @@ class ScanMatcher:
         held = start.holds(registration.T_world_lidar, _HELD_CELLS * self._map.cell_m)
         status = fit.status(self._config.tracking, self._map.is_young, held)
         return Attempt(prediction, self._map, registration, fit, status)
+
+
+def _displaced(T_world_lidar: FloatArray, away: FloatArray) -> FloatArray:
+    """A pose (4, 4) displaced by a vector (3,) of the world."""
+    displaced = T_world_lidar.copy()
+    displaced[:3, 3] += away
+    return displaced
 
 
 def measure_fit(

@@ -25,4 +25,4 @@ class MappedScan:
     added: bool = False  # whether the scan is good enough for the map, and was inserted
     # whether the sensor was tracked from the scan before; else it was relocalised, or only predicted
     is_connected: bool = True
-    measured: MeasuredPose | None = None  # by the correspondences alone; None where nothing was registered
+    measured: MeasuredPose | None = None  # by the correspondences alone; None without a registration, or an IMU

@@ -137,7 +137,7 @@ class Tracker(Stateful):
         return MappedScan(
             state=state,
             T_world_predicted=attempt.prediction.T_world_lidar,
-            measured=registration.measured,
+            measured=None if prior.inertial is None else registration.measured,
             registered=True,
             status=status,
             message=message,
