@@ -86,8 +86,7 @@ def register(
         along = degeneracy.part_along()
         observed, known = np.eye(6) - along, np.linalg.inv(predicted.covariance[:6, :6])
         measured = observed.T @ (solution[1] - held) @ observed
-        information = measured + along.T @ known @ along if len(degeneracy) else solution[1]
-        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        covariance = np.asarray(np.linalg.inv(measured + along.T @ known @ along), dtype=np.float64)
     except np.linalg.LinAlgError:  # the correspondences constrain less than they did at the prediction
         return None
     T_world_lidar = orthonormalize(solution[0])

@@ -47,9 +47,7 @@ class ProjectedTrack:
     def positions(self, trajectory: Trajectory, keyframe_scans: Sequence[int]) -> list[AntennaPosition]:
         """The positions within the time of a trajectory (M poses), beside keyframes at some of its scans."""
         stamps, track = trajectory.stamps, self.track
-        rows = np.flatnonzero(
-            (track.stamps >= stamps[0]) & (track.stamps <= stamps[-1]) & np.isfinite(self.projected).all(axis=1)
-        )
+        rows = np.flatnonzero(track.is_within(trajectory, self.projected))
         if not len(rows):
             return []
         scans = np.asarray(keyframe_scans)
@@ -58,8 +56,7 @@ class ProjectedTrack:
         T_keyframe_world = inverse(trajectory.T_world_lidar[scans[keys]])
         antennas = np.einsum("nij,nj->ni", T_keyframe_world, antennas)[:, :3]
         measured = (self.projected[rows] - self.projected[0]) / self.scale
-        epochs = np.unique(track.stamps[rows])  # receivers may state whole seconds, several times each
-        repeats = max(1.0, len(rows) * _CORRELATED_S / max(float(epochs[-1] - epochs[0]), _CORRELATED_S))
+        repeats = max(1.0, len(rows) * _CORRELATED_S / max(float(np.ptp(track.stamps[rows])), _CORRELATED_S))
         stated = np.where(np.isfinite(track.sigma_m[rows]), track.sigma_m[rows], _UNKNOWN_M)
         sigmas = np.maximum(stated, _LEAST_M)[:, None] * np.array([1.0, 1.0, _HEIGHT])
         return [

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform, skew
@@ -29,6 +30,12 @@ class GnssTrack:
     sigma_m: FloatArray  # (N,) horizontal standard deviation as stated; NaN where unknown
     lidar_antenna: FloatArray  # (3,) position of the antenna in the LiDAR frame
     notes: tuple[str, ...] = ()  # remarks, a sentence each
+
+    def is_within(self, trajectory: Trajectory, projected: FloatArray) -> NDArray[np.bool_]:
+        """(N,) which positions are within the time of a trajectory, and finite in the projection (N, 3)."""
+        times = trajectory.stamps
+        during = (self.stamps >= times[0]) & (self.stamps <= times[-1])
+        return np.asarray(during & np.isfinite(projected).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +69,7 @@ def align_to_track(trajectory: Trajectory, track: GnssTrack, projected: FloatArr
     Raises:
         TooFewPositionsError: fewer than five are within the time of the trajectory.
     """
-    within = (track.stamps >= trajectory.stamps[0]) & (track.stamps <= trajectory.stamps[-1])
-    within &= np.isfinite(projected).all(axis=1)
+    within = track.is_within(trajectory, projected)
     if within.sum() < _FEWEST:
         count = int(within.sum())
         raise TooFewPositionsError(f"{count} GNSS positions are within the time of the run, expected {_FEWEST} or more")
