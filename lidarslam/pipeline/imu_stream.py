@@ -62,7 +62,7 @@ class ImuStream(Stateful):
 
     @property
     def offset_s(self) -> float:
-        """The samples' stamps were found to be late by so much."""
+        """The estimated delay of the samples' stamps, seconds."""
         return self._offset_s
 
     @property

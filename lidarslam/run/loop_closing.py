@@ -77,7 +77,7 @@ def begin_graph(
         ConfigError: it asks for GNSS positions where none are taken.
     """
     if config.pose_graph.gnss and not takes_gnss:
-        raise ConfigError("pose_graph.gnss is of lidarslam run alone")
+        raise ConfigError("pose_graph.gnss is available in lidarslam run only; leave it out here")
     if not config.pose_graph.enabled:
         return None
     from lidarslam.mapping.pose_graph.slam_graph import SlamGraph

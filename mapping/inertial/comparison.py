@@ -40,7 +40,7 @@ _AXES = np.array(["x", "y", "z"])
 
 
 def no_gravity(samples: ImuSamples) -> str | None:
-    """Why specific forces show no gravity, and cannot be used; None where they do."""
+    """Why the specific forces cannot contain gravity; None where they do."""
     size = float(np.median(np.linalg.norm(samples.accelerations, axis=1)))
     if GRAVITY_RANGE[0] < size < GRAVITY_RANGE[1]:
         return None
@@ -67,7 +67,7 @@ class Alignment:
     offset_sigma_s: float
     rotation: FloatArray  # (3,) rotation vector from its axes, as they were given, to the LiDAR's
     rotation_sigma: float  # of its worst axis, radians
-    agrees: bool  # whether turns are the same without these errors; else the poses of some scans are wrong, or the IMU
+    agrees: bool  # whether the turns agree after the correction; else some poses are wrong, or the IMU
 
     @property
     def is_certain(self) -> bool:

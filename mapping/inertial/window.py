@@ -2,8 +2,8 @@
 
 A square-root information smoother: the factors are GTSAM's, the oldest state is marginalised (Dong-Si and Mourikis,
 ICRA 2011; Leutenegger et al., IJRR 2015). The world's pose in a levelled frame is part of the state: its tilt is the
-direction of gravity. So are the lever arm, and the scale of the accelerations, beside gravity, against the LiDAR's
-positions.
+direction of gravity. So are the lever arm, and the ratio of the measured accelerations, without gravity, to those of
+the LiDAR's positions.
 """
 
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ class Knot:
     bias: Annotated[FloatArray, Shape(6)]  # (6,) of accelerometer, m/s^2, and gyroscope, rad/s
     T_nav_world: Annotated[FloatArray, TRANSFORM]  # (4, 4)
     integrated_at: Annotated[FloatArray, Shape(6)]  # (6,) bias at which samples since the last are integrated
-    scale: float  # accelerations, beside gravity, are so many times those of the LiDAR's positions
+    scale: float  # ratio of the measured accelerations, without gravity, to those of the LiDAR's positions
     lever: Annotated[FloatArray, Shape(3)]  # (3,) position of the IMU in the LiDAR frame, whose axes are the IMU's, too
     T_world_lidar: Annotated[FloatArray, TRANSFORM]  # (4, 4) as registered
     sqrt_information: Annotated[FloatArray, Shape(6, 6)]  # of the registration; zero where there was none
@@ -128,7 +128,7 @@ class InertialWindow(Stateful):
     ) -> None:
         """Begin at a registered pose (4, 4), with the specific force (3,) there; the calibration stays.
 
-        Gravity stays where the world is level as before; it may be another world where the sensor was lost for long.
+        With `is_level`, so does the tilt of the world; after a long loss of tracking, the map may have begun anew.
         """
         last, sigmas = self.last, np.full(_SIZE, np.inf)
         sigmas[_VELOCITY], sigmas[9:12], sigmas[12:15], sigmas[_WORLD] = _SPEED, _FORCE_BIAS, _RATE_BIAS, _TILT
@@ -208,7 +208,7 @@ class InertialWindow(Stateful):
     def _between_rows(self, first: Knot, second: Knot) -> FloatArray:
         """Whitened rows `[first | second | b]` (25, 51) of the IMU between two knots, and the walk of gravity.
 
-        In positions and velocities that are scaled, accelerations are the measured ones.
+        Positions and velocities are scaled, so that their accelerations are the measured ones.
         """
         values, scaled = gtsam.Values(), [_scaled(knot, first) for knot in (first, second)]
         for n, (knot, (pose, velocity)) in enumerate(zip((first, second), scaled, strict=True)):
@@ -238,7 +238,7 @@ class InertialWindow(Stateful):
 
 
 def _scaled(knot: Knot, origin: Knot) -> tuple[gtsam.Pose3, FloatArray]:
-    """Pose and velocity about the position of another knot, in lengths of the accelerometer."""
+    """Pose relative to the position of another knot, and velocity, both scaled to the measured accelerations."""
     T = knot.T_nav_imu.copy()
     T[:3, 3] = origin.scale * (T[:3, 3] - origin.T_nav_imu[:3, 3])
     return gtsam.Pose3(T), origin.scale * knot.velocity

@@ -1,4 +1,4 @@
-"""What correspondences alone measured of a pose, without a prediction."""
+"""The pose that correspondences alone measure, without the prediction."""
 
 from dataclasses import dataclass, replace
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp
 
-# A direction of less information is not measured: standard deviations of rotation, radians, and translation, metres.
+# Directions with larger standard deviations are not measured: rotation, radians, and translation, metres.
 _LARGEST = np.array([0.1] * 3 + [1.0] * 3)
 
 
@@ -14,7 +14,7 @@ _LARGEST = np.array([0.1] * 3 + [1.0] * 3)
 class MeasuredPose:
     """A pose, and the information of its error `xi` in `T_true = T_world_lidar @ exp(xi)`, rotation first."""
 
-    T_world_lidar: FloatArray  # (4, 4); along directions that are not measured, any
+    T_world_lidar: FloatArray  # (4, 4); arbitrary along directions that are not measured
     information: FloatArray  # (6, 6), zero along directions that are not measured
 
     @classmethod
@@ -27,7 +27,7 @@ class MeasuredPose:
         return cls(T_world_lidar @ exp(step), np.asarray((rows * values) @ rows.T, dtype=np.float64))
 
     def without(self, direction: FloatArray) -> "MeasuredPose":
-        """The measurement without what it says of a direction (6,) of the error."""
+        """The measurement, marginalised over a direction (6,) of the error."""
         along = self.information @ direction
         total = float(direction @ along)
         return self if total <= 0.0 else replace(self, information=self.information - np.outer(along, along) / total)

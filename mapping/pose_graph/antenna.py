@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.global_map.products.georeference import GnssTrack, align_to_track
 
-# Errors of GNSS repeat over this time, seconds: positions within it count as one.
+# Errors of GNSS are correlated over this time, seconds: positions within it count as one.
 _CORRELATED_S = 10.0
 # Standard deviations, metres: where none is stated, and at least. That of the height is larger by the factor.
 _UNKNOWN_M, _LEAST_M, _HEIGHT = 3.0, 0.02, 2.0
@@ -17,13 +17,13 @@ _UNKNOWN_M, _LEAST_M, _HEIGHT = 3.0, 0.02, 2.0
 
 @dataclass(frozen=True, eq=False)
 class AntennaPosition:
-    """A measured position, beside the keyframe that is nearest in time."""
+    """A measured position, assigned to the keyframe nearest in time."""
 
     key: int
-    antenna: FloatArray  # (3,) in the keyframe, by the registered motion since
+    antenna: FloatArray  # (3,) in the keyframe's LiDAR frame, by the registered motion between both
     measured: FloatArray  # (3,) x east, y north, z up, metres
     sigmas: FloatArray  # (3,) metres
-    repeats: float  # how many positions have an error in common
+    repeats: float  # number of positions whose errors are correlated
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class ProjectedTrack:
         return T
 
     def positions(self, trajectory: Trajectory, keyframe_scans: Sequence[int]) -> list[AntennaPosition]:
-        """The positions within the time of a trajectory (M poses), beside keyframes at some of its scans."""
+        """The positions within the time of a trajectory (M poses), assigned to the keyframes among its scans."""
         stamps, track = trajectory.stamps, self.track
         rows = np.flatnonzero(track.is_within(trajectory, self.projected))
         if not len(rows):

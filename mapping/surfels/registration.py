@@ -73,7 +73,7 @@ class Registration:
         return measured if self.held is None else measured.without(self.held)
 
     def without(self, direction: FloatArray, prediction: Prediction) -> "Registration":
-        """The registration with a prediction held along a direction (3,) of the world: as uncertain as that was."""
+        """The registration, after holding a prediction along a direction (3,) of the world, with its uncertainty."""
         along = self.T_world_lidar[:3, :3].T @ direction
         uncertain = np.zeros((12, 2))
         uncertain[3:6, 0] = uncertain[9:, 1] = along
@@ -227,9 +227,9 @@ class _Solution:
         return np.asarray(np.linalg.inv(share * observed.T @ self.hessian @ observed + self.prior), dtype=np.float64)
 
     def measured(self, T_world_lidar: FloatArray, velocity_error: FloatArray) -> MeasuredPose:
-        """What the correspondences alone measured, at the pose (4, 4) and the velocity's error (6,) after the step.
+        """The pose by the correspondences alone, from the pose (4, 4) and the velocity's error (6,) after the step.
 
-        The velocity, which bends the sweep, is as uncertain as predicted.
+        The velocity during the sweep is marginalised, with the uncertainty of its prediction.
         """
         observed = self._observed
         H, g = observed.T @ self.hessian @ observed, observed.T @ (self.gradient + self.hessian @ self.step)

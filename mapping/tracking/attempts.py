@@ -49,7 +49,7 @@ _STROKES_EVIDENCE = 10.0
 # Standard deviation to which an IMU has to predict a position that needs no support by the scan, cells, and one that is
 # kept along a direction that the scan does not constrain, metres.
 _HELD_CELLS, _KNOWN_M = 0.5, 0.3
-# Standard deviations of that over which the scan is tried along the direction, and spacing, cells.
+# Reach of the displaced starts along that direction in standard deviations, and their spacing in cells.
 _FOUND_SIGMAS, _FOUND_CELLS = 2.0, 2.0
 
 
@@ -236,7 +236,10 @@ class ScanMatcher:
     def _found_along(
         self, prediction: Prediction, start: Prediction, direction: FloatArray, keypoints: Sweep
     ) -> Attempt | None:
-        """The attempt of most evidence from displacements along a direction (3,) that an IMU leaves open, if any."""
+        """The best constrained attempt from starts displaced along a direction (3,), within the IMU's uncertainty.
+
+        None where no attempt is constrained.
+        """
         reach_m, spacing_m = _FOUND_SIGMAS * start.sigma_along(direction), _FOUND_CELLS * self._map.cell_m
         best = None
         for steps in range(1, int(reach_m / spacing_m) + 1):

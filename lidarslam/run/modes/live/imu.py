@@ -70,7 +70,7 @@ class ImuReceiver:
         self._thread.join()
 
     def wait_for(self, stamp: float) -> None:
-        """Wait for the sample at a stamp on the clock of the scans, a moment at most beside a clock that is late."""
+        """Wait for the sample at a stamp of the scans' clock, for 50 ms and the delay of the IMU's clock at most."""
         late_s = self._stream.offset_s
         end = time.monotonic() + _PATIENCE_S + max(0.0, late_s)
         while self._stream.last_s - late_s < stamp and time.monotonic() < end:
@@ -97,6 +97,6 @@ class ImuReceiver:
             self.frame_id = self.frame_id or frame_id
 
     def _is_stray(self, stamp: float) -> bool:
-        """Whether a stamp is far ahead of the last one, and few such have come: a single one would stop all others."""
+        """Whether a stamp is an outlier, far ahead of the last one; several in a row are a new time."""
         self._strays = self._strays + 1 if stamp > self._stream.last_s + _FAR_S else 0
         return np.isfinite(self._stream.last_s) and 0 < self._strays < _STRAYS
