@@ -181,7 +181,7 @@ class SlamGraph(KeyframeGraph):
     def _placed(
         self, poses: FloatArray, loops: Sequence[LoopClosure], stamps: FloatArray, track: ProjectedTrack
     ) -> Optimised:
-        """Optimise the keyframes' poses (K, 4, 4) in the projection, with GNSS positions; the result is of the world."""
+        """Optimise the keyframes' poses (K, 4, 4) in the projection, with GNSS positions; the result is of the run."""
         scans = [keyframe.scan for keyframe in self.keyframes]
         registered = Trajectory(stamps, np.array(self.scan_poses))
         T_world_lidar = corrected_recordings(registered.T_world_lidar, np.array([0]), np.array(scans), poses)
