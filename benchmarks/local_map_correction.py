@@ -39,7 +39,7 @@ from lidarslam.mapping.config import MappingConfig, PoseGraphConfig
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import ScanToMap
@@ -82,7 +82,7 @@ class _Graph(SlamGraph):
         return np.asarray(laid[-1][key] @ inverse(self.scan_poses[keys[key]]) @ T)
 
 
-class _Mapper(SurfelMapper):
+class _Mapper(Mapper):
     def redraw(self, drawn: SurfelMap, scans: int) -> bool:
         started = time.thread_time()
         done = super().redraw(drawn, scans)

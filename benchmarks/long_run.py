@@ -46,7 +46,7 @@ from lidarslam.evaluation.trajectory.metrics import TrajectoryMetrics, evaluate_
 from lidarslam.mapping.config import GlobalMapConfig, PoseGraphConfig
 from lidarslam.mapping.global_map.tile_store import TileStore
 from lidarslam.mapping.pose_graph.slam_graph import SlamGraph
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.localisation import make_localiser
@@ -132,7 +132,7 @@ def run(options: argparse.Namespace, scans: Iterator[Scan], truth: Trajectory) -
         pose_graph=PoseGraphConfig(enabled=True),
     )
     localiser = make_localiser(config)
-    mapper = localiser.surfel_mapper
+    mapper = localiser.mapper
     assert mapper is not None
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
@@ -157,7 +157,7 @@ def _rows(
     scans: Iterator[Scan],
     truth: Trajectory,
     pipeline: Pipeline,
-    mapper: SurfelMapper,
+    mapper: Mapper,
     log: ScanLog,
     graph: SlamGraph,
     checkpoints: TimedCheckpoints,

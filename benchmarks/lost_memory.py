@@ -23,7 +23,7 @@ from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline import free_memory
 from lidarslam.pipeline.localisation import ScanToMap
@@ -58,7 +58,7 @@ def watch(scans: int, points: int, lost_every: int | None, every: int) -> list[t
     """Run, and print a row now and then; scans and megabytes of each."""
     config = without_odometry(MappingConfig())
     config = config.model_copy(update={"global_map": config.global_map.model_copy(update={"voxel_size_m": _VOXEL_M})})
-    mapper = SurfelMapper(config.mapping)  # as `lidarslam run` makes it, but in reach
+    mapper = Mapper(config.mapping)  # as `lidarslam run` makes it, but in reach
     pipeline = Pipeline(make_odometry(config.odometry), ScanToMap(mapper), config.global_map)
     log, samples = ScanLog(), []
     lost = begun = 0

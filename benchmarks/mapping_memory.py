@@ -26,7 +26,7 @@ from mapping_accuracy import make_simulation, print_row, without_odometry
 from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import ScanToMap
@@ -57,7 +57,7 @@ class Sample:
 def watch(simulation: Simulation, every: int) -> list[Sample]:
     """Run, and print a row now and then."""
     config = without_odometry(MappingConfig())
-    mapper = SurfelMapper(config.mapping)  # as `lidarslam run` makes it, but in reach
+    mapper = Mapper(config.mapping)  # as `lidarslam run` makes it, but in reach
     samples: list[Sample] = []
     with ExitStack() as stack:
         directory = stack.enter_context(RunDirectory.create(Path(stack.enter_context(TemporaryDirectory()))))
@@ -74,7 +74,7 @@ def _follow(
     simulation: Simulation,
     every: int,
     pipeline: Pipeline,
-    mapper: SurfelMapper,
+    mapper: Mapper,
     log: ScanLog,
     unfinished: Unfinished,
     samples: list[Sample],

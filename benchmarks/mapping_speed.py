@@ -49,18 +49,18 @@ from lidarslam.mapping.loam.mapper import LoamMapper
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels import sampling
 from lidarslam.mapping.tracking import attempts
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.scan_stream import in_order
 
 # Method -> its mapper, and stage -> what is timed for it: the object that holds the function, and its name there.
-_MAPPERS: dict[str, type[SurfelMapper | LoamMapper]] = {"surfels": SurfelMapper, "loam": LoamMapper}
+_MAPPERS: dict[str, type[Mapper | LoamMapper]] = {"surfels": Mapper, "loam": LoamMapper}
 _STAGES: dict[str, dict[str, tuple[Any, str]]] = {
     "surfels": {
         "thin": (sampling.Sampler, "sample"),
         "registration": (attempts, "register"),
         "fit": (attempts, "measure_fit"),
-        "map update": (SurfelMapper, "_insert"),
-        "rest": (SurfelMapper, "process"),
+        "map update": (Mapper, "_insert"),
+        "rest": (Mapper, "process"),
     },
     "loam": {
         "features": (loam_mapper, "extract_features"),

@@ -26,9 +26,9 @@ from lidarslam.core.geometry import inverse
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfels.registration import register
+from lidarslam.mapping.registration.registration import register
 from lidarslam.mapping.tracking import attempts
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.recorder import Simulation
 
 # World, sensor, carrier.
@@ -59,7 +59,7 @@ def rows(fault: str, place: str, faulty: Faulty, budgets_ms: list[float]) -> Ite
             registration_ms.append(1e3 * (time.thread_time() - started))  # noqa: B023
             return result
 
-        mapper = SurfelMapper(MappingConfig(budget_ms=budget_ms or None), clock=time.thread_time)
+        mapper = Mapper(MappingConfig(budget_ms=budget_ms or None), clock=time.thread_time)
         results, ms = [], []
         with patch.object(attempts, "register", timed):
             for scan in faulty.scans:

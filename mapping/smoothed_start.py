@@ -14,7 +14,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
     from lidarslam.mapping.inertial.inertial import Inertial
@@ -57,7 +57,7 @@ class _Tracking:
     """A mapper, with an IMU where there is one."""
 
     def __init__(self, config: MappingConfig, inertial: "Inertial | None") -> None:
-        self._mapper, self._inertial = SurfelMapper(config), inertial
+        self._mapper, self._inertial = Mapper(config), inertial
         self.results: list[MappedScan] = []
         self.has_rings = True
 

@@ -12,7 +12,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity, deskew
 from lidarslam.mapping.motion.prediction import GravityDirection
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
-from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.odometry.interface import Motion
 
 STAGES = ("read", "odometry", "refine", "check", "deskew", "map")

@@ -14,10 +14,10 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.motion.prediction import GravityDirection, Prior
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.smoothed_start import SmoothedMotion
-from lidarslam.mapping.surfels.sampling import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import Motion
 from lidarslam.odometry.methods.consistency import Consistency, ConsistencyCheck
 from lidarslam.pipeline.estimates import Estimated, Localised, SweepMotion
@@ -27,8 +27,8 @@ class Localiser(Protocol):
     """Estimates the pose of one scan after the other."""
 
     @property
-    def surfel_mapper(self) -> SurfelMapper | None:
-        """The mapper whose local map may be drawn anew; None without such a map."""
+    def mapper(self) -> Mapper | None:
+        """The scan-to-map registration with a map of its own; None without one."""
 
     def sample(self, scan: Scan) -> SampledScan | None:
         """What can be computed of the next scan ahead of its pose, on another thread; None where nothing can."""
@@ -43,11 +43,11 @@ class Localiser(Protocol):
         """Go on from a state, before the first scan."""
 
 
-class Mapper(Protocol):
-    """A scan-to-map registration with a map of its own."""
+class ScanMapper(Protocol):
+    """A scan-to-map registration: with a local map, or in a map that is given."""
 
     def process(self, scan: Scan, prior: Prior) -> MappedScan:
-        """Register the next scan to the map, and insert it."""
+        """Register the next scan to the map."""
 
     def state(self) -> State:
         """What it carries from scan to scan, the map included."""
@@ -82,7 +82,7 @@ class OdometryAlone(Stateful):
     _check: ConsistencyCheck
     _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
 
-    surfel_mapper: ClassVar[None] = None
+    mapper: ClassVar[None] = None
 
     def __init__(self, check: ConsistencyCheck) -> None:
         self._check = check
@@ -125,7 +125,7 @@ class ScanToMap(Stateful):
         start: motions of the first scans, by stamp, that replace those of the odometry in the prior.
     """
 
-    _mapper: Mapper
+    _mapper: ScanMapper
     _inertial: InertialPrediction | None
     _elevation: ElevationEstimator | None
     _T_odom_lidar: Annotated[FloatArray, TRANSFORM]
@@ -133,7 +133,7 @@ class ScanToMap(Stateful):
 
     def __init__(
         self,
-        mapper: Mapper,
+        mapper: ScanMapper,
         inertial: InertialPrediction | None = None,
         elevation: ElevationEstimator | None = None,
         start: Mapping[float, SmoothedMotion] | None = None,
@@ -146,13 +146,13 @@ class ScanToMap(Stateful):
         self._T_world_last = np.eye(4)
 
     @property
-    def surfel_mapper(self) -> SurfelMapper | None:
-        """The mapper, where it has surfels; see `Localiser`."""
-        return self._mapper if isinstance(self._mapper, SurfelMapper) else None
+    def mapper(self) -> Mapper | None:
+        """The mapper, unless the map is given; see `Localiser`."""
+        return self._mapper if isinstance(self._mapper, Mapper) else None
 
     def sample(self, scan: Scan) -> SampledScan | None:
-        """The points that surfels are made from; see `Localiser`."""
-        return None if self.surfel_mapper is None else self.surfel_mapper.sample(scan)
+        """The points that are registered and inserted; see `Localiser`."""
+        return None if self.mapper is None else self.mapper.sample(scan)
 
     def localise(self, estimated: Estimated, following: Estimated | None) -> Localised:
         """Refine the odometry's pose; where it measured nothing, the mapper predicts with the last velocity."""
@@ -161,10 +161,10 @@ class ScanToMap(Stateful):
         prior = self._prior(estimated, following)
         if self._inertial is not None:
             prior = self._inertial.prior(estimated.scan, prior)
-        if self.surfel_mapper is None or estimated.sampled is None:
+        if self.mapper is None or estimated.sampled is None:
             mapped = self._mapper.process(estimated.scan, prior)
         else:
-            mapped = self.surfel_mapper.process_sampled(estimated.sampled, prior)
+            mapped = self.mapper.process_sampled(estimated.sampled, prior)
             if self._elevation is not None:
                 self._elevation.add(estimated.sampled, mapped)
         if self._inertial is not None:
@@ -187,7 +187,7 @@ class ScanToMap(Stateful):
             stage_ms={"refine": estimated.stage_ms.get("refine", 0.0) + 1e3 * (time.perf_counter() - started)},
             is_connected=mapped.is_connected,
             gravity=None if self._inertial is None else self._inertial.direction,
-            cell_m=None if self.surfel_mapper is None else self.surfel_mapper.cell_m,
+            cell_m=None if self.mapper is None else self.mapper.cell_m,
         )
 
     def _prior(self, estimated: Estimated, following: Estimated | None) -> Prior:
@@ -224,10 +224,7 @@ def make_localiser(
     """
     if config.mapping.method == "off":
         return OdometryAlone(ConsistencyCheck())
-    if config.mapping.method == "loam":
-        from lidarslam.mapping.loam.mapper import LoamMapper  # loads Open3D
-
-        return ScanToMap(LoamMapper(config.mapping), inertial)
-    corrects = config.pose_graph.enabled and config.pose_graph.corrects_local_map
-    mapper = SurfelMapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0)
-    return ScanToMap(mapper, inertial, elevation, start)
+    is_surfels = config.mapping.method == "surfels"
+    corrects = is_surfels and config.pose_graph.enabled and config.pose_graph.corrects_local_map
+    mapper = Mapper(config.mapping, kept_scans=SCANS_LATER if corrects else 0)
+    return ScanToMap(mapper, inertial, elevation if is_surfels else None, start)

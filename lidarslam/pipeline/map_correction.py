@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from lidarslam.core.state.stateful import State, Stateful
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class MapCorrection(Stateful):
     _followed: int  # scans that the graph was given
     _waiting: list[DrawnMap]
 
-    def __init__(self, mapper: SurfelMapper) -> None:
+    def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
         self._registered = self._followed = 0
         self._waiting = []

@@ -67,9 +67,9 @@ def _surfels() -> None:
     from lidarslam.mapping.config import MappingConfig
     from lidarslam.mapping.motion.prediction import Prior
     from lidarslam.mapping.surfels.grid import SurfelGrid
-    from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+    from lidarslam.mapping.tracking.mapper import Mapper
 
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     for scan in made_up_scans():
         mapper.process(scan, Prior(_STEP, None))
     grid, points = SurfelGrid(0.5), made_up_scans()[0].points
@@ -79,10 +79,10 @@ def _surfels() -> None:
 
 def _loam() -> None:
     from lidarslam.mapping.config import MappingConfig
-    from lidarslam.mapping.loam.mapper import LoamMapper
     from lidarslam.mapping.motion.prediction import Prior
+    from lidarslam.mapping.tracking.mapper import Mapper
 
-    mapper = LoamMapper(MappingConfig(method="loam"))
+    mapper = Mapper(MappingConfig(method="loam"))
     for scan in made_up_scans():
         mapper.process(scan, Prior(_STEP, None))
 
@@ -124,8 +124,9 @@ class Part:
 PARTS = {
     "surfels": Part(
         _surfels,
-        tuple(
-            f"mapping.surfels.{kind}_kernels" for kind in ("hash", "cell", "correspondence", "linear", "side", "surfel")
+        (
+            *(f"mapping.surfels.{kind}_kernels" for kind in ("hash", "cell", "correspondence", "side", "surfel")),
+            "mapping.registration.linear_kernels",
         ),
     ),
     "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),

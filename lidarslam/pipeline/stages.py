@@ -52,7 +52,7 @@ class Stages(Stateful):
         self._localiser = localiser
         self._graph = graph
         self._graph_worker = BackgroundWorker("graph", _GRAPH_CALLS_BEHIND)
-        mapper = localiser.surfel_mapper
+        mapper = localiser.mapper
         self._correction = None if graph is None or mapper is None or not mapper.kept_scans else MapCorrection(mapper)
         self._measured_stamp = None
         self.map = MapBuilder(config, store)
@@ -87,7 +87,7 @@ class Stages(Stateful):
         self.map.add(thinned, points, localised)
         if self._graph is not None:
             arrived = graph_scan(estimated, localised, points)
-            drawing = self._graph_worker.submit(_follow, self._graph, arrived, localised.cell_m)
+            drawing = self._graph_worker.submit(_follow, self._graph, arrived, localised.cell_m if self._correction else None)
             if self._correction is not None:
                 self._correction.add(drawing)
         stage_ms = {"deskew": _ms(started, deskewed), "map": _ms(deskewed, time.perf_counter())}

@@ -15,7 +15,7 @@ from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.run.request import RunRequest
 
 # An error is certain beyond so many standard deviations.
@@ -80,7 +80,7 @@ def with_elevations(
         return request, recording
     phase("estimating the error of the elevations")
     estimator = ElevationEstimator()
-    mapper = SurfelMapper(request.config.mapping.model_copy(update={"budget_ms": None}))
+    mapper = Mapper(request.config.mapping.model_copy(update={"budget_ms": None}))
     with suppress(InputError):  # raised again when the scans are read
         for scan in take_in(recording, range(chosen.start, chosen.stop)[:_MOST_SCANS], Faults()):
             sampled = mapper.sample(scan)

@@ -18,7 +18,7 @@ from lidarslam.datasets.mounting.recording import recorded_axes
 from lidarslam.datasets.mounting.rotation import transform_of
 from lidarslam.datasets.recording import Recording
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.config import OdometryConfig
 
 if TYPE_CHECKING:  # GTSAM takes a while to load
@@ -124,7 +124,7 @@ class _Poses:
 
     def __init__(self, config: Config, recording: Recording, chosen: range) -> None:
         self._scans = take_in(recording, chosen, Faults())
-        self._mapper = SurfelMapper(config.mapping.model_copy(update={"budget_ms": None}))
+        self._mapper = Mapper(config.mapping.model_copy(update={"budget_ms": None}))
         self._poses: list[tuple[float, FloatArray, bool]] = []
 
     def compared(self, samples: ImuSamples, T_lidar_imu: FloatArray, most: int) -> "Iterator[Comparison]":

@@ -27,7 +27,7 @@ from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
 from lidarslam.pipeline.estimates import ScanResult
-from lidarslam.pipeline.localisation import Localiser, Mapper, ScanToMap, make_localiser
+from lidarslam.pipeline.localisation import Localiser, ScanMapper, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
 from lidarslam.pipeline.scan_stream import prefetch
 from lidarslam.run.checkpoints import Checkpoints
@@ -88,7 +88,7 @@ def track(
     viewer: Viewer,
     progress: Progress,
     unfinished: Unfinished | None = None,
-    mapper: Mapper | None = None,
+    mapper: ScanMapper | None = None,
 ) -> Tracked:
     """Take the chosen scans of a recording through the pipeline.
 

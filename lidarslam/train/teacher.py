@@ -10,7 +10,7 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.training.preparation import PreparedRecording
 
 
@@ -18,7 +18,7 @@ class MapTeacher:
     """Registers a recording at constant velocity, scan after scan."""
 
     def __init__(self) -> None:
-        self._mapper = SurfelMapper(MappingConfig())
+        self._mapper = Mapper(MappingConfig())
         self._T_world_middle: list[FloatArray] = []
         self._is_ok: list[bool] = []
 

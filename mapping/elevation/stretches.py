@@ -9,7 +9,7 @@ from lidarslam.core.geometry import FloatArray, transform_points
 from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.elevation.bias import ElevationBias, PlacedPoints, combined, estimate_bias
-from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarslam.core.geometry import FloatArray, inverse, rotation_angle, transform_points
-from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 
 # A scan is kept after so much way, in median ranges, or such a turn. The latest are kept.
 _APART_RANGES, _APART_RAD = 0.25, np.deg2rad(30.0)

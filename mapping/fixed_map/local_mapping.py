@@ -7,9 +7,9 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.mapping.tracking.tracking_state import GIVE_UP_AFTER
 
 # Scans until the first search of the whole map, growth of the intervals, and the longest; and between nearby searches.
@@ -31,7 +31,7 @@ class LocalMapping:
         self.kept = KeptScans()
         self.poses: dict[int, FloatArray] = {}  # (4, 4) in the local frame, by the number of the scan
         self._followed: list[int] = []  # numbers of the scans that the latest one follows without a break
-        self._mapper = SurfelMapper(config)
+        self._mapper = Mapper(config)
         self._first = first
         self._count = self._lost = 0
         self._next_search, self._wait = _FIRST_SEARCH, float(_FIRST_SEARCH)

@@ -19,7 +19,8 @@ from lidarslam.mapping.fixed_map.local_mapping import LocalMapping
 from lidarslam.mapping.fixed_map.place_search import Place, PlaceSearch, Search
 from lidarslam.mapping.fixed_map.regions import Regions
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, MotionState, Prediction, Prior
-from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.surfels.sampling import SurfelSampler
 from lidarslam.mapping.tracking.fit import Fit
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 from lidarslam.mapping.tracking.pose_status import NOT_CONFIRMED
@@ -59,7 +60,7 @@ class MapLocaliser(Stateful):
     ) -> None:
         self._config = config
         self._map = fixed_map
-        self._sampler = Sampler(config)
+        self._sampler = SurfelSampler(config)
         self._search = PlaceSearch(fixed_map, config.max_range_m)
         self._local: LocalMapping | None = LocalMapping(config, None)
         self._guess = guess

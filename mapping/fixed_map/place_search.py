@@ -14,7 +14,7 @@ from lidarslam.mapping.fixed_map.kept_scans import KeptScan, KeptScans
 from lidarslam.mapping.fixed_map.regions import Regions
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.surfels.registration import Registration, register
+from lidarslam.mapping.registration.registration import Registration, register
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.attempts import measure_fit
 from lidarslam.mapping.tracking.birds_eye_map import levelling

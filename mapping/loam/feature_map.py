@@ -1,130 +1,191 @@
-"""Map of feature points, searched by Open3D, and the lines and planes that features correspond to."""
+"""Map of edge and planar features: a centroid a voxel, in several sizes, and the lines and planes through them."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Shape, Stateful
-from lidarslam.mapping.loam.neighbour_kernels import write_principal_axes
-from lidarslam.mapping.surfels.voxel_hash import point_keys
+from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Stateful
+from lidarslam.mapping.loam.feature_kernels import EDGE
+from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, Centroids, add_moments, match_features
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.surfaces import Matcher, Surfaces
+from lidarslam.mapping.surfels.voxel_hash import VoxelHash, point_keys
 
-# Neighbours that a line or plane is fitted to, and the largest distance of the farthest of them.
-_NEIGHBOURS, _FARTHEST_M = 5, 1.0
-# Least ratio of the two largest variances of a line's neighbours; largest distance of a plane's neighbours from it.
-_LINE_RATIO, _PLANE_M = 3.0, 0.2
-# Least ratio of the second to the largest variance of a plane's neighbours: points of one ring span no plane.
-_PLANE_RATIO = 0.0225
+# Correspondences are kept over a displacement of this share of a cell.
+_SAME_CELLS = 0.1
+# Neighbours of a plane over the coarsest cells: all around.
+_ALL = 27
+# Voxels beyond the radius are dropped each time the sensor has moved by this share of it.
+_FORGET_AFTER = 0.2
 
 
-class FeatureMap(Stateful):
-    """Points within a radius of the sensor, at most one a voxel.
+class CentroidGrid(Stateful):
+    """The mean of the points in each voxel.
 
-    The first point of a voxel stays. A mean with every new scan's, as the voxel grids of PCL and Open3D form it, halves
-    the weight of earlier scans each time: the map then follows the sensor, and the error grows.
+    As the voxel grids of PCL and Open3D form it, of a mean and the new scan's, it would halve the weight of earlier
+    scans each time: the map would follow the sensor.
     """
 
-    points: Annotated[FloatArray, Shape(None, 3)]  # (N, 3) in the world, in the order of their voxels
-    _spacing_m: float
+    cell_m: float
+    _keys: Annotated[NDArray[np.int64], Shape(None), ANY_NUMBER]  # (M,) of the voxels, by row
+    _sums: Annotated[FloatArray, Shape(None, 10)]  # (M, 10) see `Centroids`
 
-    def __init__(self, radius_m: float) -> None:
-        self.points = np.empty((0, 3))
-        self._spacing_m = 1.0  # of the voxels; any while there are no points
-        self._radius_m = radius_m
-        self._keys = np.empty(0, dtype=np.int64)  # (N,) of the voxels
-        self._search: o3d.core.nns.NearestNeighborSearch | None = None  # over the points, once it is asked for
+    def __init__(self, cell_m: float) -> None:
+        self.cell_m = cell_m
+        self._keys, self._sums = np.empty(0, dtype=np.int64), np.empty((0, 10))
+        self._hash = VoxelHash()
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self._keys)
 
-    def insert(self, points: FloatArray, sensor: FloatArray, spacing_m: float) -> None:
-        """Insert points (N, 3) of the world, and drop those beyond the radius from the sensor's position (3,)."""
-        if spacing_m != self._spacing_m:
-            points = np.concatenate([self.points, points])
-            self.points, self._keys, self._spacing_m = np.empty((0, 3)), np.empty(0, dtype=np.int64), spacing_m
-        keys, first = np.unique(point_keys(points, spacing_m), return_index=True)
-        is_new = ~np.isin(keys, self._keys, assume_unique=True)
-        places = np.searchsorted(self._keys, keys[is_new])
-        self._keys = np.insert(self._keys, places, keys[is_new])
-        self.points = np.insert(self.points, places, points[first[is_new]], axis=0)
-        away = self.points - sensor
-        near = np.flatnonzero(np.einsum("ij,ij->i", away, away) < self._radius_m**2)
-        self._keys, self.points, self._search = self._keys[near], self.points[near], None
+    @property
+    def means(self) -> FloatArray:
+        """(M, 3) in the world."""
+        return np.asarray(self._sums[:, 1:4] / self._sums[:, :1], dtype=np.float64)
 
-    def neighbourhoods(self, points: FloatArray, axis: int) -> "Neighbourhoods":
-        """The nearest neighbours of points (M, 3) of the world that have enough of them nearby."""
-        nearby, neighbours = np.empty(0, dtype=np.intp), np.empty((0, _NEIGHBOURS), dtype=np.int32)
-        if len(points) and len(self) >= _NEIGHBOURS:
-            found, squared = self._index().knn_search(o3d.core.Tensor.from_numpy(points), _NEIGHBOURS)
-            nearby = np.flatnonzero(squared.numpy()[:, -1] < _FARTHEST_M**2)
-            neighbours = found.numpy()[nearby]
-        means, variances, axes = (np.empty((len(nearby), 3)) for _ in range(3))
-        farthest_m = np.empty(len(nearby))
-        write_principal_axes(self.points, neighbours, axis, means, variances, axes, farthest_m)
-        return Neighbourhoods(nearby, means, variances, axes, farthest_m)
+    def insert(self, points: FloatArray) -> None:
+        """Insert points (N, 3) of the world."""
+        keys = point_keys(points, self.cell_m)
+        rows = self._hash.insert(keys)
+        new = np.flatnonzero(rows >= len(self._keys))
+        if len(new):
+            grown = np.empty(len(self._hash), dtype=np.int64)
+            grown[: len(self._keys)], grown[rows[new]] = self._keys, keys[new]
+            self._sums = np.concatenate([self._sums, np.zeros((len(grown) - len(self._keys), 10))])
+            self._keys = grown
+        add_moments(np.ascontiguousarray(points), rows, self._sums)
 
-    def _index(self) -> o3d.core.nns.NearestNeighborSearch:
-        if self._search is None:
-            self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(self.points), o3d.core.int32)
-            self._search.knn_index()
-        return self._search
+    def insert_means(self, other: "CentroidGrid") -> None:
+        """Insert the centroids of another grid, with their numbers of points."""
+        rows = self._hash.insert(point_keys(other.means, self.cell_m))
+        self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 10))
+        self._keys[rows] = point_keys(other.means, self.cell_m)
+        np.add.at(self._sums, rows, other._sums)
+
+    def drop_beyond(self, centre: FloatArray, radius_m: float) -> None:
+        """Drop the voxels farther than `radius_m` from `centre` (3,)."""
+        near = np.flatnonzero(np.linalg.norm(self.means - centre, axis=1) < radius_m)
+        self._keys, self._sums = self._keys[near], self._sums[near]
+        self._hash.rebuild(self._keys)
+
+    @property
+    def centroids(self) -> Centroids:
+        """The arrays for compiled loops."""
+        return Centroids(self.cell_m, *self._hash.slots, self._sums)
 
     def _after_restore(self) -> None:
-        if not self._spacing_m > 0.0:
-            raise ValueError(f"voxels of {self._spacing_m:g} m")
-        self._keys = point_keys(self.points, self._spacing_m)
-        self._search = None
-        if (np.diff(self._keys) <= 0).any():
-            raise ValueError("the points are not in the order of their voxels")
+        if len(self._keys) != len(self._sums) or len(np.unique(self._keys)) != len(self._keys):
+            raise ValueError("the voxels of a map of features differ in number, or repeat")
+        self._hash = VoxelHash()
+        self._hash.rebuild(self._keys)
 
 
-@dataclass(frozen=True, eq=False)
-class Neighbourhoods:
-    """The five nearest neighbours in a map of K points."""
+class FeatureMatcher(Matcher):
+    """Lines of edges and planes of other points, through their five nearest neighbours.
 
-    index: NDArray[np.intp]  # (K,) of the point
-    means: FloatArray  # (K, 3) of the neighbours, in the world
-    variances: FloatArray  # (K, 3) along their principal axes, ascending
-    axes: FloatArray  # (K, 3) unit, one of the principal axes
-    farthest_m: FloatArray  # (K,) largest distance of a neighbour from the plane across that axis
+    A point that has moved by a small part of a cell since it was matched keeps its line or plane.
 
+    Args:
+        edges, planes: grids of centroids, the finest first.
+        sweep: edges are told by their kind; without kinds, all points are planar.
+    """
 
-@dataclass(frozen=True, eq=False)
-class Correspondences:
-    """M residuals of features: two with each line, across it, and one with each plane."""
+    def __init__(self, edges: list[CentroidGrid], planes: list[CentroidGrid], sweep: Sweep) -> None:
+        self._edges, self._planes = edges, planes
+        self._is_edge = np.zeros(len(sweep), dtype=np.bool_) if sweep.kinds is None else sweep.kinds == EDGE
+        self._matched = np.full((len(sweep), 3), np.inf)  # where the points were matched
+        self.surfaces = Surfaces.none(len(sweep))
 
-    index: NDArray[np.intp]  # (M,) of the feature
-    points: FloatArray  # (M, 3) on the line or plane, in the world
-    normals: FloatArray  # (M, 3) unit, across the line or plane
-    tilt: FloatArray  # (M,) standard deviation of the normal, radians
-
-
-def match_lines(points: FloatArray, edges: FeatureMap) -> Correspondences:
-    """Match edge points (N, 3) of the world to lines: neighbours spread along one direction."""
-    near = edges.neighbourhoods(points, axis=2)
-    fit = np.flatnonzero(near.variances[:, 2] > _LINE_RATIO * near.variances[:, 1])
-    along, index, means = near.axes[fit], near.index[fit], near.means[fit]
-    across = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    normals = np.stack([across, np.cross(along, across)], axis=1).reshape(-1, 3)
-    # Two residuals are spent on the fit.
-    tilt = _tilt(near.variances[fit, 1], near.variances[fit, 2], _NEIGHBOURS - 2)
-    return Correspondences(index.repeat(2), means.repeat(2, axis=0), normals, tilt.repeat(2))
+    def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
+        """See `Matcher`."""
+        points, sensor = np.ascontiguousarray(points), np.array(T_world_lidar[:3, 3])
+        moved = np.abs(points - self._matched).max(axis=1) > _SAME_CELLS * self._planes[0].cell_m
+        self._matched[moved] = points[moved]
+        self.surfaces.counts[moved] = 0
+        for is_line, grids in ((True, self._edges), (False, self._planes)):
+            unmatched = np.flatnonzero(moved & (self._is_edge == is_line))
+            for grid in grids:
+                if not len(unmatched):
+                    break
+                left = match_features(points, unmatched, is_line, NEIGHBOURS, grid.centroids, sensor, self.surfaces)
+                unmatched = unmatched[:left]
 
 
-def match_planes(points: FloatArray, planes: FeatureMap) -> Correspondences:
-    """Match planar points (N, 3) of the world to planes: neighbours that are all close to one, and not on a line."""
-    near = planes.neighbourhoods(points, axis=0)
-    spread = near.variances[:, 1] > _PLANE_RATIO * near.variances[:, 2]
-    fit = np.flatnonzero(spread & (near.farthest_m < _PLANE_M))
-    # Three residuals are spent on the fit; the shorter extent decides.
-    tilt = _tilt(near.variances[fit, 0], near.variances[fit, 1], _NEIGHBOURS - 3)
-    return Correspondences(near.index[fit], near.means[fit], near.axes[fit], tilt)
+class FeatureMap(LocalMap):
+    """Edges and planar points within a radius of the sensor."""
 
+    _radius_m: float
+    _edges: list[CentroidGrid]
+    _planes: list[CentroidGrid]
+    _centre: Annotated[FloatArray, Shape(3)] | None
 
-def _tilt(across: FloatArray, along: FloatArray, free: int) -> FloatArray:
-    """Standard deviation (M,) of directions fitted to points with variances (M,) across and along them."""
-    return np.asarray(np.sqrt(np.maximum(across, 0.0) / (free * along)), dtype=np.float64)
+    def __init__(self, cell_m: float, radius_m: float) -> None:
+        self.cell_m, self.scans = cell_m, 0
+        self._radius_m = radius_m
+        self._edges, self._planes = ([CentroidGrid(cell_m * level) for level in LEVELS] for _ in range(2))
+        self._centre = None
+
+    def __len__(self) -> int:
+        """See `LocalMap`."""
+        return sum(map(len, self._grids))
+
+    @property
+    def _grids(self) -> list[CentroidGrid]:
+        return [*self._edges, *self._planes]
+
+    def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
+        """See `LocalMap`."""
+        assert scan.sweep.kinds is not None
+        is_edge = scan.sweep.kinds == EDGE
+        for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
+            for grid in grids:
+                grid.insert(chosen)
+        self._centre = sensor if self._centre is None else self._centre
+        if float(np.linalg.norm(sensor - self._centre)) > _FORGET_AFTER * self._radius_m:
+            self._centre = sensor
+            for grid in self._grids:
+                grid.drop_beyond(sensor, self._radius_m)
+        self.scans += 1
+
+    def matcher(self, sweep: Sweep, level: int = 0) -> FeatureMatcher:
+        """See `LocalMap`."""
+        return FeatureMatcher(self._edges[level:], self._planes[level:], sweep)
+
+    def resized(self, cell_m: float) -> "FeatureMap":
+        """See `LocalMap`."""
+        if cell_m == self.cell_m:
+            return self
+        other = FeatureMap(cell_m, self._radius_m)
+        other._centre, other.scans = self._centre, self.scans
+        for grids, finest in ((other._edges, self._edges[0]), (other._planes, self._planes[0])):
+            for grid in grids:
+                grid.insert_means(finest)
+        return other
+
+    def means(self) -> FloatArray:
+        """See `LocalMap`."""
+        return np.concatenate([self._edges[1].means, self._planes[1].means])
+
+    def level_normals(self) -> FloatArray:
+        """See `LocalMap`."""
+        normals, spread_m = self.coarse_planes(self._planes[-1].means, np.zeros(3))
+        return normals[np.isfinite(spread_m)]
+
+    def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `LocalMap`."""
+        found, unmatched = Surfaces.none(len(points)), np.arange(len(points))
+        match_features(
+            np.ascontiguousarray(points), unmatched, False, _ALL, self._planes[-1].centroids, np.array(sensor), found
+        )
+        return found.normals[:, 0], np.where(found.counts > 0, found.thickness_m[:, 0], np.inf)
+
+    def _after_restore(self) -> None:
+        if not len(self._edges) == len(self._planes) == len(LEVELS):
+            raise ValueError(f"{len(self._edges)} and {len(self._planes)} grids instead of {len(LEVELS)}")
+        sizes = [grid.cell_m / level for grid, level in zip(self._grids, 2 * LEVELS, strict=True)]
+        if not (self._radius_m > 0.0 and np.allclose(sizes, self.cell_m, rtol=1e-9, atol=0.0)):
+            raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")

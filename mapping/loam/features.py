@@ -1,16 +1,21 @@
 """Edge and planar features of a sweep by curvature along its rings (Zhang and Singh, "LOAM", RSS 2014, section V-A)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.scan import Scan
-from lidarslam.core.thinning import one_per_cell
+from lidarslam.core.thinning import central_per_cell, one_per_cell
 from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE, classify, write_curvatures
 from lidarslam.mapping.loam.rings import ring_order
 from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.registration.sampled_scan import Sampler
 
+# Spacing of the features that go into the map, in cells.
+_MAP_SPACING = 0.5
+# Largest number of edges that are registered, and their spacing in cells.
+_MOST_EDGES, _EDGE_SPACING = 1000, 1.0
+# Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
+_MOST_SPACING_M = 0.4
 # Curvature above which a point is an edge, and below which it is planar, square metres: that of the authors' program.
 _CURVATURE_M2 = 0.1
 # An edge needs this many times the median curvature as well. Flat surfaces seen with a range noise of more than one
@@ -18,26 +23,41 @@ _CURVATURE_M2 = 0.1
 _ABOVE_NOISE = 10.0
 
 
-@dataclass(frozen=True, eq=False)
-class Features:
-    """Features of a sweep, as measured."""
+class FeatureSampler(Sampler):
+    """Edges and planar points."""
 
-    edges: Sweep
-    planes: Sweep
-    spacing_m: float  # of either, at least
-    middle_s: float  # time from the stamp to the middle of the sweep; 0 where the points are compensated
+    def _spacing_m(self, cell_m: float) -> float:
+        return cell_m if self._config.cell_m is not None else min(cell_m, _MOST_SPACING_M)
 
-    def __len__(self) -> int:
-        return len(self.edges) + len(self.planes)
+    def _choose(
+        self,
+        scan: Scan,
+        has_rings: bool,
+        cell_m: float,
+    ) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
+        order, kinds = (
+            find_features(scan) if has_rings else (np.arange(len(scan)), np.full(len(scan), PLANE, dtype=np.int8))
+        )
+        chosen = []
+        for kind in (EDGE, PLANE):
+            features = order.take(np.flatnonzero(kinds == kind))
+            chosen.append(features.take(one_per_cell(scan.points.take(features, axis=0), _MAP_SPACING * cell_m)))
+        return np.concatenate(chosen), np.repeat(np.array([EDGE, PLANE], dtype=np.int8), [len(part) for part in chosen])
+
+    def _keypoints(self, sweep: Sweep, cell_m: float) -> NDArray[np.intp]:
+        assert sweep.kinds is not None
+        edges, planes = (np.flatnonzero(sweep.kinds == kind) for kind in (EDGE, PLANE))
+        edges = edges.take(central_per_cell(sweep.points.take(edges, axis=0), _EDGE_SPACING * cell_m))
+        if len(edges) > _MOST_EDGES:
+            edges = edges[np.linspace(0, len(edges) - 1, _MOST_EDGES).astype(np.intp)]
+        return np.concatenate([edges, planes.take(super()._keypoints(sweep.take(planes), cell_m))])
 
 
-def extract_features(scan: Scan, min_range_m: float, max_range_m: float, spacing_m: float) -> Features:
-    """Extract the sharpest points of each sector of a ring, and the points of small curvature.
+def find_features(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
+    """The sharpest points of each sector of a ring, and the points of small curvature.
 
-    Args:
-        scan: as read.
-        min_range_m, max_range_m: nearer and farther points are no features.
-        spacing_m: edge of the voxels of which one feature is kept.
+    Returns:
+        Indices (N,) of the scan's points, ring after ring, and whether each is `EDGE`, `PLANE` or neither, 0.
     """
     order, rings = ring_order(scan)
     points = scan.points.take(order, axis=0)
@@ -46,16 +66,5 @@ def extract_features(scan: Scan, min_range_m: float, max_range_m: float, spacing
     write_curvatures(points, rings, curvature)
     known = curvature[np.isfinite(curvature)]
     noise_m2 = float(np.median(known)) if len(known) else 0.0
-    classify(points, ranges, rings, curvature, max(_CURVATURE_M2, _ABOVE_NOISE * noise_m2), _CURVATURE_M2, kinds)
-    usable = (ranges > min_range_m) & (ranges < max_range_m)
-    edges, planes = (
-        _thinned(scan, order.take(np.flatnonzero(usable & (kinds == kind))), spacing_m) for kind in (EDGE, PLANE)
-    )
-    return Features(edges, planes, spacing_m, scan.middle_offset_s)
-
-
-def _thinned(scan: Scan, chosen: NDArray[np.intp], spacing_m: float) -> Sweep:
-    """The chosen points of a scan, one a voxel."""
-    kept = chosen.take(one_per_cell(scan.points.take(chosen, axis=0), spacing_m))
-    times = None if scan.time_offsets is None else scan.time_offsets.take(kept)
-    return Sweep(scan.points.take(kept, axis=0), times)
+    classify(points, ranges, rings, curvature, max(_CURVATURE_M2, _ABOVE_NOISE * noise_m2), np.inf, kinds)
+    return order, kinds

@@ -19,15 +19,15 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, inverse, log, orthonormalize, transform_points
 from lidarslam.core.thinning import central_per_cell
-from lidarslam.mapping.least_squares.gauss_newton import (
+from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
+from lidarslam.mapping.loops.registration import CORRELATION
+from lidarslam.mapping.loops.sparse_submap import principal_components
+from lidarslam.mapping.registration.gauss_newton import (
     NormalEquations,
     gauss_newton,
     geman_mcclure,
     point_to_plane_jacobian,
 )
-from lidarslam.mapping.loops.closure import CHI_SQUARED_99, LoopClosure
-from lidarslam.mapping.loops.registration import CORRELATION
-from lidarslam.mapping.loops.sparse_submap import principal_components
 
 # Planes are fitted to so many nearest points, wherever they lie: to leave out what is not flat biases the result.
 _NEIGHBOURS = 12

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 
 from lidarslam.core.geometry import FloatArray, orthonormalize, transform_points
 from lidarslam.core.thinning import one_per_cell
-from lidarslam.mapping.least_squares.gauss_newton import (
+from lidarslam.mapping.loops.sparse_submap import LINE, SparseSubmap
+from lidarslam.mapping.registration.gauss_newton import (
     NormalEquations,
     gauss_newton,
     geman_mcclure,
     point_to_plane_jacobian,
 )
-from lidarslam.mapping.loops.sparse_submap import LINE, SparseSubmap
 
 # Level after level: reach of correspondences and scale of the kernel, in cells; one point in so many; most steps.
 _LEVELS = ((12.0, 4.0, 4, 8), (6.0, 2.0, 2, 6), (4.0, 1.0, 1, 4), (3.0, 0.5, 1, 8))

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray, inverse, transform_points
-from lidarslam.mapping.least_squares.degeneracy import find_degeneracy
-from lidarslam.mapping.least_squares.gauss_newton import NormalEquations
 from lidarslam.mapping.loops.registration import (
     CORRELATION,
     GUESS_SIGMAS,
@@ -23,6 +21,8 @@ from lidarslam.mapping.loops.registration import (
     match,
     register,
 )
+from lidarslam.mapping.registration.degeneracy import find_degeneracy
+from lidarslam.mapping.registration.gauss_newton import NormalEquations
 
 # Largest residual of an inlier, in cells and at least in metres, and largest distance of its correspondence.
 _GATE = 0.3

@@ -25,10 +25,12 @@ class Sweep:
     points: Annotated[FloatArray, Shape(None, 3)]  # (N, 3)
     # (N,) seconds from the stamp; None when the points are motion compensated already
     times: Annotated[FloatArray, Shape(None)] | None = None
+    kinds: Annotated[NDArray[np.int8], Shape(None)] | None = None  # (N,) of features; None where points are of one kind
 
     def __post_init__(self) -> None:
-        if self.times is not None and len(self.times) != len(self.points):
-            raise ValueError(f"{len(self.times)} times of {len(self.points)} points")
+        for what, values in (("times", self.times), ("kinds", self.kinds)):
+            if values is not None and len(values) != len(self.points):
+                raise ValueError(f"{len(values)} {what} of {len(self.points)} points")
 
     def __len__(self) -> int:
         return len(self.points)
@@ -36,7 +38,8 @@ class Sweep:
     def take(self, chosen: NDArray[np.intp]) -> "Sweep":
         """The points with some indices."""
         times = None if self.times is None else self.times.take(chosen)
-        return Sweep(self.points.take(chosen, axis=0), times)
+        kinds = None if self.kinds is None else self.kinds.take(chosen)
+        return Sweep(self.points.take(chosen, axis=0), times, kinds)
 
     def compensated(self, velocity: FloatArray) -> FloatArray:
         """The points (N, 3) in the LiDAR frame at the stamp, for a constant velocity (6,)."""

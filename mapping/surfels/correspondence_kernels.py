@@ -5,13 +5,13 @@ The columns of surfels (M, 15) are as in `mapping.surfels.grid`: mean, normal, d
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray
+from lidarslam.mapping.registration.surfaces import Surfaces
 from lidarslam.mapping.surfels.surfel_kernels import is_steep
 
 # A single ring bent around a corner spans a plane too, that of its own rays. A plane seen at a grazing angle counts
@@ -22,24 +22,6 @@ _FEWEST_POINTS = 6
 _SHARED = 120.0
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5
-
-
-class Surfaces(NamedTuple):
-    """The surfaces that N points correspond to, a row for each point."""
-
-    counts: NDArray[np.int32]  # (N,) residuals of the point: 1 with a plane, up to 3 with a compact object, or none
-    points: FloatArray  # (N, 3) on the surface, in the world
-    normals: FloatArray  # (N, 3, 3) unit, in the world, one for each residual
-    thickness_m: FloatArray  # (N, 3) standard deviation of the surface along each, with that of its plane
-    tilt: FloatArray  # (N, 3) standard deviation of each normal, radians
-
-    @classmethod
-    def none(cls, count: int) -> "Surfaces":
-        """No surface for any point."""
-        shape = (count, 3)
-        return cls(
-            np.zeros(count, dtype=np.int32), np.empty(shape), np.empty((*shape, 3)), np.empty(shape), np.empty(shape)
-        )
 
 
 @compiled

@@ -1,13 +1,12 @@
 """Point-to-plane correspondences of a set of points with grids of surfels, kept from one pose to the next."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.mapping.surfels.correspondence_kernels import Surfaces, match_compact, match_planes
+from lidarslam.mapping.registration.surfaces import Matcher, Surfaces
+from lidarslam.mapping.surfels.correspondence_kernels import match_compact, match_planes
 from lidarslam.mapping.surfels.grid import SurfelGrid
 from lidarslam.mapping.surfels.voxel_hash import point_keys
 
@@ -17,26 +16,8 @@ _COMPACT = 0.5
 _NOWHERE = -1
 
 
-@dataclass(frozen=True, eq=False)
-class Correspondences:
-    """M residuals of points with surfaces, each along one direction."""
-
-    index: NDArray[np.intp]  # (M,) of the point
-    points: FloatArray  # (M, 3) on the surface, in the world
-    normals: FloatArray  # (M, 3) unit, in the world
-    thickness_m: FloatArray  # (M,) standard deviation of the surface along the normal
-    tilt: FloatArray  # (M,) standard deviation of the normal, radians
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def residuals(self, world: FloatArray) -> FloatArray:
-        """Signed distances (M,) of the matched points, at (M, 3) of the world, from their surfaces."""
-        return np.asarray(np.einsum("ij,ij->i", world - self.points, self.normals), dtype=np.float64)
-
-
-class Matcher:
-    """Finds the surfaces that N points correspond to, at one pose after another.
+class SurfelMatcher(Matcher):
+    """Surfels of the cells that points lie in.
 
     A point that has stayed in its cell keeps its surface: once an iteration moves by a small part of a cell, few are
     looked up again. The grids must not change meanwhile.
@@ -70,23 +51,3 @@ class Matcher:
             unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, self.surfaces)]
         assert finest is not None
         match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)
-
-    def first_correspondences(self) -> Correspondences:
-        """One residual for each point that has a surface, the one across it."""
-        found = self.surfaces
-        index = np.flatnonzero(found.counts)
-        return Correspondences(
-            index,
-            found.points.take(index, axis=0),
-            found.normals[index, 0],
-            found.thickness_m[index, 0],
-            found.tilt[index, 0],
-        )
-
-    def correspondences(self) -> Correspondences:
-        """A residual a row, in the order of the points."""
-        found = self.surfaces
-        index, _ = chosen = np.nonzero(np.arange(3) < found.counts[:, None])
-        return Correspondences(
-            index, found.points[index], found.normals[chosen], found.thickness_m[chosen], found.tilt[chosen]
-        )

@@ -1,134 +1,18 @@
-"""Sampling of a scan: points that are inserted into the map, and keypoints that are registered to it."""
-
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Annotated
+"""Sampling of a scan for a map of surfels."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lidarslam.core.geometry import FloatArray
-from lidarslam.core.scan import Scan, squared_ranges
-from lidarslam.core.state.stateful import Shape, Stateful
-from lidarslam.core.thinning import central_per_cell, one_per_cell
-from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
-from lidarslam.mapping.surfels.stability import constraining_points
+from lidarslam.core.scan import Scan
+from lidarslam.core.thinning import one_per_cell
+from lidarslam.mapping.registration.sampled_scan import Sampler
 
-# Fewer keypoints, or correspondences of them, make no pose.
-MIN_CORRESPONDENCES = MIN_POINTS
-# Spacing of the points that go into the map, and of the keypoints, in cells.
+# Spacing of the points that go into the map, in cells.
 _MAP_SPACING = 0.5
-_KEYPOINT_SPACING = 2.5
-_MOST_CONSTRAINING = 600
-# Instants that a sweep is divided into, of so many points at least; and the share of the view's height that those of
-# one instant span if they form a column. It is 0.6 to 0.9 of spinning sensors, 0.07 of a Mid-360.
-_INSTANTS, _LEAST_OF_INSTANT = 1000, 16
-_COLUMN_SHARE = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class SampledScan:
-    """A thinned scan, as measured."""
+class SurfelSampler(Sampler):
+    """One point in each half of a cell."""
 
-    stamp: float  # of the scan, seconds
-    cell_m: float  # size of the map's cells for the scene
-    range_m: float  # smoothed median range of the scene
-    sweep: Sweep  # N points for the map
-    # (N,) their angles above the sensor's equator, radians; all zero where points do not lie in rings
-    elevations: Annotated[FloatArray, Shape(None)]
-    keypoints: Sweep  # the subset that is registered
-
-    def __post_init__(self) -> None:
-        if len(self.elevations) != len(self.sweep):
-            raise ValueError(f"{len(self.elevations)} elevations of {len(self.sweep)} points")
-
-    def __len__(self) -> int:
-        return len(self.sweep)
-
-    @property
-    def is_sparse(self) -> bool:
-        """Whether there are too few keypoints for a registration: a covered sensor, or open country."""
-        return len(self.keypoints) < MIN_CORRESPONDENCES
-
-    @cached_property
-    def has_rings(self) -> bool:
-        """Whether points lie in rings, as those of a spinning sensor."""
-        return bool(self.elevations.any())
-
-    @cached_property
-    def seen_until_s(self) -> float:
-        """Time from the stamp to the last point; 0 when the scan is compensated already."""
-        times = self.sweep.times
-        return 0.0 if times is None or not len(times) else max(0.0, float(times.max()))
-
-    @cached_property
-    def seen_from_s(self) -> float:
-        """Time from the first point to the stamp; 0 when the scan is compensated already."""
-        times = self.sweep.times
-        return 0.0 if times is None or not len(times) else max(0.0, -float(times.min()))
-
-    @cached_property
-    def constraining(self) -> Sweep:
-        """The points that constrain what few others do, whether they are keypoints or not."""
-        found = constraining_points(self.sweep.points, self.elevations, self.cell_m, _MOST_CONSTRAINING)
-        return self.sweep.take(found)
-
-    def is_followed_by(self, following: "SampledScan") -> bool:
-        """Whether another sweep begins within a sweep's duration after this one's end."""
-        gap_s = following.stamp - following.seen_from_s - self.stamp - self.seen_until_s
-        return gap_s < self.seen_from_s + self.seen_until_s
-
-
-class Sampler(Stateful):
-    """Thins scans by the scale of the scene, the smoothed median range."""
-
-    _scale: SceneScale
-    _has_rings: bool | None  # of the first scan of enough points; None before
-
-    def __init__(self, config: MappingConfig) -> None:
-        self._config = config
-        self._scale = SceneScale(config)
-        self._has_rings = None
-
-    def sample(self, scan: Scan) -> SampledScan:
-        """Choose the points of a scan."""
-        squared = squared_ranges(scan.points)
-        cell_m = self._scale.update(squared)
-        kept = one_per_cell(scan.points, _MAP_SPACING * cell_m)
-        near, far = self._config.min_range_m**2, self._config.max_range_m**2
-        inside = squared.take(kept)
-        kept = kept[(inside > near) & (inside < far)]
-        points = scan.points.take(kept, axis=0)
-        sweep = Sweep(points, None if scan.time_offsets is None else scan.time_offsets.take(kept))
-        # The last points of the sweep would lie on the same side of every tree, and a sensor at rest would rotate.
-        keys = central_per_cell(points, _KEYPOINT_SPACING * cell_m)
-        if len(keys) > self._config.keypoints:
-            keys = keys[np.linspace(0, len(keys) - 1, self._config.keypoints).astype(np.intp)]
-        if self._has_rings is None and len(scan) >= _INSTANTS:
-            self._has_rings = has_rings(scan)
-        # A stroke of points that do not lie in rings spans a plane of its rays as a ring does, with any spread of
-        # elevations; without one, no plane seen at a grazing angle counts.
-        rings = 0.0 if self._has_rings is False else 1.0
-        elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
-        return SampledScan(scan.stamp, cell_m, self._scale.range_m, sweep, elevations, sweep.take(keys))
-
-
-def has_rings(scan: Scan) -> bool:
-    """Whether lasers keep their elevations, as those of a spinning sensor; true if unknown.
-
-    The lasers of a rosette or a raster draw strokes, numbered or not. Where they are not numbered, the points of one
-    instant form a column of a spinning sensor's view, and are near one another in a stroke.
-    """
-    elevations = np.arcsin(scan.points[:, 2] / np.maximum(np.sqrt(squared_ranges(scan.points)), 1e-9))
-    least = _COLUMN_SHARE * float(np.subtract(*np.quantile(elevations, (0.95, 0.05))))
-    if scan.rings is not None:
-        order = np.argsort(scan.rings, kind="stable")
-        lasers = np.split(elevations.take(order), np.flatnonzero(np.diff(scan.rings.take(order))) + 1)
-        return bool(np.median([np.subtract(*np.quantile(laser, (0.9, 0.1))) for laser in lasers]) < least)
-    if scan.time_offsets is None:
-        return True
-    elevations = elevations.take(np.argsort(scan.time_offsets, kind="stable"))
-    size = max(_LEAST_OF_INSTANT, len(elevations) // _INSTANTS)
-    instants = elevations[: len(elevations) // size * size].reshape(-1, size)
-    return bool(np.median(np.subtract(*np.quantile(instants, (0.9, 0.1), axis=1))) > least)
+    def _choose(self, scan: Scan, has_rings: bool, cell_m: float) -> tuple[NDArray[np.intp], None]:  # noqa: ARG002
+        return one_per_cell(scan.points, _MAP_SPACING * cell_m), None

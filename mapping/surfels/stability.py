@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from lidarslam.core.directions.degeneracy import lever_scale
 from lidarslam.core.geometry import FloatArray
+from lidarslam.mapping.registration.surfaces import Surfaces
 from lidarslam.mapping.surfels.cell_kernels import write_views
-from lidarslam.mapping.surfels.correspondence_kernels import Surfaces, match_planes
+from lidarslam.mapping.surfels.correspondence_kernels import match_planes
 from lidarslam.mapping.surfels.grid import SurfelGrid
 
 # Cells of a single scan's surfels, in cells of the map.

@@ -6,33 +6,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarslam.core.geometry import FloatArray
-from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.state.stateful import Shape
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.cell_kernels import write_views
-from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SurfelGrid
-from lidarslam.mapping.surfels.matching import Correspondences, Matcher
+from lidarslam.mapping.surfels.grid import IS_PLANE, NORMAL, SPREADS, SurfelGrid
+from lidarslam.mapping.surfels.matching import SurfelMatcher
 from lidarslam.mapping.surfels.voxel_hash import require_reach
 
-# Sizes of the grids, in cells. A point's correspondence is the plane of the finest grid that has one.
-LEVELS = (1, 2, 4)
 # Cells beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.2
 # Scans between two removals of stray cells.
 _TIDIED_AFTER = 500
-# Surfaces within this cosine of the z axis are floors or ceilings.
-_LEVEL_COSINE = 0.7
 # Spread of the elevations of points that were seen from many places.
 _ANY_HEIGHT_RAD = 0.2
-# Surfels of fewer scans are of few points: their normals are uncertain.
-_YOUNG_SCANS = 5
 # A direction that few walls are parallel to.
 _UNEVEN = np.array([0.46, 0.29, 0.84])
 
 
-class SurfelMap(Stateful):
-    """Surfels within a radius of the sensor."""
+class SurfelMap(LocalMap):
+    """Surfels within a radius of the sensor.
 
-    cell_m: float  # edge of the finest cells
-    scans: int  # number of inserted scans
+    A point corresponds to the plane of the finest grid that has one in its cell; where none has, to the middle of a
+    compact object in the finest grid, along the axes of small extent.
+    """
+
     _radius_m: float
     _grids: list[SurfelGrid]
     _centre: Annotated[FloatArray, Shape(3)] | None
@@ -69,13 +68,12 @@ class SurfelMap(Stateful):
             raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")
 
     def __len__(self) -> int:
-        """Number of cells in all grids."""
+        """See `LocalMap`."""
         return sum(len(grid) for grid in self._grids)
 
-    @property
-    def is_young(self) -> bool:
-        """Whether so few scans were inserted that normals are uncertain; a map that was given has none."""
-        return 0 < self.scans < _YOUNG_SCANS
+    def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
+        """See `LocalMap`."""
+        self.insert(points, scan.elevations, sensor)
 
     def insert(self, points: FloatArray, elevations: FloatArray, sensor: FloatArray) -> None:
         """Insert a scan.
@@ -109,59 +107,30 @@ class SurfelMap(Stateful):
         for grid in self._grids:
             grid.insert(points, elevations, views, weight)
 
-    def match(self, points: FloatArray, T_world_lidar: FloatArray, level: int = 0) -> Correspondences:
-        """Correspondences of points (N, 3) of the world, seen from a pose (4, 4).
+    def matcher(self, sweep: Sweep, level: int = 0) -> SurfelMatcher:
+        """See `LocalMap`."""
+        return SurfelMatcher(self._grids[level:], len(sweep))
 
-        A point corresponds to the plane of the finest grid that has one in its cell; where none has, to the middle of a
-        compact object in the finest grid, along the axes of small extent.
-
-        Args:
-            points: in the world.
-            T_world_lidar: pose of the sensor.
-            level: finest grid that is used, for points that may be off by more than a cell.
-        """
-        matcher = self.matcher(len(points), level)
-        matcher.match(points, T_world_lidar)
-        return matcher.correspondences()
-
-    def matcher(self, count: int, level: int = 0) -> Matcher:
-        """Correspondences of so many points, as of `match`, at one pose after another; until the map changes."""
-        return Matcher(self._grids[level:], count)
-
-    def vertical(self) -> FloatArray:
-        """Unit normal (3,) of floors and ceilings near the sensor; the world's z axis when there are none."""
+    def level_normals(self) -> FloatArray:
+        """See `LocalMap`."""
         grid = self._grids[-1]
         surfels = grid.surfels(np.arange(len(grid), dtype=np.int32))
-        normals = surfels[surfels[:, IS_PLANE] > 0.0, NORMAL]
-        normals = normals[np.abs(normals[:, 2]) > _LEVEL_COSINE]
-        mean = (normals * np.sign(normals[:, 2:])).sum(axis=0)
-        length = float(np.linalg.norm(mean))
-        return np.array([0.0, 0.0, 1.0]) if length == 0.0 else np.asarray(mean / length, dtype=np.float64)
+        return np.asarray(surfels[surfels[:, IS_PLANE] > 0.0, NORMAL], dtype=np.float64)
 
-    def goes_on(
-        self, points: FloatArray, normals: FloatArray, sensor: FloatArray, cosine: float, thickness: float
-    ) -> NDArray[np.bool_]:
-        """Whether planes (N, 3) at points (N, 3) of the world, seen from (3,), go on over the coarsest cell.
-
-        Args:
-            points: in the world.
-            normals: unit.
-            sensor: position in the world.
-            cosine: least, between the normals.
-            thickness: largest standard deviation along the normal, as a share of the cell.
-        """
+    def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `LocalMap`."""
         grid = self._grids[-1]
         rows = grid.find(points, np.array(sensor))
-        coarse = grid.refreshed(rows)[rows]
-        is_plane = (rows >= 0) & (coarse[:, 14] > 0.0) & (coarse[:, 9] < thickness * grid.cell_m)
-        return np.asarray(is_plane & (np.abs(np.einsum("ij,ij->i", normals, coarse[:, 3:6])) > cosine))
+        planes = grid.refreshed(rows)[rows]
+        is_plane = (rows >= 0) & (planes[:, IS_PLANE] > 0.0)
+        return planes[:, NORMAL], np.where(is_plane, planes[:, SPREADS.start], np.inf)
 
     def means(self) -> FloatArray:
-        """Mean points (M, 3) of the cells of the middle size, in the world."""
+        """See `LocalMap`."""
         return self._grids[1].means()
 
     def resized(self, cell_m: float) -> "SurfelMap":
-        """The map in cells of another size, resampled from the finest cells; the map itself for its own size."""
+        """See `LocalMap`; resampled from the finest cells."""
         if cell_m == self.cell_m:
             return self
         other = SurfelMap(cell_m, self._radius_m)

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from lidarslam.core.state.stateful import ANY_NUMBER, Stateful
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.registration.local_map import LocalMap
 from lidarslam.mapping.tracking.attempt import Attempt
 from lidarslam.mapping.tracking.attempts import ScanMatcher
 from lidarslam.mapping.tracking.budget import Budget, Steps
@@ -19,7 +19,7 @@ _FIRST_WAIT, _WAIT_GROWTH, _LONGEST_WAIT = 5, 1.5, 60
 class ArchivedMaps(Stateful):
     """Keeps the first and the last of the maps that were given up."""
 
-    _maps: list[SurfelMap]
+    _maps: list[LocalMap]
     _scans_until_search: Annotated[int, ANY_NUMBER]
     _wait: float
 
@@ -32,11 +32,11 @@ class ArchivedMaps(Stateful):
     def __len__(self) -> int:
         return len(self._maps)
 
-    def add(self, surfel_map: SurfelMap) -> None:
+    def add(self, local_map: LocalMap) -> None:
         """Archive a map that was given up; memory stays bounded."""
-        if surfel_map.scans < _LEAST_SCANS:
+        if local_map.scans < _LEAST_SCANS:
             return
-        self._maps = [*self._maps[:1], surfel_map]
+        self._maps = [*self._maps[:1], local_map]
         self._wait = float(_FIRST_WAIT)
         self._scans_until_search = _FIRST_WAIT
         self._search.drop()
@@ -55,12 +55,12 @@ class ArchivedMaps(Stateful):
             self._search.begin(self._searching(matcher, prediction), prediction)
         attempt = self._search.go_on(matcher, prediction, budget)
         if attempt is not None:
-            self._maps = self._maps[: self._maps.index(attempt.surfel_map)]
+            self._maps = self._maps[: self._maps.index(attempt.local_map)]
         return attempt
 
     def _searching(self, matcher: ScanMatcher, prediction: Prediction) -> Steps[Attempt | None]:
-        for surfel_map in reversed(self._maps):
-            attempt = yield from matcher.on(surfel_map).search_map(prediction)
+        for local_map in reversed(self._maps):
+            attempt = yield from matcher.on(local_map).search_map(prediction)
             if attempt is not None:
                 return attempt
         return None

@@ -11,9 +11,9 @@ from lidarslam.core.geometry import FloatArray, inverse, log
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.surfels.registration import Registration
-from lidarslam.mapping.surfels.sampling import SampledScan
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.registration import Registration
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.fit import Fit
 
 # A correction beyond so many standard deviations of the prediction, and beyond degrees and metres, is a jump.
@@ -38,7 +38,7 @@ class Attempt:
     """A registration attempt."""
 
     prediction: Prediction  # that the result is compared with
-    surfel_map: SurfelMap  # that the scan was registered to
+    local_map: LocalMap  # that the scan was registered to
     registration: Registration | None  # None where there were too few correspondences
     fit: Fit  # of the scan to the map
     status: Status  # by the fit
@@ -113,7 +113,7 @@ class Attempt:
 
     def has_rivals(self, others: Iterable["Attempt"]) -> bool:
         """Whether the scan fits nearly as well at another place."""
-        apart_m = _RIVAL_CELLS * self.surfel_map.cell_m
+        apart_m = _RIVAL_CELLS * self.local_map.cell_m
         return any(
             np.linalg.norm(other.T_world_lidar[:3, 3] - self.T_world_lidar[:3, 3]) > apart_m
             and _RIVAL_QUALITY * other.quality > self.quality

@@ -10,10 +10,11 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction, Prior, ProcessNoise, predict
-from lidarslam.mapping.surfels.matching import Matcher
-from lidarslam.mapping.surfels.registration import register, with_mean_velocity
-from lidarslam.mapping.surfels.sampling import SampledScan
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.registration import register, with_mean_velocity
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.registration.surfaces import Matcher
+from lidarslam.mapping.surfels.stability import constraining_points
 from lidarslam.mapping.tracking.attempt import Attempt, best_of
 from lidarslam.mapping.tracking.birds_eye_map import BirdsEyeMap
 from lidarslam.mapping.tracking.budget import Budget, Steps, complete
@@ -40,6 +41,8 @@ _FEW_POINTS, _LIKELY = 800, 0.5
 # cells, within reach of the coarse cells.
 _FASTEST_M_S = 50.0
 _DISPLACED_CELLS = 3.0
+# Points that constrain what few others do, by which a displacement is chosen, at most.
+_MOST_CONSTRAINING = 600
 # Displacements tried along the least constrained direction, and the largest that is taken, cells; a factor by which
 # the quality must be better.
 _ALONG_CELLS, _MOST_ALONG_CELLS = (-2.0, -1.0, 1.0, 2.0), 3.0
@@ -59,23 +62,23 @@ class ScanMatcher:
     Args:
         scan: sampled.
         last: state of the scan before.
-        surfel_map: local map.
+        local_map: local map.
         config: of the mapping.
         budget: of the scan.
     """
 
     def __init__(
-        self, scan: SampledScan, last: MotionState, surfel_map: SurfelMap, config: MappingConfig, budget: Budget
+        self, scan: SampledScan, last: MotionState, local_map: LocalMap, config: MappingConfig, budget: Budget
     ) -> None:
         self.scan = scan
         self.last = last
-        self._map = surfel_map
+        self._map = local_map
         self._config = config
         self._budget = budget
 
-    def on(self, surfel_map: SurfelMap) -> "ScanMatcher":
+    def on(self, local_map: LocalMap) -> "ScanMatcher":
         """The matcher of the scan with another map."""
-        return ScanMatcher(self.scan, self.last, surfel_map, self._config, self._budget)
+        return ScanMatcher(self.scan, self.last, local_map, self._config, self._budget)
 
     def none(self, prediction: Prediction) -> Attempt:
         """The result without a registration."""
@@ -115,8 +118,11 @@ class ScanMatcher:
             T = last.T_world_lidar.copy()
             T[:3, :3] = rotation[:3, :3]
             starts.append(positions_around(T, up, radius_m, _DISPLACED_CELLS * self._map.cell_m))
-        even, few = self._some(SCORED_POINTS), self.scan.constraining
-        points = np.concatenate([part.compensated(last.velocity) for part in (even, few)])
+        sweep = self.scan.sweep
+        few = constraining_points(sweep.points, self.scan.elevations, self._map.cell_m, _MOST_CONSTRAINING)
+        points = np.concatenate(
+            [part.compensated(last.velocity) for part in (self._some(SCORED_POINTS), sweep.take(few))]
+        )
         attempts = []
         best = yield from best_supported(points, np.concatenate(starts), self._map)
         for start in {start.tobytes(): start for start in best}.values():
@@ -276,13 +282,13 @@ def _displaced(T_world_lidar: FloatArray, away: FloatArray) -> FloatArray:
 
 
 def measure_fit(
-    points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap, matcher: Matcher | None = None
+    points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap, matcher: Matcher | None = None
 ) -> Fit:
     """Fit of compensated points (N, 3) of the LiDAR frame at a pose (4, 4), with the matcher of a pose nearby."""
-    matcher, world = matcher or surfel_map.matcher(len(points)), transform_points(T_world_lidar, points)
+    matcher, world = matcher or local_map.matcher(Sweep(points)), transform_points(T_world_lidar, points)
     matcher.match(world, T_world_lidar)
     matches = matcher.first_correspondences()
     distances = np.abs(matches.residuals(world.take(matches.index, axis=0)))
     ranges = np.linalg.norm(points.take(matches.index, axis=0), axis=1)
     surfaces = matches.thickness_m, matches.tilt
-    return Fit.of(distances, matches.normals, ranges, len(points), surfel_map.cell_m, *surfaces)
+    return Fit.of(distances, matches.normals, ranges, len(points), local_map.cell_m, *surfaces)

@@ -46,4 +46,4 @@ class SpreadSearch:
         self.drop()
         if found is None or prediction.stamp == begun.stamp:
             return found
-        return matcher.on(found.surfel_map).relocalise_along(found, begun, prediction)
+        return matcher.on(found.local_map).relocalise_along(found, begun, prediction)

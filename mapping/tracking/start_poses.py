@@ -4,7 +4,7 @@ import numpy as np
 
 from lidarslam.core.geometry import FloatArray, exp, transform_points
 from lidarslam.mapping.motion.deskew import Sweep
-from lidarslam.mapping.surfels.surfel_map import LEVELS, SurfelMap
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.tracking.budget import Steps
 from lidarslam.mapping.tracking.fit import translation_information
 
@@ -29,12 +29,12 @@ def turned_poses(T_world_lidar: FloatArray, up: FloatArray, yaw_step_deg: float)
     return turned
 
 
-def best_starts(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> Steps[FloatArray]:
+def best_starts(points: FloatArray, starts: FloatArray, local_map: LocalMap) -> Steps[FloatArray]:
     """The few of the poses (K, 4, 4) at which compensated points (N, 3) of the LiDAR frame are nearest to the map."""
     few = points[:: max(1, len(points) // SCORED_POINTS)]
     scores = []
     for start in starts:
-        scores.append(start_score(few, start, surfel_map))
+        scores.append(start_score(few, start, local_map))
         yield
     return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
 
@@ -50,7 +50,7 @@ def positions_around(T_world_lidar: FloatArray, up: FloatArray, radius_m: float,
     return moved
 
 
-def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap) -> Steps[FloatArray]:
+def best_supported(points: FloatArray, starts: FloatArray, local_map: LocalMap) -> Steps[FloatArray]:
     """The few of neighbouring poses (K, 4, 4) with the best directional support of some compensated points (N, 3).
 
     Directions of translation have equal weight, however few points constrain them: `tr(A^-1 B)` with A the mean over
@@ -60,7 +60,7 @@ def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap
     distinct, inverse = np.unique(starts.reshape(-1, 16), axis=0, return_inverse=True)
     sums = []
     for start in distinct.reshape(-1, 4, 4):
-        sums.append(_information(points, start, surfel_map))
+        sums.append(_information(points, start, local_map))
         yield
     information, supported = (np.array(parts)[inverse.reshape(-1)] for parts in zip(*sums, strict=True))
     mean = np.mean(information, axis=0)
@@ -69,28 +69,28 @@ def best_supported(points: FloatArray, starts: FloatArray, surfel_map: SurfelMap
     return np.asarray(starts[np.argsort(scores)[::-1][:_BEST]], dtype=np.float64)
 
 
-def best_velocity(sweep: Sweep, velocities: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> FloatArray:
+def best_velocity(sweep: Sweep, velocities: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> FloatArray:
     """The one of the velocities (K, 6) whose compensated sweep is nearest to the map."""
     few = sweep.take(np.arange(0, len(sweep), max(1, len(sweep) // SCORED_POINTS)))
-    scores = [start_score(few.compensated(velocity), T_world_lidar, surfel_map) for velocity in velocities]
+    scores = [start_score(few.compensated(velocity), T_world_lidar, local_map) for velocity in velocities]
     return np.asarray(velocities[int(np.argmax(scores))], dtype=np.float64)
 
 
-def start_score(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> float:
+def start_score(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> float:
     """Sum of the inlier weights of compensated points (N, 3) of the LiDAR frame at a pose (4, 4)."""
-    _, distances = _distances(points, T_world_lidar, surfel_map)
+    _, distances = _distances(points, T_world_lidar, local_map)
     return float((1.0 / (1.0 + distances**2)).sum())
 
 
-def _information(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> tuple[FloatArray, FloatArray]:
+def _information(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> tuple[FloatArray, FloatArray]:
     """Sums (3, 3) of `n n^T` over the matched points, without and with inlier weights."""
-    information, supported, _ = translation_information(*_distances(points, T_world_lidar, surfel_map))
+    information, supported, _ = translation_information(*_distances(points, T_world_lidar, local_map))
     return information, supported
 
 
-def _distances(points: FloatArray, T_world_lidar: FloatArray, surfel_map: SurfelMap) -> tuple[FloatArray, FloatArray]:
+def _distances(points: FloatArray, T_world_lidar: FloatArray, local_map: LocalMap) -> tuple[FloatArray, FloatArray]:
     """Normals (M, 3) of the surfaces in the coarsest cells, and distances (M,) in half-weight units."""
     world = transform_points(T_world_lidar, points)
-    matches = surfel_map.match(world, T_world_lidar, len(LEVELS) - 1)
+    matches = local_map.match(world, T_world_lidar, len(LEVELS) - 1)
     distances = matches.residuals(world.take(matches.index, axis=0))
-    return matches.normals, distances / (_HALF_CELLS * surfel_map.cell_m)
+    return matches.normals, distances / (_HALF_CELLS * local_map.cell_m)

@@ -20,9 +20,9 @@ from lidarslam.mapping.motion.prediction import (
     ProcessNoise,
     predict,
 )
-from lidarslam.mapping.surfels.registration import Registration
-from lidarslam.mapping.surfels.sampling import SampledScan
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.registration import Registration
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.archived_maps import ArchivedMaps
 from lidarslam.mapping.tracking.attempt import Attempt, best_of
 from lidarslam.mapping.tracking.attempts import ScanMatcher
@@ -84,10 +84,10 @@ class Tracker(Stateful):
         return predict(last, scan.stamp, prior, noise, self._config, scan.seen_from_s, self._odometry_noise)
 
     def register(
-        self, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState, surfel_map: SurfelMap
+        self, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState, local_map: LocalMap
     ) -> Attempt:
         """Register a scan near its prediction, else relocalise it; the status is lost where neither is reliable."""
-        matcher = ScanMatcher(scan, last, surfel_map, self._config, self._budget)
+        matcher = ScanMatcher(scan, last, local_map, self._config, self._budget)
         if self._state.is_lost and self.is_searching:  # which has all the time of a lost scan
             found = self._found(matcher, prediction, prior)
             self._in_vain = found is None and not self.is_searching
@@ -132,7 +132,7 @@ class Tracker(Stateful):
         state = MotionState(scan.stamp, registration.T_world_lidar, velocity, covariance, seen_until_s)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
         # A young map that is not added to would stay one.
-        fits = attempt.status is Status.OK or attempt.surfel_map.is_young
+        fits = attempt.status is Status.OK or attempt.local_map.is_young
         status, message = judge(attempt, self._state, unexpected, len(self._archive) > 0, self._config.tracking)
         return MappedScan(
             state=state,
@@ -148,11 +148,11 @@ class Tracker(Stateful):
             is_connected=not attempt.relocalised,
         )
 
-    def lose(self, surfel_map: SurfelMap, has_points: bool) -> bool:
+    def lose(self, local_map: LocalMap, has_points: bool) -> bool:
         """Update with a scan that was not registered; true where the map is archived and a new one must begin."""
         if not self.loses(has_points):
             return False
-        self._archive.add(surfel_map)
+        self._archive.add(local_map)
         self._end_search()
         self._state.map_restarted()
         return True

@@ -16,7 +16,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.loam.mapper import LoamMapper
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import Motion, Odometry
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
@@ -82,7 +82,7 @@ def test_points_are_compensated_by_the_motion_on_their_side_of_the_stamp() -> No
 
 
 def localise_all(scans: list[Scan], motions: list[Motion]) -> list[Localised]:
-    localiser = ScanToMap(SurfelMapper(MappingConfig()))
+    localiser = ScanToMap(Mapper(MappingConfig()))
     measured = [motion.failure is None for motion in motions]
     estimates = [
         Estimated(scan, motion, 0.1 if k and measured[k] and measured[k - 1] else None)
@@ -118,7 +118,7 @@ def test_where_the_odometry_measured_nothing_its_path_goes_on_with_the_mappers_m
 
 
 def run(odometry: Odometry, scans: list[Scan]) -> tuple[list[ScanResult], Pipeline]:
-    pipeline = Pipeline(odometry, ScanToMap(SurfelMapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
+    pipeline = Pipeline(odometry, ScanToMap(Mapper(MappingConfig())), GlobalMapConfig(voxel_size_m=0.1))
     return list(pipeline.run(scans)), pipeline
 
 
@@ -179,7 +179,7 @@ def test_results_carry_what_the_map_says_of_the_pose(room_scans: list[Scan], roo
 
 
 def test_the_configuration_chooses_the_mapper() -> None:
-    assert type(_mapper_of(MappingConfig())) is SurfelMapper
+    assert type(_mapper_of(MappingConfig())) is Mapper
     assert type(_mapper_of(MappingConfig(method="loam"))) is LoamMapper
     assert isinstance(make_localiser(Config(mapping=MappingConfig(method="off"))), OdometryAlone)
 

@@ -18,7 +18,7 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.pose_graph.graph_scan import GraphScan
 from lidarslam.mapping.pose_graph.laid_submaps import SCANS_LATER
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import ScanToMap, make_localiser
@@ -73,7 +73,7 @@ class Keeper:
 
 
 def pipeline_of(odometry: ExternalOdometry, graph: Any, keeper: Keeper | None = None) -> Pipeline:
-    localiser = ScanToMap(SurfelMapper(CONFIG, kept_scans=SCANS_LATER))
+    localiser = ScanToMap(Mapper(CONFIG, kept_scans=SCANS_LATER))
     return Pipeline(odometry, localiser, GlobalMapConfig(voxel_size_m=0.1), graph, keeper)
 
 
@@ -135,7 +135,7 @@ def test_an_error_while_drawing_reaches_the_caller(room_scans: list[Scan], room_
 
 
 def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
-    mapper = SurfelMapper(CONFIG, kept_scans=SCANS_LATER)
+    mapper = Mapper(CONFIG, kept_scans=SCANS_LATER)
     for scan in room_scans[:6]:  # the map begins anew with the second one, when the first one's velocity is known
         mapper.process(scan, Prior())
     begun, cell_m = mapper.local_map, mapper.cell_m
@@ -157,6 +157,6 @@ def test_a_map_that_has_begun_since_stays(room_scans: list[Scan]) -> None:
     ],
 )
 def test_runs_with_a_graph_correct_their_map_unless_told_otherwise(settings: list[str], kept_scans: int) -> None:
-    mapper = make_localiser(load_config(None, settings)).surfel_mapper
+    mapper = make_localiser(load_config(None, settings)).mapper
     assert mapper is not None
     assert mapper.kept_scans == kept_scans

@@ -9,8 +9,8 @@ from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_poi
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import UNKNOWN_VELOCITY, MotionState, Prediction
-from lidarslam.mapping.surfels.registration import register
-from lidarslam.mapping.surfels.sampling import SampledScan
+from lidarslam.mapping.registration.registration import register
+from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.surfels.stability import constraining_points
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.tracking.attempts import ScanMatcher, measure_fit

@@ -15,7 +15,7 @@ from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking import attempts, start_poses
 from lidarslam.mapping.tracking.budget import Budget, Steps, complete
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
@@ -143,7 +143,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     return clock
 
 
-def results(mapper: SurfelMapper, faulty: Faulty, clock: FakeClock, first: int = 0) -> Iterator[MappedScan]:
+def results(mapper: Mapper, faulty: Faulty, clock: FakeClock, first: int = 0) -> Iterator[MappedScan]:
     for scan in faulty.scans[first:]:
         started = clock.s
         yield mapper.process(scan, Prior())
@@ -158,7 +158,7 @@ def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_re
         faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
     else:
         faulty = covered(simulation, AT, AT + 10, "empty")
-    mapper = SurfelMapper(MappingConfig(budget_ms=BUDGET_MS), clock=clock)
+    mapper = Mapper(MappingConfig(budget_ms=BUDGET_MS), clock=clock)
     mapped = list(results(mapper, faulty, clock))
     assert max(clock.taken_ms[2:]) <= BUDGET_MS + REGISTRATION_MS + 1e-6
     assert any(one.status is Status.LOST for one in mapped[faulty.after :])  # it was spread
@@ -171,7 +171,7 @@ def test_no_scan_takes_more_than_the_budget_and_one_registration_and_tracking_re
 
 def test_without_a_budget_the_same_search_takes_one_scan(simulation: Simulation, clock: FakeClock) -> None:
     faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
-    mapper = SurfelMapper(MappingConfig(), clock=clock)
+    mapper = Mapper(MappingConfig(), clock=clock)
     mapped = list(results(mapper, faulty, clock))
     assert max(clock.taken_ms[2:]) > 3 * BUDGET_MS
     assert mapped[AT].message.startswith("relocalised")
@@ -180,12 +180,12 @@ def test_without_a_budget_the_same_search_takes_one_scan(simulation: Simulation,
 def test_a_search_that_was_under_way_begins_anew_after_a_resumption(simulation: Simulation, clock: FakeClock) -> None:
     faulty = carried_off(simulation, AT, index_back(simulation, AT, 3.0), 120.0)
     config = MappingConfig(budget_ms=BUDGET_MS)
-    mapper = SurfelMapper(config, clock=clock)
+    mapper = Mapper(config, clock=clock)
     searching = results(mapper, faulty, clock)
     while next(searching).status is not Status.LOST:
         pass
     number = len(clock.taken_ms) + 1
-    resumed = SurfelMapper(config, clock=clock)
+    resumed = Mapper(config, clock=clock)
     resumed.restore(Saved(deepcopy(mapper.state())))
     mapped = list(results(resumed, faulty, clock, number))
     assert [one.status for one in mapped[-5:]] == [Status.OK] * 5

@@ -5,7 +5,7 @@ import pytest
 
 from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, exp
-from lidarslam.mapping.least_squares.degeneracy import find_degeneracy
+from lidarslam.mapping.registration.degeneracy import find_degeneracy
 
 Scene = tuple[FloatArray, FloatArray]
 

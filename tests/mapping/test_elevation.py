@@ -16,7 +16,8 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.elevation.bias import PlacedPoints, combined, estimate_bias
 from lidarslam.mapping.elevation.stretches import ElevationEstimator
 from lidarslam.mapping.motion.prediction import MotionState
-from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.surfels.sampling import SurfelSampler
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
 
 EDGE_M, SCANS, STEP_M, NOISE_M = 0.8, 10, 1.5, 0.02
@@ -84,7 +85,7 @@ def registered(T: FloatArray, status: Status = Status.OK) -> MappedScan:
 
 @pytest.fixture(scope="module")
 def sampled(street: Any) -> list[SampledScan]:
-    sampler = Sampler(MappingConfig())
+    sampler = SurfelSampler(MappingConfig())
     return [
         sampler.sample(Scan(scan_at(street, number, T, TRUE_DEG), 0.1 * number)) for number, T in enumerate(poses())
     ]

@@ -30,7 +30,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.given_motion import motion_along
 from lidarslam.simulation.motion.route_motion import motion_along_route
@@ -44,7 +44,7 @@ from lidarslam.simulation.worlds.registry import build_world
 AT = 70
 COUNT = 100
 NOTHING = Prior()
-Start = Callable[[], SurfelMapper]
+Start = Callable[[], Mapper]
 
 
 def light(name: str = "vlp-16") -> Sensor:
@@ -71,20 +71,20 @@ def drive_by(office: World) -> Simulation:
 
 
 @pytest.fixture(scope="module")
-def _followed(drive_by: Simulation) -> SurfelMapper:
-    mapper = SurfelMapper(MappingConfig())
+def _followed(drive_by: Simulation) -> Mapper:
+    mapper = Mapper(MappingConfig())
     for scan in drive_by.scans(0, AT):
         mapper.process(scan, NOTHING)
     return mapper
 
 
 @pytest.fixture
-def mapper(_followed: SurfelMapper) -> SurfelMapper:
+def mapper(_followed: Mapper) -> Mapper:
     """One that has followed the drive up to scan `AT`."""
     return deepcopy(_followed)
 
 
-def process(mapper: SurfelMapper, recorded: Faulty, first: int = AT) -> list[MappedScan]:
+def process(mapper: Mapper, recorded: Faulty, first: int = AT) -> list[MappedScan]:
     return [mapper.process(scan, NOTHING) for scan in recorded.scans[first:]]
 
 
@@ -128,7 +128,7 @@ def polluted_share(results: list[MappedScan], recorded: Faulty, simulation: Simu
 
 @pytest.mark.parametrize("cover", ["empty", "near", "stray"])
 def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(
-    mapper: SurfelMapper, drive_by: Simulation, cover: Cover
+    mapper: Mapper, drive_by: Simulation, cover: Cover
 ) -> None:
     """For one second, while it moves on; more scans than after which a map is given up."""
     recorded = covered(drive_by, AT, AT + 10, cover)
@@ -146,7 +146,7 @@ def test_a_covered_sensor_is_lost_and_goes_on_in_the_same_map(
 
 def test_a_first_scan_of_stray_points_begins_no_map(drive_by: Simulation) -> None:
     recorded = covered(drive_by, 0, 3, "stray")
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in recorded.scans[:3]]
     assert [result.status for result in results] == [Status.LOST] * 3
     assert mapper.local_map is None
@@ -154,9 +154,7 @@ def test_a_first_scan_of_stray_points_begins_no_map(drive_by: Simulation) -> Non
 
 
 @pytest.mark.parametrize("turned_deg", [0.0, 90.0, 180.0])
-def test_carried_5_m_back_it_finds_itself_in_its_map(
-    mapper: SurfelMapper, drive_by: Simulation, turned_deg: float
-) -> None:
+def test_carried_5_m_back_it_finds_itself_in_its_map(mapper: Mapper, drive_by: Simulation, turned_deg: float) -> None:
     back = index_back(drive_by, AT, 5.0)
     recorded = carried_off(drive_by, AT, back, turned_deg)
     moved = recorded.truth.positions[AT] - recorded.truth.positions[AT - 1]
@@ -172,7 +170,7 @@ def test_carried_5_m_back_it_finds_itself_in_its_map(
 
 
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
-def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper: SurfelMapper, drive_by: Simulation) -> None:
+def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper: Mapper, drive_by: Simulation) -> None:
     """In a tunnel it begins a map that is told to be a guess; back in the office, it is in its first map again."""
     tunnel = build_world("tunnel", 0)
     motion = motion_along_route("tracked", tunnel, 0)
@@ -192,14 +190,14 @@ def test_carried_to_an_unknown_place_it_says_so_and_comes_back(mapper: SurfelMap
 
 
 @pytest.mark.parametrize("count", [1, 3, 10])
-def test_dropped_scans_do_no_harm(mapper: SurfelMapper, drive_by: Simulation, count: int) -> None:
+def test_dropped_scans_do_no_harm(mapper: Mapper, drive_by: Simulation, count: int) -> None:
     recorded = dropped(drive_by, range(AT, AT + count))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
     assert_recovered(results, recorded)
 
 
-def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: SurfelMapper, drive_by: Simulation) -> None:
+def test_a_gap_of_5_s_is_bridged_when_the_map_is_met_again(mapper: Mapper, drive_by: Simulation) -> None:
     recorded = dropped(replace(drive_by, scan_count=AT + 75), range(AT, AT + 50))
     results = process(mapper, recorded)
     assert_nothing_wrong_is_believed(results, recorded)
@@ -220,7 +218,7 @@ def test_sudden_turns_on_the_spot_are_followed(acceleration_deg: float, rate_deg
     motion = motion_along(Trajectory(times, T_world_first @ exp(turn)), world, on_ground=False)
     simulation = Simulation(world, light("os1-64"), motion, mount_pose("upright", 0.0), 58)
     recorded = Faulty(tuple(simulation.scans()), simulation.ground_truth, np.zeros(58, dtype=np.bool_), 0)
-    results = process(SurfelMapper(MappingConfig()), recorded, 0)
+    results = process(Mapper(MappingConfig()), recorded, 0)
     metres, degrees = errors(results, recorded, 0)
     assert {result.status for result in results} == {Status.OK}
     assert metres.max() < 0.05
@@ -245,7 +243,7 @@ def stand(world: World, scans: int, mover_sides_m: FloatArray | None = None) -> 
 def test_nothing_drifts_while_the_sensor_stands_still(name: str) -> None:
     """Noise of the first scans shows in the first poses; from the tenth on the pose stays, through 200 scans."""
     recorded = stand(build_world(name, 0), 200)
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
     assert {result.status for result in results} == {Status.OK}
     poses = np.array([result.state.T_world_lidar for result in results])
@@ -257,7 +255,7 @@ def test_nothing_drifts_while_the_sensor_stands_still(name: str) -> None:
 @pytest.mark.slow  # looks all over the map again and again, or follows a hundred scans
 def test_people_who_hide_much_of_the_view_do_not_drag_the_pose(office: World) -> None:
     recorded = stand(office, 80, np.array([0.8, -0.8, 0.9, -0.9, 1.0, -1.1, 1.2]))
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in recorded.scans]
     metres, degrees = errors(results, recorded, 0)
     assert {result.status for result in results} == {Status.OK}
@@ -275,7 +273,7 @@ def test_an_even_tunnel_is_told_to_say_nothing_along_it() -> None:
     x = simulation.ground_truth.positions[:, 0]
     nothing = (x > 33.0) & (x < 39.0)
     assert nothing.sum() > 10
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     results = [mapper.process(scan, NOTHING) for scan in simulation.scans(0, int(np.flatnonzero(nothing)[-1]) + 1)]
     concerned = [result for result, here in zip(results, nothing[: len(results)], strict=True) if here]
     assert {result.status for result in concerned} == {Status.DEGRADED}
@@ -293,7 +291,7 @@ def test_a_scan_that_fits_two_places_alike_is_at_neither(rng: np.random.Generato
         points[np.arange(count), axis] = rng.choice([-1.0, 1.0], count) * half[axis]
         return points
 
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     for k in range(10):
         mapper.process(Scan(walls(8_000), 0.1 * k), NOTHING)
     carried = Scan(walls(8_000) - np.array([2.5, 1.0, 0.0]), 1.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidarslam.core.geometry import exp, transform_points
-from lidarslam.mapping.least_squares.gauss_newton import geman_mcclure, point_to_plane_jacobian
+from lidarslam.mapping.registration.gauss_newton import geman_mcclure, point_to_plane_jacobian
 
 
 def test_the_jacobian_is_the_derivative_with_a_motion_from_the_right(rng: np.random.Generator) -> None:

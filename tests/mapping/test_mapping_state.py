@@ -16,7 +16,7 @@ from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.motion.prediction import OdometryNoise, Prior, ProcessNoise
 from lidarslam.mapping.pose_graph.keyframes import KeyframeSelector
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 
 ThroughDisk = Callable[[State], Saved]
 CONFIG = MappingConfig(keypoints=600)
@@ -47,14 +47,14 @@ def assert_same(found: MappedScan, expected: MappedScan) -> None:
 
 
 def test_a_mapper_goes_on(scans: list[Scan], through_disk: ThroughDisk) -> None:
-    whole = SurfelMapper(CONFIG)
+    whole = Mapper(CONFIG)
     expected = []
     for scan in scans:
         expected.append(whole.process(scan, Prior()))
     assert {mapped.status for mapped in expected} >= {Status.OK, Status.LOST}
     assert any("a new map" in mapped.message for mapped in expected)
     for after in (0, 1, 2, 6, 7, 8, 10):
-        first, second = SurfelMapper(CONFIG), SurfelMapper(CONFIG)
+        first, second = Mapper(CONFIG), Mapper(CONFIG)
         for scan in scans[:after]:
             first.process(scan, Prior())
         second.restore(through_disk(first.state()))
@@ -123,27 +123,27 @@ def test_keyframes_are_chosen_as_before(rng: np.random.Generator, through_disk: 
 
 
 def test_a_state_of_another_shape_is_refused(through_disk: ThroughDisk) -> None:
-    mapper = SurfelMapper(CONFIG)
+    mapper = Mapper(CONFIG)
     mapper.process(Scan(np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3)), 0.0), Prior())
     state = mapper.state()
     state["_last"] = {**state["_last"], "covariance": np.eye(6)}
     with pytest.raises(InputError, match=r"covariance.*expected an array of shape \(12, 12\), got float64 \(6, 6\)"):
-        SurfelMapper(CONFIG).restore(through_disk(state))
+        Mapper(CONFIG).restore(through_disk(state))
 
 
 def test_a_state_whose_arrays_differ_in_length_is_refused(scans: list[Scan], through_disk: ThroughDisk) -> None:
-    mapper = SurfelMapper(CONFIG)
+    mapper = Mapper(CONFIG)
     mapper.process(scans[0], Prior())
     state = mapper.state()
     grid = state["_map"]["_grids"][0]
     grid["_keys"] = grid["_keys"][:-1]
     with pytest.raises(InputError, match="differ in length"):
-        SurfelMapper(CONFIG).restore(through_disk(state))
+        Mapper(CONFIG).restore(through_disk(state))
 
 
 def test_nothing_that_a_mapper_remembers_is_forgotten(scans: list[Scan], through_disk: ThroughDisk) -> None:
     """Values unlike those at the beginning come back, and no attribute but the settings goes unsaved."""
-    mapper, restored = SurfelMapper(CONFIG), SurfelMapper(CONFIG)
+    mapper, restored = Mapper(CONFIG), Mapper(CONFIG)
     for scan in scans[:2]:
         mapper.process(scan, Prior())
     tracker = mapper._tracker

@@ -17,7 +17,7 @@ from lidarslam.mapping.global_map.moved_points import Views
 from lidarslam.mapping.loam.mapper import LoamMapper
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.voxel_hash import reach_m
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 
 
 def test_a_map_leaves_out_what_its_voxels_do_not_reach(rng: np.random.Generator) -> None:
@@ -45,9 +45,9 @@ def test_points_up_to_the_reach_are_in_the_map(rng: np.random.Generator) -> None
     assert len(far.points()) == pytest.approx(len(near.points()), rel=0.1)
 
 
-@pytest.mark.parametrize("mapper", [SurfelMapper, LoamMapper])
+@pytest.mark.parametrize("mapper", [Mapper, LoamMapper])
 def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(
-    mapper: type[SurfelMapper] | type[LoamMapper], room: Any, drive: Callable[[FloatArray], FloatArray]
+    mapper: type[Mapper] | type[LoamMapper], room: Any, drive: Callable[[FloatArray], FloatArray]
 ) -> None:
     tracker = mapper(MappingConfig(cell_m=0.05, max_range_m=30.0))
     tracker.process(room.ring_sweep(drive, 0.1), Prior(T_prev_curr=np.eye(4)))

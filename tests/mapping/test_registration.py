@@ -9,8 +9,8 @@ import pytest
 from lidarslam.core.geometry import FloatArray, exp, inverse, log, rotation_angle, transform_points
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.motion.prediction import Prediction
-from lidarslam.mapping.surfels.registration import Registration
-from lidarslam.mapping.surfels.registration import register as register_sweep
+from lidarslam.mapping.registration.registration import Registration
+from lidarslam.mapping.registration.registration import register as register_sweep
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 CELL = 0.2
@@ -203,7 +203,7 @@ def test_no_more_iterations_than_allowed(
 ) -> None:
     off = exp([0.0, 0.0, 0.03, 0.05, -0.05, 0.0])
     assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations > 2
-    monkeypatch.setattr("lidarslam.mapping.surfels.registration._ITERATIONS", (3, 2))
+    monkeypatch.setattr("lidarslam.mapping.registration.registration._ITERATIONS", (3, 2))
     assert register(snapshot(rng), predicted(T_TRUE @ off), box_map, False).iterations == 2
 
 

@@ -10,7 +10,7 @@ from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.deskew import move
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.tracking.mapped_scan import MappedScan
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
@@ -41,7 +41,7 @@ def truth(at_speed: Simulation, scans: list[Scan]) -> FloatArray:
 
 
 def process(scans: list[Scan], motions: list[FloatArray | None]) -> list[MappedScan]:
-    mapper = SurfelMapper(MappingConfig())
+    mapper = Mapper(MappingConfig())
     priors = [Prior() if motion is None else Prior(motion, covariance=STATED) for motion in motions]
     return [mapper.process(scan, prior) for scan, prior in zip(scans, priors, strict=True)]
 

@@ -8,7 +8,7 @@ from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.smoothed_start import smoothed_start
-from lidarslam.mapping.tracking.surfel_mapper import SurfelMapper
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.simulation.motion.carriers import mount_pose
 from lidarslam.simulation.motion.route_motion import motion_along_route
 from lidarslam.simulation.recorder import Simulation
@@ -22,7 +22,7 @@ def test_a_drone_takes_off(seed: int) -> None:
     motion = motion_along_route("drone-agile", world, seed)
     T_body_lidar = mount_pose("upright", motion.sensor_height_m)
     simulation = Simulation(world, find_sensor("mid-360"), motion, T_body_lidar, 30, seed=seed)
-    scans, mapper = list(simulation.scans()), SurfelMapper(MappingConfig())
+    scans, mapper = list(simulation.scans()), Mapper(MappingConfig())
     smoothed = smoothed_start(scans, MappingConfig())
     results = []
     for scan in scans:

@@ -7,6 +7,7 @@ for each field. What is read back has the types, shapes and bounds of its hints,
 """
 
 import dataclasses
+import inspect
 import types
 import typing
 from collections.abc import Mapping
@@ -120,6 +121,7 @@ def decode(kind: Any, tree: Any, saved: Saved) -> Any:
 
 def _decode_plain(kind: Any, values: Values, tree: Any, saved: Saved) -> Any:
     if hasattr(kind, "restore"):
+        kind = _concrete(kind, tree)
         made = kind.__new__(kind)
         made.restore(Saved(_tree(tree, saved), saved.place))
         return made
@@ -136,6 +138,14 @@ def _decode_plain(kind: Any, values: Values, tree: Any, saved: Saved) -> Any:
     if kind in (int, float):
         checked(saved, lambda: values.require(np.asarray(tree)))
     return kind(tree)
+
+
+def _concrete(kind: Any, tree: Any) -> Any:
+    """The class itself, or of an abstract one the subclass whose attributes a tree has."""
+    if not inspect.isabstract(kind):
+        return kind
+    names = set(tree) if isinstance(tree, dict) else set()
+    return next((one for one in kind.__subclasses__() if set(hints_of(one)) == names), kind.__subclasses__()[0])
 
 
 def _decode_array(dtype: Any, values: Values, tree: Any, saved: Saved, of_list: bool = False) -> Any:

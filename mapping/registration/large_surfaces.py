@@ -4,8 +4,8 @@ import numpy as np
 
 from lidarslam.core.directions.degeneracy import lever_scale
 from lidarslam.core.geometry import FloatArray, transform_points
-from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
-from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.surfaces import Surfaces
 
 # The plane of a point is part of a large one where the coarsest cell has a plane of nearly its normal, no thicker than
 # this share of that cell.
@@ -21,7 +21,7 @@ _RANGE_NOISE_M, _SCALE_PER_MEDIAN = 0.02, 1.5
 
 
 def inflation_of_small(
-    points: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, surfel_map: SurfelMap
+    points: FloatArray, T_world_lidar: FloatArray, surfaces: Surfaces, local_map: LocalMap
 ) -> FloatArray | None:
     """Factors (N,) on the standard deviations of the points' surfaces, larger for small ones; None where these agree.
 
@@ -32,11 +32,11 @@ def inflation_of_small(
         points: (N, 3) in the LiDAR frame.
         T_world_lidar: (4, 4) registered to all surfaces alike.
         surfaces: of the points.
-        surfel_map: map with these surfaces.
+        local_map: map with these surfaces.
     """
     matched = np.flatnonzero(surfaces.counts)
     world, normals = transform_points(T_world_lidar, points[matched]), surfaces.normals[matched, 0]
-    is_large = surfel_map.goes_on(world, normals, T_world_lidar[:3, 3], _SAME_COSINE, _MOST_THICKNESS)
+    is_large = local_map.goes_on(world, normals, T_world_lidar[:3, 3], _SAME_COSINE, _MOST_THICKNESS)
     large = matched[is_large]
     if len(large) < _FEWEST:
         return None
@@ -52,7 +52,7 @@ def inflation_of_small(
     if np.linalg.eigvalsh(hessian)[0] < _SUFFICIENT * float(weights @ surfaces.tilt[large, 0] ** 2):
         return None
     step_m = np.linalg.norm(np.linalg.solve(hessian, jacobian.T @ (weights * residuals)))
-    if step_m < _CONTRADICTION_CELLS * surfel_map.cell_m:
+    if step_m < _CONTRADICTION_CELLS * local_map.cell_m:
         return None
     inflation = np.full(len(points), INFLATION)
     inflation[large] = 1.0

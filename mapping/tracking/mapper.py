@@ -1,4 +1,4 @@
-"""Scan-to-map mapping by continuous-time surfel registration, with any odometry or none.
+"""Scan-to-map mapping by continuous-time registration to surfels or LOAM's features, with any odometry or none.
 
 Each scan is predicted from the last motion and the odometry, registered to the local map, judged by its fit, and
 inserted into the map. `mapping.tracking` has the cases in which the registration fails.
@@ -17,9 +17,13 @@ from lidarslam.core.scan import Scan
 from lidarslam.core.state.stateful import Shape, Stateful
 from lidarslam.core.tracking import Status
 from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.loam.feature_map import FeatureMap
+from lidarslam.mapping.loam.features import FeatureSampler
 from lidarslam.mapping.motion.deskew import body_velocity
 from lidarslam.mapping.motion.prediction import FADING, LOST_MOTION, UNKNOWN_VELOCITY, MotionState, Prediction, Prior
-from lidarslam.mapping.surfels.sampling import SampledScan, Sampler
+from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.sampled_scan import SampledScan, Sampler
+from lidarslam.mapping.surfels.sampling import SurfelSampler
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import beyond_reach
 from lidarslam.mapping.tracking.budget import Budget
@@ -49,7 +53,7 @@ class Insertion:
             raise ValueError(f"{len(self.elevations)} elevations of {len(self.points)} points")
 
 
-class SurfelMapper(Stateful):
+class Mapper(Stateful):
     """Holds the local map and the state of the last scan.
 
     Args:
@@ -60,7 +64,7 @@ class SurfelMapper(Stateful):
 
     _sampler: Sampler
     _tracker: Tracker
-    _map: SurfelMap | None
+    _map: LocalMap | None
     _last: MotionState | None
     _first: SampledScan | None
     _scans: int
@@ -74,7 +78,7 @@ class SurfelMapper(Stateful):
         self.kept_scans = kept_scans
         self._scans, self._map_since, self._recent = 0, 0, []
         self._budget = Budget(config.budget_ms, clock)
-        self._sampler = Sampler(config)
+        self._sampler = FeatureSampler(config) if config.method == "loam" else SurfelSampler(config)
         self._tracker = Tracker(config, self._budget)
         self._map = None
         self._last = None
@@ -86,7 +90,7 @@ class SurfelMapper(Stateful):
             raise ValueError(f"scans {numbers}, and a map since scan {self._map_since}, of {self._scans} scans")
 
     @property
-    def local_map(self) -> SurfelMap | None:
+    def local_map(self) -> LocalMap | None:
         """The map that scans are registered to; None before the first."""
         return self._map
 
@@ -119,36 +123,36 @@ class SurfelMapper(Stateful):
         self._last = mapped.state
         return mapped
 
-    def _track(self, scan: SampledScan, prior: Prior, last: MotionState, surfel_map: SurfelMap) -> MappedScan:
+    def _track(self, scan: SampledScan, prior: Prior, last: MotionState, local_map: LocalMap) -> MappedScan:
         """Predict, register, judge, insert."""
-        self._map = surfel_map = surfel_map.resized(scan.cell_m)
+        self._map = local_map = local_map.resized(scan.cell_m)
         # Predict the pose and the velocity from the last motion and the odometry.
         prediction = self._tracker.predict(scan, prior, last)
         if scan.is_sparse:
-            return self._lose(scan, prediction, surfel_map, None, _sparse_message(scan))
+            return self._lose(scan, prediction, local_map, None, _sparse_message(scan))
         # A velocity that is extrapolated over a gap in the stamps leads anywhere.
         T_world_near = (last if prior.T_prev_curr is None else prediction).T_world_lidar
-        beyond = beyond_reach(T_world_near[:3, 3], self._config.max_range_m, surfel_map.cell_m)
+        beyond = beyond_reach(T_world_near[:3, 3], self._config.max_range_m, local_map.cell_m)
         if beyond is not None:
-            return self._lose(scan, prediction, surfel_map, None, beyond)
+            return self._lose(scan, prediction, local_map, None, beyond)
         # Register the keypoints to the surfels; where that fails, relocalise.
-        attempt = self._tracker.register(scan, prior, prediction, last, surfel_map)
+        attempt = self._tracker.register(scan, prior, prediction, last, local_map)
         if attempt.status is Status.LOST or attempt.registration is None:
             reason = attempt.fit.explain(self._config.tracking) or _AMBIGUOUS
             reason = _SEARCHING if self._tracker.is_searching else reason
-            return self._lose(scan, attempt.prediction, surfel_map, attempt.fit, reason)
+            return self._lose(scan, attempt.prediction, local_map, attempt.fit, reason)
         # Judge the pose by its fit, and adapt the noise of process and odometry.
         mapped = self._tracker.accept(attempt, scan, prior, prediction, last)
         # Insert the scan into the map that it was registered to, which may be an archived one.
-        if attempt.surfel_map is not surfel_map:
+        if attempt.local_map is not local_map:
             self._map_since = self._scans
-        self._map = attempt.surfel_map
+        self._map = attempt.local_map
         if mapped.added:
             self._insert(scan, mapped.state, self._map)
         return mapped
 
     def redraw(self, drawn: SurfelMap, scans: int) -> bool:
-        """Replace the local map by one drawn anew without the latest scans, so many, which are inserted.
+        """Replace the local map of surfels by one drawn anew without the latest scans, so many, which are inserted.
 
         Returns:
             False where another map has begun since, or a search of the map is under way: the map stays.
@@ -175,51 +179,52 @@ class SurfelMapper(Stateful):
         return MappedScan(state, T_world_lidar, False, Status.OK, added=True)
 
     def _track_second(
-        self, scan: SampledScan, prior: Prior, last: MotionState, first: SampledScan, surfel_map: SurfelMap
+        self, scan: SampledScan, prior: Prior, last: MotionState, first: SampledScan, local_map: LocalMap
     ) -> MappedScan:
         """Register the second scan; where the first was moving, insert that anew, and register again.
 
         Two sweeps bent alike fit one another and hide a common motion, the motion between their poses does not.
         """
         before = self._tracker.snapshot()
-        mapped = self._track(scan, prior, last, surfel_map)
+        mapped = self._track(scan, prior, last, local_map)
         for _ in range(_REDRAWS if scan.stamp > last.stamp else 0):
             motion = inverse(last.T_world_lidar) @ mapped.state.T_world_lidar
-            if not mapped.registered or displacement_m(log(motion), scan.range_m) < surfel_map.cell_m:
+            if not mapped.registered or displacement_m(log(motion), scan.range_m) < local_map.cell_m:
                 break
             # The sensor moved partly with the first sweep's velocity and partly with the second's.
             interval_s = scan.stamp - last.stamp
             share = min(1.0, last.seen_until_s / interval_s)
             mean = share * last.velocity + (1.0 - share) * mapped.state.velocity
             last = replace(last, velocity=last.velocity + (body_velocity(motion, interval_s) - mean))
-            surfel_map = self._new_map(first, last)
+            local_map = self._new_map(first, last)
             self._tracker.rewind(before)
-            mapped = self._track(scan, prior, last, surfel_map)
+            mapped = self._track(scan, prior, last, local_map)
         return mapped
 
     def _lose(
-        self, scan: SampledScan, prediction: Prediction, surfel_map: SurfelMap, fit: Fit | None, reason: str
+        self, scan: SampledScan, prediction: Prediction, local_map: LocalMap, fit: Fit | None, reason: str
     ) -> MappedScan:
         """A scan without a registration stays at its prediction, out of the map; after many a new map begins."""
         T_world_lidar, velocity = prediction.T_world_lidar, prediction.velocity
-        if self._tracker.lose(surfel_map, has_points=fit is not None):
+        if self._tracker.lose(local_map, has_points=fit is not None):
             self._map = self._new_map(scan, MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION))
             reason += "; a new map begins here"
         lost = MotionState(scan.stamp, T_world_lidar, FADING * velocity, LOST_MOTION)
         return MappedScan(lost, T_world_lidar, False, Status.LOST, reason, fit, is_connected=False)
 
-    def _new_map(self, scan: SampledScan, state: MotionState) -> SurfelMap:
+    def _new_map(self, scan: SampledScan, state: MotionState) -> LocalMap:
         """A map of one scan."""
-        surfel_map = SurfelMap(scan.cell_m, self._config.radius_m)
-        logger.info("new surfel map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
+        kind = FeatureMap if self._config.method == "loam" else SurfelMap
+        local_map = kind(scan.cell_m, self._config.radius_m)
+        logger.info("new local map at %.3f s, cells of %.2f m", scan.stamp, scan.cell_m)
         self._map_since = self._scans
-        self._insert(scan, state, surfel_map)
-        return surfel_map
+        self._insert(scan, state, local_map)
+        return local_map
 
-    def _insert(self, scan: SampledScan, state: MotionState, surfel_map: SurfelMap) -> None:
+    def _insert(self, scan: SampledScan, state: MotionState, local_map: LocalMap) -> None:
         """Insert a scan, compensated, at its pose."""
         points = transform_points(state.T_world_lidar, scan.sweep.compensated(state.velocity))
-        surfel_map.insert(points, scan.elevations, state.T_world_lidar[:3, 3])
+        local_map.add(scan, points, state.T_world_lidar[:3, 3])
         recent = [one for one in self._recent if one.number > self._scans - self.kept_scans]
         if self.kept_scans:
             recent.append(Insertion(self._scans, points, scan.elevations, state.T_world_lidar[:3, 3]))

@@ -11,16 +11,15 @@ import numpy as np
 
 from lidarslam.core.directions.degeneracy import Degeneracy
 from lidarslam.core.geometry import FloatArray, displacement_m, exp, inverse, log, orthonormalize, transform_points
-from lidarslam.mapping.least_squares.degeneracy import DEGENERATE_INFORMATION, degenerate_directions
 from lidarslam.mapping.motion.deskew import Sweep, body_velocity
 from lidarslam.mapping.motion.measured_pose import MeasuredPose
 from lidarslam.mapping.motion.prediction import MotionState, Prediction
-from lidarslam.mapping.surfels.correspondence_kernels import Surfaces
-from lidarslam.mapping.surfels.large_surfaces import INFLATION, inflation_of_small
-from lidarslam.mapping.surfels.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
-from lidarslam.mapping.surfels.matching import Matcher
-from lidarslam.mapping.surfels.sampling import MIN_CORRESPONDENCES
-from lidarslam.mapping.surfels.surfel_map import LEVELS, SurfelMap
+from lidarslam.mapping.registration.degeneracy import DEGENERATE_INFORMATION, degenerate_directions
+from lidarslam.mapping.registration.large_surfaces import INFLATION, inflation_of_small
+from lidarslam.mapping.registration.linear_kernels import COLUMNS, RESIDUAL, accumulate, linearise
+from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
+from lidarslam.mapping.registration.sampled_scan import MIN_CORRESPONDENCES
+from lidarslam.mapping.registration.surfaces import Matcher, Surfaces
 
 # Iterations on each coarse level, and in all; the second pair where the start is a guess.
 _ITERATIONS, _PATIENT_ITERATIONS = (3, 20), (10, 40)
@@ -82,7 +81,7 @@ class Registration:
 
 
 def register(
-    sweep: Sweep, prediction: Prediction, surfel_map: SurfelMap, with_velocity: bool, coarse_first: bool = True,
+    sweep: Sweep, prediction: Prediction, local_map: LocalMap, with_velocity: bool, coarse_first: bool = True,
     patient: bool = False,
 ) -> Registration | None:  # fmt: skip
     """Register a sweep to the map; None where it has too few correspondences.
@@ -90,7 +89,7 @@ def register(
     Args:
         sweep: the keypoints.
         prediction: start, and prior with its covariance.
-        surfel_map: local map.
+        local_map: local map.
         with_velocity: whether to estimate the velocity during the sweep.
         coarse_first: whether to begin on coarse cells, for predictions that may be off by more than half a cell.
         patient: whether to allow more iterations.
@@ -103,7 +102,7 @@ def register(
         prior: FloatArray = np.asarray(np.linalg.inv(prediction.covariance), dtype=np.float64)
         inflation = uniform = np.ones(len(sweep))
         for level in reversed(range(len(LEVELS))) if coarse_first else (0,):
-            cell_m, matcher = surfel_map.cell_m * LEVELS[level], surfel_map.matcher(len(sweep), level)
+            cell_m, matcher = local_map.cell_m * LEVELS[level], local_map.matcher(sweep, level)
             for _ in range(coarse if level else most - iterations):
                 points = sweep.compensated(velocity)
                 matcher.match(transform_points(T_world_lidar, points), T_world_lidar)
@@ -120,7 +119,7 @@ def register(
                 if _has_converged(solution.step, level, cell_m, system.lever_m):
                     if level > 0 or inflation is not uniform:
                         break
-                    found = inflation_of_small(points, T_world_lidar, matcher.surfaces, surfel_map)
+                    found = inflation_of_small(points, T_world_lidar, matcher.surfaces, local_map)
                     if found is None:
                         break
                     # An odometry saw the same small surfaces.
@@ -133,7 +132,7 @@ def register(
 
 
 def with_mean_velocity(
-    registration: Registration, sweep: Sweep, prediction: Prediction, last: MotionState, surfel_map: SurfelMap,
+    registration: Registration, sweep: Sweep, prediction: Prediction, last: MotionState, local_map: LocalMap,
     patient: bool,
 ) -> Registration | None:  # fmt: skip
     """The registration with the mean velocity since the last scan, where none was estimated during the sweep.
@@ -146,7 +145,7 @@ def with_mean_velocity(
     same = np.linalg.norm(change[:3]) < _SAME_ROTATION and np.linalg.norm(change[3:]) < _SAME_TRANSLATION_M
     if sweep.times is not None and not same:
         again = replace(prediction, T_world_lidar=registration.T_world_lidar, velocity=velocity)
-        second = register(sweep, again, surfel_map, with_velocity=False, coarse_first=False, patient=patient)
+        second = register(sweep, again, local_map, with_velocity=False, coarse_first=False, patient=patient)
         if second is None:
             return None
         registration = second

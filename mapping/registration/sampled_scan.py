@@ -1,0 +1,141 @@
+"""A thinned scan: points that are inserted into the map, and keypoints that are registered to it."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarslam.core.geometry import FloatArray
+from lidarslam.core.scan import Scan, squared_ranges
+from lidarslam.core.state.stateful import Shape, Stateful
+from lidarslam.core.thinning import central_per_cell
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.scene_scale import MIN_POINTS, SceneScale
+
+# Fewer keypoints, or correspondences of them, make no pose.
+MIN_CORRESPONDENCES = MIN_POINTS
+# Spacing of the keypoints, in cells.
+_KEYPOINT_SPACING = 2.5
+# Instants that a sweep is divided into, of so many points at least; and the share of the view's height that those of
+# one instant span if they form a column. It is 0.6 to 0.9 of spinning sensors, 0.07 of a Mid-360.
+_INSTANTS, _LEAST_OF_INSTANT = 1000, 16
+_COLUMN_SHARE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class SampledScan:
+    """A thinned scan, as measured."""
+
+    stamp: float  # of the scan, seconds
+    cell_m: float  # size of the map's cells for the scene
+    range_m: float  # smoothed median range of the scene
+    sweep: Sweep  # N points for the map
+    # (N,) their angles above the sensor's equator, radians; all zero where points do not lie in rings
+    elevations: Annotated[FloatArray, Shape(None)]
+    keypoints: Sweep  # the subset that is registered
+
+    def __post_init__(self) -> None:
+        if len(self.elevations) != len(self.sweep):
+            raise ValueError(f"{len(self.elevations)} elevations of {len(self.sweep)} points")
+
+    def __len__(self) -> int:
+        return len(self.sweep)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether there are too few keypoints for a registration: a covered sensor, or open country."""
+        return len(self.keypoints) < MIN_CORRESPONDENCES
+
+    @cached_property
+    def has_rings(self) -> bool:
+        """Whether points lie in rings, as those of a spinning sensor."""
+        return bool(self.elevations.any())
+
+    @cached_property
+    def seen_until_s(self) -> float:
+        """Time from the stamp to the last point; 0 when the scan is compensated already."""
+        times = self.sweep.times
+        return 0.0 if times is None or not len(times) else max(0.0, float(times.max()))
+
+    @cached_property
+    def seen_from_s(self) -> float:
+        """Time from the first point to the stamp; 0 when the scan is compensated already."""
+        times = self.sweep.times
+        return 0.0 if times is None or not len(times) else max(0.0, -float(times.min()))
+
+    def is_followed_by(self, following: "SampledScan") -> bool:
+        """Whether another sweep begins within a sweep's duration after this one's end."""
+        gap_s = following.stamp - following.seen_from_s - self.stamp - self.seen_until_s
+        return gap_s < self.seen_from_s + self.seen_until_s
+
+
+class Sampler(Stateful, ABC):
+    """Thins scans by the scale of the scene, the smoothed median range."""
+
+    _scale: SceneScale
+    _has_rings: bool | None  # of the first scan of enough points; None before
+
+    def __init__(self, config: MappingConfig) -> None:
+        self._config = config
+        self._scale = SceneScale(config)
+        self._has_rings = None
+
+    def sample(self, scan: Scan) -> SampledScan:
+        """Choose the points of a scan."""
+        squared = squared_ranges(scan.points)
+        cell_m = self._spacing_m(self._scale.update(squared))
+        if self._has_rings is None and len(scan) >= _INSTANTS:
+            self._has_rings = has_rings(scan)
+        near, far = self._config.min_range_m**2, self._config.max_range_m**2
+        kept, kinds = self._choose(scan, self._has_rings is not False, cell_m)
+        inside = squared.take(kept)
+        is_within = (inside > near) & (inside < far)
+        kept, kinds = kept[is_within], None if kinds is None else kinds[is_within]
+        points = scan.points.take(kept, axis=0)
+        sweep = Sweep(points, None if scan.time_offsets is None else scan.time_offsets.take(kept), kinds)
+        # A stroke of points that do not lie in rings spans a plane of its rays as a ring does, with any spread of
+        # elevations; without one, no plane seen at a grazing angle counts.
+        rings = 0.0 if self._has_rings is False else 1.0
+        elevations = rings * np.arcsin(points[:, 2] / np.sqrt(squared.take(kept)))
+        keypoints = sweep.take(self._keypoints(sweep, cell_m))
+        return SampledScan(scan.stamp, cell_m, self._scale.range_m, sweep, elevations, keypoints)
+
+    def _spacing_m(self, cell_m: float) -> float:
+        """The edge of the map's finest cells for that of the scene."""
+        return cell_m
+
+    @abstractmethod
+    def _choose(self, scan: Scan, has_rings: bool, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8] | None]:
+        """Indices (N,) of the points for the map, and their kinds (N,), if there are several."""
+
+    def _keypoints(self, sweep: Sweep, cell_m: float) -> NDArray[np.intp]:
+        """Indices (K,) of the points that are registered."""
+        # The last points of the sweep would lie on the same side of every tree, and a sensor at rest would rotate.
+        keys = central_per_cell(sweep.points, _KEYPOINT_SPACING * cell_m)
+        if len(keys) > self._config.keypoints:
+            keys = keys[np.linspace(0, len(keys) - 1, self._config.keypoints).astype(np.intp)]
+        return keys
+
+
+def has_rings(scan: Scan) -> bool:
+    """Whether lasers keep their elevations, as those of a spinning sensor; true if unknown.
+
+    The lasers of a rosette or a raster draw strokes, numbered or not. Where they are not numbered, the points of one
+    instant form a column of a spinning sensor's view, and are near one another in a stroke.
+    """
+    elevations = np.arcsin(scan.points[:, 2] / np.maximum(np.sqrt(squared_ranges(scan.points)), 1e-9))
+    least = _COLUMN_SHARE * float(np.subtract(*np.quantile(elevations, (0.95, 0.05))))
+    if scan.rings is not None:
+        order = np.argsort(scan.rings, kind="stable")
+        lasers = np.split(elevations.take(order), np.flatnonzero(np.diff(scan.rings.take(order))) + 1)
+        return bool(np.median([np.subtract(*np.quantile(laser, (0.9, 0.1))) for laser in lasers]) < least)
+    if scan.time_offsets is None:
+        return True
+    elevations = elevations.take(np.argsort(scan.time_offsets, kind="stable"))
+    size = max(_LEAST_OF_INSTANT, len(elevations) // _INSTANTS)
+    instants = elevations[: len(elevations) // size * size].reshape(-1, size)
+    return bool(np.median(np.subtract(*np.quantile(instants, (0.9, 0.1), axis=1))) > least)
