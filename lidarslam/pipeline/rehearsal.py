@@ -129,7 +129,14 @@ PARTS = {
             "mapping.registration.linear_kernels",
         ),
     ),
-    "loam": Part(_loam, ("mapping.loam.feature_kernels", "mapping.loam.neighbour_kernels")),
+    "loam": Part(
+        _loam,
+        (
+            *(f"mapping.loam.{kind}_kernels" for kind in ("feature", "neighbour")),
+            "mapping.registration.linear_kernels",
+            "mapping.surfels.hash_kernels",
+        ),
+    ),
     "alignment": Part(
         _alignment, tuple(f"odometry.alignment.{kind}" for kind in ("residuals", "point_to_plane", "steps"))
     ),

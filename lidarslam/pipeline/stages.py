@@ -87,7 +87,8 @@ class Stages(Stateful):
         self.map.add(thinned, points, localised)
         if self._graph is not None:
             arrived = graph_scan(estimated, localised, points)
-            drawing = self._graph_worker.submit(_follow, self._graph, arrived, localised.cell_m if self._correction else None)
+            cell_m = None if self._correction is None else localised.cell_m
+            drawing = self._graph_worker.submit(_follow, self._graph, arrived, cell_m)
             if self._correction is not None:
                 self._correction.add(drawing)
         stage_ms = {"deskew": _ms(started, deskewed), "map": _ms(deskewed, time.perf_counter())}

@@ -47,20 +47,20 @@ def write_curvatures(points: FloatArray, rings: NDArray[np.intp], curvature: Flo
 @compiled
 def classify(
     points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], curvature: FloatArray, edge_above: float,
-    plane_below: float, kinds: NDArray[np.int8],
+    kinds: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Write whether points are edges, planar, or neither.
 
     Args:
         points, ranges: (N, 3) and (N,), ring after ring.
         rings, curvature: (N,) of the points.
-        edge_above, plane_below: thresholds of the curvature, square metres.
+        edge_above: threshold of the curvature, square metres; the others are planar where they are reliable.
         kinds: (N,) written.
     """
     free = np.ones(len(points), dtype=np.bool_)
     _exclude_unreliable(points, ranges, rings, free)
     for i in range(len(points)):
-        kinds[i] = PLANE if free[i] and curvature[i] < plane_below else 0
+        kinds[i] = PLANE if free[i] and curvature[i] < np.inf else 0
     begin = 0
     for end in range(1, len(points) + 1):
         if end == len(points) or rings[end] != rings[begin]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Stateful
 from lidarslam.mapping.loam.feature_kernels import EDGE
-from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, Centroids, add_moments, match_features
+from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, Voxels, add_moments, match_features
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -23,7 +23,7 @@ _ALL = 27
 _FORGET_AFTER = 0.2
 
 
-class CentroidGrid(Stateful):
+class VoxelGrid(Stateful):
     """The mean of the points in each voxel.
 
     As the voxel grids of PCL and Open3D form it, of a mean and the new scan's, it would halve the weight of earlier
@@ -32,7 +32,7 @@ class CentroidGrid(Stateful):
 
     cell_m: float
     _keys: Annotated[NDArray[np.int64], Shape(None), ANY_NUMBER]  # (M,) of the voxels, by row
-    _sums: Annotated[FloatArray, Shape(None, 10)]  # (M, 10) see `Centroids`
+    _sums: Annotated[FloatArray, Shape(None, 10)]  # (M, 10) see `Voxels`
 
     def __init__(self, cell_m: float) -> None:
         self.cell_m = cell_m
@@ -59,8 +59,8 @@ class CentroidGrid(Stateful):
             self._keys = grown
         add_moments(np.ascontiguousarray(points), rows, self._sums)
 
-    def insert_means(self, other: "CentroidGrid") -> None:
-        """Insert the centroids of another grid, with their numbers of points."""
+    def insert_means(self, other: "VoxelGrid") -> None:
+        """Insert the voxels of another grid, with their numbers of points."""
         rows = self._hash.insert(point_keys(other.means, self.cell_m))
         self._keys, self._sums = np.empty(len(self._hash), dtype=np.int64), np.zeros((len(self._hash), 10))
         self._keys[rows] = point_keys(other.means, self.cell_m)
@@ -73,9 +73,9 @@ class CentroidGrid(Stateful):
         self._hash.rebuild(self._keys)
 
     @property
-    def centroids(self) -> Centroids:
+    def voxels(self) -> Voxels:
         """The arrays for compiled loops."""
-        return Centroids(self.cell_m, *self._hash.slots, self._sums)
+        return Voxels(self.cell_m, *self._hash.slots, self._sums)
 
     def _after_restore(self) -> None:
         if len(self._keys) != len(self._sums) or len(np.unique(self._keys)) != len(self._keys):
@@ -90,11 +90,11 @@ class FeatureMatcher(Matcher):
     A point that has moved by a small part of a cell since it was matched keeps its line or plane.
 
     Args:
-        edges, planes: grids of centroids, the finest first.
+        edges, planes: grids of voxels, the finest first.
         sweep: edges are told by their kind; without kinds, all points are planar.
     """
 
-    def __init__(self, edges: list[CentroidGrid], planes: list[CentroidGrid], sweep: Sweep) -> None:
+    def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], sweep: Sweep) -> None:
         self._edges, self._planes = edges, planes
         self._is_edge = np.zeros(len(sweep), dtype=np.bool_) if sweep.kinds is None else sweep.kinds == EDGE
         self._matched = np.full((len(sweep), 3), np.inf)  # where the points were matched
@@ -111,7 +111,7 @@ class FeatureMatcher(Matcher):
             for grid in grids:
                 if not len(unmatched):
                     break
-                left = match_features(points, unmatched, is_line, NEIGHBOURS, grid.centroids, sensor, self.surfaces)
+                left = match_features(points, unmatched, is_line, NEIGHBOURS, grid.voxels, sensor, self.surfaces)
                 unmatched = unmatched[:left]
 
 
@@ -119,14 +119,14 @@ class FeatureMap(LocalMap):
     """Edges and planar points within a radius of the sensor."""
 
     _radius_m: float
-    _edges: list[CentroidGrid]
-    _planes: list[CentroidGrid]
+    _edges: list[VoxelGrid]
+    _planes: list[VoxelGrid]
     _centre: Annotated[FloatArray, Shape(3)] | None
 
     def __init__(self, cell_m: float, radius_m: float) -> None:
         self.cell_m, self.scans = cell_m, 0
         self._radius_m = radius_m
-        self._edges, self._planes = ([CentroidGrid(cell_m * level) for level in LEVELS] for _ in range(2))
+        self._edges, self._planes = ([VoxelGrid(cell_m * level) for level in LEVELS] for _ in range(2))
         self._centre = None
 
     def __len__(self) -> int:
@@ -134,7 +134,7 @@ class FeatureMap(LocalMap):
         return sum(map(len, self._grids))
 
     @property
-    def _grids(self) -> list[CentroidGrid]:
+    def _grids(self) -> list[VoxelGrid]:
         return [*self._edges, *self._planes]
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
@@ -179,7 +179,7 @@ class FeatureMap(LocalMap):
         """See `LocalMap`."""
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))
         match_features(
-            np.ascontiguousarray(points), unmatched, False, _ALL, self._planes[-1].centroids, np.array(sensor), found
+            np.ascontiguousarray(points), unmatched, False, _ALL, self._planes[-1].voxels, np.array(sensor), found
         )
         return found.normals[:, 0], np.where(found.counts > 0, found.thickness_m[:, 0], np.inf)
 

@@ -16,7 +16,7 @@ _MAP_SPACING = 0.5
 _MOST_EDGES, _EDGE_SPACING = 1000, 1.0
 # Of maps that follow the scene: in sparser ones, neighbours are too far apart for a line or plane.
 _MOST_SPACING_M = 0.4
-# Curvature above which a point is an edge, and below which it is planar, square metres: that of the authors' program.
+# Curvature above which a point is an edge, square metres: that of the authors' program. All others are planar.
 _CURVATURE_M2 = 0.1
 # An edge needs this many times the median curvature as well. Flat surfaces seen with a range noise of more than one
 # centimetre exceed the published threshold all over, and these edges, on rings that move with the sensor, hold it back.
@@ -29,15 +29,11 @@ class FeatureSampler(Sampler):
     def _spacing_m(self, cell_m: float) -> float:
         return cell_m if self._config.cell_m is not None else min(cell_m, _MOST_SPACING_M)
 
-    def _choose(
-        self,
-        scan: Scan,
-        has_rings: bool,
-        cell_m: float,
-    ) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
-        order, kinds = (
-            find_features(scan) if has_rings else (np.arange(len(scan)), np.full(len(scan), PLANE, dtype=np.int8))
-        )
+    def _choose(self, scan: Scan, has_rings: bool, cell_m: float) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
+        if has_rings:
+            order, kinds = find_features(scan)
+        else:  # the ends of strokes are no edges, and what is no plane finds none in the map
+            order, kinds = np.arange(len(scan)), np.full(len(scan), PLANE, dtype=np.int8)
         chosen = []
         for kind in (EDGE, PLANE):
             features = order.take(np.flatnonzero(kinds == kind))
@@ -54,7 +50,7 @@ class FeatureSampler(Sampler):
 
 
 def find_features(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
-    """The sharpest points of each sector of a ring, and the points of small curvature.
+    """The sharpest points of each sector of a ring, and all others that are reliable.
 
     Returns:
         Indices (N,) of the scan's points, ring after ring, and whether each is `EDGE`, `PLANE` or neither, 0.
@@ -66,5 +62,5 @@ def find_features(scan: Scan) -> tuple[NDArray[np.intp], NDArray[np.int8]]:
     write_curvatures(points, rings, curvature)
     known = curvature[np.isfinite(curvature)]
     noise_m2 = float(np.median(known)) if len(known) else 0.0
-    classify(points, ranges, rings, curvature, max(_CURVATURE_M2, _ABOVE_NOISE * noise_m2), np.inf, kinds)
+    classify(points, ranges, rings, curvature, max(_CURVATURE_M2, _ABOVE_NOISE * noise_m2), kinds)
     return order, kinds

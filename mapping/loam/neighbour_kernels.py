@@ -1,4 +1,4 @@
-"""Lines and planes through the five nearest neighbours of features in a map of centroids, compiled.
+"""Lines and planes through the five nearest neighbours of features in a map of voxels, compiled.
 
 The map has one centroid a voxel, hashed as in `mapping.surfels.hash_kernels`: its five nearest neighbours are looked
 for in the voxel of a point and the 26 around it.
@@ -35,7 +35,7 @@ _MOST_TILT = 0.05
 _MOST_POINTS = 60.0
 
 
-class Centroids(NamedTuple):
+class Voxels(NamedTuple):
     """The arrays of a map of M voxels."""
 
     cell_m: float  # edge of a voxel
@@ -62,7 +62,7 @@ def add_moments(points: FloatArray, rows: Rows, sums: FloatArray) -> None:
 
 @compiled
 def match_features(
-    points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, most: int, centroids: Centroids,
+    points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, most: int, voxels: Voxels,
     sensor: FloatArray, found: Surfaces,
 ) -> int:  # fmt: skip
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
@@ -73,16 +73,16 @@ def match_features(
     Returns:
         Number of points that are still unmatched.
     """
-    left, scale = 0, 1.0 / centroids.cell_m
+    left, scale = 0, 1.0 / voxels.cell_m
     near, squared = np.empty(most, dtype=np.int64), np.empty(most)
     scatter = np.empty(6)
     mean, variances, axis = np.empty(3), np.empty(3), np.empty(3)
-    most_off = min(_PLANE_M, _PLANE_CELLS * centroids.cell_m)
+    most_off = min(_PLANE_M, _PLANE_CELLS * voxels.cell_m)
     for w in range(len(unmatched)):
         n = unmatched[w]
-        count = _nearest(points[n], key_at(points[n], scale), centroids, near, squared)
+        count = _nearest(points[n], key_at(points[n], scale), voxels, near, squared)
         if count >= NEIGHBOURS:
-            number = _moments(points[n], near[:count], centroids.sums, mean, scatter)
+            number = _moments(points[n], near[:count], voxels.sums, mean, scatter)
             write_eigenvalues(scatter, variances)
             if is_line and variances[2] > _LINE_RATIO * variances[1]:
                 thickness_m, tilt = _uncertainty(variances[1], variances[2], number, 2.0)
@@ -93,7 +93,7 @@ def match_features(
             if not is_line and variances[1] > max(_PLANE_RATIO * variances[2], _FLAT_RATIO * variances[0]):
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
-                if tilt < _MOST_TILT and _farthest(near[:count], centroids.sums, mean, axis) < most_off:
+                if tilt < _MOST_TILT and _farthest(near[:count], voxels.sums, mean, axis) < most_off:
                     _write_plane(found, n, mean, axis, thickness_m, tilt, sensor)
                     continue
         unmatched[left] = n
@@ -102,16 +102,16 @@ def match_features(
 
 
 @compiled_part
-def _nearest(point: FloatArray, key: int, centroids: Centroids, near: NDArray[np.int64], squared: FloatArray) -> int:
-    """Write the rows of the nearest centroids to a point (3,), and their squared distances; return how many."""
+def _nearest(point: FloatArray, key: int, voxels: Voxels, near: NDArray[np.int64], squared: FloatArray) -> int:
+    """Write the rows of the nearest voxels to a point (3,), and their squared distances; return how many."""
     count, most = 0, len(near)
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
-                row = find_one(neighbour_key(key, i, j, k), centroids.bits, centroids.table_keys, centroids.table_rows)
+                row = find_one(neighbour_key(key, i, j, k), voxels.bits, voxels.table_keys, voxels.table_rows)
                 if row == ABSENT:
                     continue
-                cell = centroids.sums[row]
+                cell = voxels.sums[row]
                 x, y, z = cell[1] / cell[0] - point[0], cell[2] / cell[0] - point[1], cell[3] / cell[0] - point[2]
                 distance = x * x + y * y + z * z
                 if count == most and distance >= squared[most - 1]:

@@ -14,7 +14,7 @@ from lidarslam.cli import main
 from lidarslam.core.geometry import FloatArray, inverse
 from lidarslam.core.text.trajectory_io import read_tum, write_tum
 from lidarslam.core.trajectory import Trajectory
-from lidarslam.mapping.loam.features import Features, extract_features
+from lidarslam.mapping.loam.features import find_features
 
 SCANS = 8
 FIELDS = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("time", "f8"), ("ring", "u2")])
@@ -79,14 +79,14 @@ def test_an_interrupted_run_comes_to_the_same_results(
     whole, out, left = tmp_path / "whole", tmp_path / "run", 5
     lidarslam("run", source, "--out", whole, *arguments)
 
-    def interrupted(*given: Any) -> Features:
+    def interrupted(*given: Any) -> Any:
         nonlocal left
         left -= 1
         if left < 0:
             raise KeyboardInterrupt
-        return extract_features(*given)
+        return find_features(*given)
 
-    monkeypatch.setattr("lidarslam.mapping.loam.mapper.extract_features", interrupted)
+    monkeypatch.setattr("lidarslam.mapping.loam.features.find_features", interrupted)
     command = ["run", str(source), "--out", str(out), *arguments]
     assert CliRunner().invoke(main, command).exit_code == 1
     assert (out / "unfinished" / "state.npz").exists()

@@ -15,8 +15,9 @@ from lidarslam.core.state.stateful import Saved
 from lidarslam.core.tracking import Status
 from lidarslam.core.trajectory import Trajectory
 from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
-from lidarslam.mapping.loam.mapper import LoamMapper
-from lidarslam.mapping.tracking.mapper import Mapper
+from lidarslam.mapping.loam.feature_map import FeatureMap
+from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.odometry.interface import Motion, Odometry
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
@@ -178,16 +179,13 @@ def test_results_carry_what_the_map_says_of_the_pose(room_scans: list[Scan], roo
     assert set(results[3].stage_ms) == {"read", "odometry", "refine", "deskew", "map"}
 
 
-def test_the_configuration_chooses_the_mapper() -> None:
-    assert type(_mapper_of(MappingConfig())) is Mapper
-    assert type(_mapper_of(MappingConfig(method="loam"))) is LoamMapper
+def test_the_configuration_chooses_the_map(room_scans: list[Scan]) -> None:
+    for method, kind in (("surfels", SurfelMap), ("loam", FeatureMap)):
+        mapper = make_localiser(Config(mapping=MappingConfig(method=method))).mapper
+        assert mapper is not None
+        mapper.process(room_scans[0], Prior())
+        assert type(mapper.local_map) is kind
     assert isinstance(make_localiser(Config(mapping=MappingConfig(method="off"))), OdometryAlone)
-
-
-def _mapper_of(mapping: MappingConfig) -> object:
-    localiser = make_localiser(Config(mapping=mapping))
-    assert isinstance(localiser, ScanToMap)
-    return localiser._mapper
 
 
 @pytest.mark.parametrize("method", ["surfels", "loam"])
@@ -217,5 +215,4 @@ def test_scans_may_be_thinned_ahead_of_their_poses(room_scans: list[Scan], room_
         first, second = in_turn.localise(one, None), ahead.localise(other, None)
         assert second.status is Status.OK
         np.testing.assert_array_equal(first.T_world_lidar, second.T_world_lidar)
-    for method in ("loam", "off"):
-        assert make_localiser(Config(mapping=MappingConfig(method=method))).sample(room_scans[0]) is None
+    assert make_localiser(Config(mapping=MappingConfig(method="off"))).sample(room_scans[0]) is None

@@ -62,7 +62,7 @@ def registered(surfel_map: SurfelMap, sweep: Sweep) -> FloatArray:
 
 def inflation(surfel_map: SurfelMap, sweep: Sweep) -> FloatArray | None:
     """At the pose of the people, at rest."""
-    matcher = surfel_map.matcher(len(sweep))
+    matcher = surfel_map.matcher(sweep)
     matcher.match(transform_points(np.eye(4), sweep.points), np.eye(4))
     return inflation_of_small(sweep.points, np.eye(4), matcher.surfaces, surfel_map)
 

@@ -9,12 +9,11 @@ import pytest
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, exp
 from lidarslam.core.tracking import Status
-from lidarslam.mapping.config import GlobalMapConfig, MappingConfig
+from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.fixed_map.fixed_map import FixedMap
 from lidarslam.mapping.global_map.drawing import drawn_map
 from lidarslam.mapping.global_map.global_map import GlobalMap
 from lidarslam.mapping.global_map.moved_points import Views
-from lidarslam.mapping.loam.mapper import LoamMapper
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.voxel_hash import reach_m
 from lidarslam.mapping.tracking.mapper import Mapper
@@ -45,11 +44,11 @@ def test_points_up_to_the_reach_are_in_the_map(rng: np.random.Generator) -> None
     assert len(far.points()) == pytest.approx(len(near.points()), rel=0.1)
 
 
-@pytest.mark.parametrize("mapper", [Mapper, LoamMapper])
+@pytest.mark.parametrize("method", ["surfels", "loam"])
 def test_a_scan_beyond_the_reach_of_the_cells_is_lost_with_the_reason(
-    mapper: type[Mapper] | type[LoamMapper], room: Any, drive: Callable[[FloatArray], FloatArray]
+    method: MappingName, room: Any, drive: Callable[[FloatArray], FloatArray]
 ) -> None:
-    tracker = mapper(MappingConfig(cell_m=0.05, max_range_m=30.0))
+    tracker = Mapper(MappingConfig(method=method, cell_m=0.05, max_range_m=30.0))
     tracker.process(room.ring_sweep(drive, 0.1), Prior(T_prev_curr=np.eye(4)))
     T_prev_curr = exp([0.0, 0.0, 0.0, 1e7, 0.0, 0.0])
     mapped = tracker.process(room.ring_sweep(drive, 0.2), Prior(T_prev_curr=T_prev_curr, covariance=1e-12 * np.eye(6)))

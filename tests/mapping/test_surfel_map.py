@@ -5,7 +5,9 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, exp, make_transform
 from lidarslam.core.state.stateful import Saved
-from lidarslam.mapping.surfels.surfel_map import LEVELS, Correspondences, SurfelMap
+from lidarslam.mapping.registration.local_map import LEVELS
+from lidarslam.mapping.registration.surfaces import Correspondences
+from lidarslam.mapping.surfels.surfel_map import SurfelMap
 
 CELL = 0.4
 HALF = np.array([7.0, 5.0, 2.0])

@@ -7,9 +7,10 @@ import pytest
 
 from lidarslam.core.geometry import FloatArray, make_transform
 from lidarslam.core.state.stateful import Saved
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.registration.surfaces import Correspondences
 from lidarslam.mapping.surfels.grid import IS_PLANE, MEAN, NORMAL, SurfelGrid
 from lidarslam.mapping.surfels.hash_kernels import OTHER_SIDE
-from lidarslam.mapping.surfels.matching import Correspondences
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
 from lidarslam.mapping.surfels.voxel_hash import VoxelHash, key_cells, point_keys
 
@@ -36,7 +37,7 @@ def seen_wall(rng: np.random.Generator, cell_m: float, faces: tuple[float, float
 
 
 def first_matches(local_map: SurfelMap, points: FloatArray, side: int) -> Correspondences:
-    matcher = local_map.matcher(len(points))
+    matcher = local_map.matcher(Sweep(points))
     matcher.match(points, make_transform(np.eye(3), SENSORS[side]))
     return matcher.first_correspondences()
 

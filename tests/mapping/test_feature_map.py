@@ -1,0 +1,289 @@
+"""Maps of edges and planar points: their lines and planes, and registration to them, against known truth."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lidarslam.core.errors import InputError
+from lidarslam.core.geometry import FloatArray, exp, inverse, log, transform_points
+from lidarslam.core.state.stateful import Saved, State
+from lidarslam.mapping.loam.feature_kernels import EDGE, PLANE
+from lidarslam.mapping.loam.feature_map import FeatureMap, VoxelGrid
+from lidarslam.mapping.motion.deskew import Sweep
+from lidarslam.mapping.motion.prediction import Prediction
+from lidarslam.mapping.registration.local_map import LocalMap
+from lidarslam.mapping.registration.registration import Registration, register
+from lidarslam.mapping.registration.sampled_scan import SampledScan
+from lidarslam.mapping.surfels.voxel_hash import point_keys
+
+ThroughDisk = Callable[[State], Saved]
+ORIGIN = np.zeros(3)
+CELL_M = 0.2
+
+
+def kinds_of(edges: FloatArray, planes: FloatArray) -> NDArray[np.int8]:
+    return np.repeat(np.array([EDGE, PLANE], dtype=np.int8), [len(edges), len(planes)])
+
+
+def add(feature_map: FeatureMap, edges: FloatArray, planes: FloatArray, sensor: FloatArray = ORIGIN) -> None:
+    points = np.concatenate([edges, planes])
+    sweep = Sweep(points, None, kinds_of(edges, planes))
+    scan = SampledScan(0.0, feature_map.cell_m, 1.0, sweep, np.zeros(len(points)), sweep)
+    feature_map.add(scan, points, sensor)
+
+
+def map_of(edges: FloatArray, planes: FloatArray, cell_m: float = CELL_M, radius_m: float = 100.0) -> FeatureMap:
+    feature_map = FeatureMap(cell_m, radius_m)
+    add(feature_map, edges, planes)
+    return feature_map
+
+
+NONE = np.empty((0, 3))
+
+
+def test_a_voxel_has_the_mean_of_its_points(rng: np.random.Generator) -> None:
+    clouds = [rng.uniform(-3.0, 3.0, (2000, 3)) for _ in range(3)]
+    grid = VoxelGrid(0.5)
+    for cloud in clouds:
+        grid.insert(cloud)
+    points = np.concatenate(clouds)
+    keys, inverse_keys, counts = np.unique(point_keys(points, 0.5), return_inverse=True, return_counts=True)
+    means = np.array([np.bincount(inverse_keys, points[:, axis]) for axis in range(3)]).T / counts[:, None]
+    assert len(grid) == len(keys)
+    np.testing.assert_allclose(grid.means[np.argsort(grid._keys)], means, atol=1e-12)
+
+
+def test_a_full_voxel_stays_as_it_is(rng: np.random.Generator) -> None:
+    grid = VoxelGrid(1.0)
+    grid.insert(rng.uniform(0.1, 0.2, (60, 3)))
+    before = grid.means
+    grid.insert(rng.uniform(0.8, 0.9, (60, 3)))
+    np.testing.assert_array_equal(grid.means, before)
+
+
+def test_voxels_beyond_the_radius_are_dropped_on_the_way(rng: np.random.Generator) -> None:
+    points = rng.uniform(-10.0, 10.0, (2000, 3))
+    feature_map = map_of(points[:500], points[500:], radius_m=8.0)
+    sensor = np.array([5.0, 0.0, 0.0])
+    add(feature_map, NONE, NONE, sensor)
+    for grid in feature_map._grids:
+        assert len(grid) > 0
+        assert np.linalg.norm(grid.means - sensor, axis=1).max() < 8.0
+
+
+def test_a_map_of_other_cells_has_the_same_points(rng: np.random.Generator) -> None:
+    points = rng.uniform(-3.0, 3.0, (3000, 3))
+    fine, coarse = map_of(points[:900], points[900:], 0.1), map_of(points[:900], points[900:], 0.4)
+    resized = fine.resized(0.4)
+    assert fine.resized(0.1) is fine
+    assert resized.scans == fine.scans
+    for found, expected in zip(resized._grids, coarse._grids, strict=True):
+        assert found._sums[:, 0].sum() == expected._sums[:, 0].sum()
+        assert len(found) == pytest.approx(len(expected), rel=0.2)
+
+
+def test_a_restored_map_goes_on(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+    whole = map_of(rng.uniform(-4.0, 4.0, (1000, 3)), rng.uniform(-4.0, 4.0, (2000, 3)), 0.3)
+    restored = FeatureMap(1.0, 1.0)
+    restored.restore(through_disk(whole.state()))
+    for _ in range(2):
+        for one, other in zip(whole._grids, restored._grids, strict=True):
+            np.testing.assert_array_equal(one.means, other.means)
+        more = rng.uniform(-5.0, 5.0, (3000, 3))
+        for held in (whole, restored):
+            add(held, more[:1000], more[1000:])
+
+
+def test_a_local_map_is_restored_as_what_it_is(rng: np.random.Generator, through_disk: ThroughDisk) -> None:
+    from lidarslam.core.state.stateful import decode
+
+    whole = map_of(rng.uniform(-4.0, 4.0, (100, 3)), rng.uniform(-4.0, 4.0, (100, 3)))
+    saved = through_disk({"map": whole.state()})
+    assert isinstance(decode(LocalMap | None, saved.value("map"), saved), FeatureMap)
+
+
+@pytest.mark.parametrize(
+    ("forge", "message"),
+    [
+        (lambda state: state.update(_edges=state["_edges"][:2]), "2 and 3 grids instead of 3"),
+        (lambda state: state["_planes"][0].update(_sums=state["_planes"][0]["_sums"][1:]), "differ in number"),
+        (lambda state: state["_planes"][1].update(cell_m=0.5), "grids of cells of"),
+        (lambda state: state["_edges"][0].update(_sums=np.zeros((4, 2))), "_sums.*expected an array of shape"),
+    ],
+)
+def test_a_forged_map_is_refused(
+    rng: np.random.Generator, through_disk: ThroughDisk, forge: Callable[[State], object], message: str
+) -> None:
+    state = map_of(rng.uniform(-4.0, 4.0, (300, 3)), rng.uniform(-4.0, 4.0, (300, 3))).state()
+    forge(state)
+    with pytest.raises(InputError, match=message):
+        FeatureMap(1.0, 1.0).restore(through_disk(state))
+
+
+def on_plane(rng: np.random.Generator, count: int, noise_m: float = 0.0) -> FloatArray:
+    """Points of the plane z = 1."""
+    return np.column_stack([rng.uniform(-3.0, 3.0, (count, 2)), 1.0 + noise_m * rng.standard_normal(count)])
+
+
+def test_a_plane_is_that_of_the_points_in_the_five_nearest_voxels(rng: np.random.Generator) -> None:
+    points = on_plane(rng, 20_000, 0.01)
+    feature_map, asked = map_of(NONE, points), on_plane(rng, 200)[:, :]
+    found = feature_map.match(asked, np.eye(4))
+    np.testing.assert_array_equal(found.index, np.arange(200))
+    grid = feature_map._planes[0]
+    keys = point_keys(points, CELL_M)
+    for row, near in enumerate(cKDTree(grid.means).query(asked, 5)[1]):
+        members = points[np.isin(keys, grid._keys[near])]
+        values, vectors = np.linalg.eigh(np.cov(members.T, bias=True))
+        assert abs(found.normals[row] @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(found.points[row], members.mean(axis=0), atol=1e-9)
+        number, noise = len(members), 2.0 * 0.02**2
+        variance = (number * values[0] + noise) / (number - 3 + 2)
+        assert found.thickness_m[row] == pytest.approx(np.sqrt(variance * (1.0 + 120.0 / number)))
+        assert found.tilt[row] == pytest.approx(np.sqrt(variance / (number * values[1])))
+
+
+def test_the_normal_of_a_plane_faces_the_sensor(rng: np.random.Generator) -> None:
+    feature_map, asked = map_of(NONE, on_plane(rng, 20_000)), on_plane(rng, 50)
+    for z, side in ((5.0, 1.0), (-5.0, -1.0)):
+        found = feature_map.match(asked, exp([0, 0, 0, 0, 0, z]))
+        np.testing.assert_allclose(found.normals, np.tile([0.0, 0.0, side], (50, 1)), atol=1e-6)
+
+
+def test_a_line_has_two_residuals_the_first_along_the_distance(rng: np.random.Generator) -> None:
+    along = rng.uniform(-3.0, 3.0, 3000)
+    edges = np.column_stack([along, np.full((3000, 2), [2.0, -1.0])]) + 0.005 * rng.standard_normal((3000, 3))
+    asked = np.array([[0.5, 2.05, -1.0], [-0.7, 2.0, -0.9]])
+    matcher = map_of(edges, NONE).matcher(Sweep(asked, None, np.full(2, EDGE, dtype=np.int8)))
+    matcher.match(asked, np.eye(4))
+    np.testing.assert_array_equal(matcher.surfaces.counts, 2)
+    np.testing.assert_allclose(matcher.surfaces.normals[:, 0], [[0, 1, 0], [0, 0, 1]], atol=0.05)
+    normals = matcher.surfaces.normals[:, :2]
+    np.testing.assert_allclose(np.einsum("nki,nli->nkl", normals, normals), np.tile(np.eye(2), (2, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(np.abs(matcher.first_correspondences().residuals(asked)), [0.05, 0.1], atol=0.01)
+
+
+@pytest.mark.parametrize("held", [0, 4])
+def test_fewer_than_five_voxels_make_no_plane(rng: np.random.Generator, held: int) -> None:
+    middles = CELL_M * (np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])[:held] + 0.5)
+    points = (middles[:, None] + rng.uniform(-0.05, 0.05, (held, 50, 3)) * [1, 1, 0]).reshape(-1, 3)
+    assert len(map_of(NONE, points).match(middles, np.eye(4))) == 0
+
+
+def test_points_of_one_ring_or_across_a_corner_make_no_plane(rng: np.random.Generator) -> None:
+    """Noise gives a ring's points any plane; those of a corner are as thick as wide."""
+    ring = np.column_stack([rng.uniform(-0.45, 0.45, 40), 0.02 * rng.standard_normal((40, 2))])
+    corner = np.concatenate([
+        np.column_stack([rng.uniform(0, 0.3, 500), np.zeros(500), rng.uniform(-0.3, 0.3, 500)]),
+        np.column_stack([np.zeros(500), rng.uniform(0, 0.3, 500), rng.uniform(-0.3, 0.3, 500)]),
+        np.column_stack([rng.uniform(0, 0.3, 500), rng.uniform(0, 0.3, 500), np.zeros(500)]),
+    ])  # fmt: skip
+    for points in (ring, corner):
+        assert len(map_of(NONE, points).match(np.array([[0.01, 0.01, 0.01]]), np.eye(4))) == 0
+
+
+def test_where_the_finest_voxels_are_too_few_coarser_ones_have_the_plane(rng: np.random.Generator) -> None:
+    feature_map, asked = map_of(NONE, on_plane(rng, 150, 0.005)), on_plane(rng, 50)
+    assert len(feature_map.match(asked, np.eye(4), 2)) > 45
+    found = feature_map.match(asked, np.eye(4))
+    assert len(found) > 45
+    assert np.abs(found.normals[:, 2]).min() > 0.98
+
+
+# A hall of 12 x 9 x 5 m: its faces sampled away from their borders, and the lines where they meet, away from corners.
+HALF = np.array([6.0, 4.5, 2.5])
+BORDER_M = 0.7
+
+
+def on_faces(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2)) -> FloatArray:
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF - BORDER_M)
+    axis = np.array(axes)[np.arange(count) % len(axes)]
+    points[np.arange(count), axis] = HALF[axis] * rng.choice([-1.0, 1.0], count)
+    return points
+
+
+def on_lines(rng: np.random.Generator, count: int, axes: tuple[int, ...] = (0, 1, 2)) -> FloatArray:
+    points = HALF * rng.choice([-1.0, 1.0], (count, 3))
+    axis = np.array(axes)[np.arange(count) % len(axes)]
+    points[np.arange(count), axis] = rng.uniform(-1.0, 1.0, count) * (HALF - BORDER_M)[axis]
+    return points
+
+
+def hall(
+    rng: np.random.Generator, faces: tuple[int, ...] = (0, 1, 2), lines: tuple[int, ...] = (0, 1, 2)
+) -> FeatureMap:
+    return map_of(on_lines(rng, 20_000, lines), on_faces(rng, 60_000, faces))
+
+
+T_TRUE = exp([0.02, -0.03, 0.4, 1.0, -0.5, 0.2])
+CLOSE = exp([0.01, -0.015, 0.03, 0.12, -0.08, 0.05])  # of the prediction to the truth
+COVARIANCE = np.diag([0.05**2] * 3 + [0.3**2] * 3 + [1e-6] * 6)
+
+
+def registered(
+    rng: np.random.Generator, edges: int, planes: int, feature_map: FeatureMap,
+    faces: tuple[int, ...] = (0, 1, 2), lines: tuple[int, ...] = (0, 1, 2), noise_m: float = 0.0,
+) -> Registration | None:  # fmt: skip
+    seen = on_lines(rng, edges, lines), on_faces(rng, planes, faces)
+    points = transform_points(inverse(T_TRUE), np.concatenate(seen)) + noise_m * rng.standard_normal(
+        (edges + planes, 3)
+    )
+    prediction = Prediction(0.0, T_TRUE @ CLOSE, np.zeros(6), COVARIANCE)
+    return register(Sweep(points, None, kinds_of(*seen)), prediction, feature_map, with_velocity=False)
+
+
+@pytest.mark.parametrize(("edges", "planes"), [(200, 600), (600, 0), (0, 600)])
+def test_a_motion_is_found(rng: np.random.Generator, edges: int, planes: int) -> None:
+    found = registered(rng, edges, planes, hall(rng))
+    assert found is not None
+    np.testing.assert_allclose(log(inverse(T_TRUE) @ found.T_world_lidar), 0.0, atol=1e-3)
+    assert found.degeneracy.names == ()
+
+
+def test_along_a_corridor_the_prediction_is_kept_and_the_covariance_grows(rng: np.random.Generator) -> None:
+    found = registered(rng, 300, 900, hall(rng, (1, 2), (0,)), (1, 2), (0,))
+    assert found is not None
+    assert found.degeneracy.names == ("x",)
+    error = (found.T_world_lidar - T_TRUE)[:3, 3]
+    assert error[0] == pytest.approx((T_TRUE @ CLOSE - T_TRUE)[0, 3], abs=0.01)
+    np.testing.assert_allclose(error[1:], 0.0, atol=2e-3)
+    along = T_TRUE[:3, :3].T[:, 0]
+    assert along @ found.covariance[3:6, 3:6] @ along == pytest.approx(COVARIANCE[3, 3], rel=0.05)
+
+
+def test_too_few_correspondences_make_no_pose(rng: np.random.Generator) -> None:
+    feature_map = hall(rng)
+    assert registered(rng, 20, 20, feature_map) is None
+    assert registered(rng, 100, 300, FeatureMap(CELL_M, 100.0)) is None
+
+
+def test_the_covariance_is_no_smaller_than_the_errors(rng: np.random.Generator) -> None:
+    """Of independent noise; the errors of real scans are correlated, and the covariance allows for that."""
+    feature_map, errors, stated = hall(rng), [], []
+    for _ in range(30):
+        found = registered(rng, 100, 300, feature_map, noise_m=0.02)
+        assert found is not None
+        errors.append(log(inverse(T_TRUE) @ found.T_world_lidar))
+        stated.append(np.diag(found.covariance)[:6])
+    ratio = np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0)
+    assert (ratio > 1.0).all()
+    assert (ratio < 100.0).all()
+
+
+def test_the_vertical_is_that_of_the_floor(rng: np.random.Generator) -> None:
+    tilt = exp([0.1, 0.05, 0.0, 0.0, 0.0, 0.0])
+    feature_map = map_of(NONE, transform_points(tilt, on_faces(rng, 60_000)))
+    np.testing.assert_allclose(feature_map.vertical(), tilt[:3, 2], atol=0.01)
+
+
+def test_large_surfaces_go_on(rng: np.random.Generator) -> None:
+    faces = on_faces(rng, 60_000)
+    person = np.array([1.0, 1.0, 0.0]) + rng.uniform(-1.0, 1.0, (600, 3)) * [0.2, 0.0, 0.2]
+    feature_map = map_of(NONE, np.concatenate([faces, person]))
+    floor, board = np.array([[2.0, 0.5, -2.5]]), np.array([[1.0, 1.0, 0.0]])
+    assert feature_map.goes_on(floor, np.array([[0.0, 0.0, 1.0]]), ORIGIN, 0.94, 0.08).all()
+    assert not feature_map.goes_on(floor, np.array([[0.0, 1.0, 0.0]]), ORIGIN, 0.94, 0.08).any()
+    assert not feature_map.goes_on(board, np.array([[0.0, 1.0, 0.0]]), ORIGIN, 0.94, 0.08).any()
