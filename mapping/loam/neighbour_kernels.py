@@ -16,8 +16,8 @@ from lidarslam.mapping.registration.surfaces import Surfaces
 from lidarslam.mapping.surfels.hash_kernels import ABSENT, Keys, Rows, find_one, key_at, neighbour_key
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 
-# Neighbours that a line or plane is fitted to.
-NEIGHBOURS = 5
+# Voxels whose points a plane or line is fitted to, and the least number for a line, which passes through few.
+NEIGHBOURS, _LINE_VOXELS = 5, 3
 # Least ratio of the two largest variances of a line's neighbours, and of a plane's: points of one ring span no plane.
 _LINE_RATIO, _PLANE_RATIO = 3.0, 0.0225
 # Least ratio of the two smallest variances of a plane's.
@@ -81,7 +81,7 @@ def match_features(
     for w in range(len(unmatched)):
         n = unmatched[w]
         count = _nearest(points[n], key_at(points[n], scale), voxels, near, squared)
-        if count >= NEIGHBOURS:
+        if count >= (_LINE_VOXELS if is_line else NEIGHBOURS):
             number = _moments(points[n], near[:count], voxels.sums, mean, scatter)
             write_eigenvalues(scatter, variances)
             if is_line and variances[2] > _LINE_RATIO * variances[1]:

@@ -18,6 +18,7 @@ from lidarslam.mapping.config import GlobalMapConfig, MappingConfig, MappingName
 from lidarslam.mapping.loam.feature_map import FeatureMap
 from lidarslam.mapping.motion.prediction import Prior
 from lidarslam.mapping.surfels.surfel_map import SurfelMap
+from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.odometry.interface import Motion, Odometry
 from lidarslam.odometry.methods.consistency import ConsistencyCheck
 from lidarslam.odometry.methods.constant_velocity import ConstantVelocity
