@@ -7,53 +7,57 @@ Prints a Markdown table, a row for each recording: ATE in metres after SE(3) ali
 
 - ours;
 - published edges: curvature above 0.1 square metres, whatever the noise of the scan;
-- averaged voxels: Open3D's voxel grid over map and new scan together, instead of the first point of a voxel;
-- both.
+- published planes: of the means of five voxels alone, not of all points in them;
+- discrete: the sweep compensated with the odometry's velocity, not with one that is estimated with the pose.
 """
 
 import argparse
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-import open3d as o3d
 from mapping_accuracy import add_simulation_arguments, localise, print_row, recordings
 
 from lidarslam.config.settings import Config
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.loam import features
-from lidarslam.mapping.loam.feature_map import FeatureMap
+from lidarslam.mapping.loam import feature_map, features
+from lidarslam.mapping.loam.neighbour_kernels import add_moments
+from lidarslam.mapping.surfels.hash_kernels import Rows
+from lidarslam.mapping.surfels.symmetric import SYMMETRIC
 from lidarslam.odometry.config import OdometryConfig
-
-_VARIANTS = {
-    "ours": (False, False),
-    "published edges": (True, False),
-    "averaged voxels": (False, True),
-    "both": (True, True),
-}
-
-
-def insert_averaged(self: FeatureMap, points: FloatArray, sensor: FloatArray, spacing_m: float) -> None:
-    """`FeatureMap.insert` with one mean a voxel."""
-    points = np.concatenate([self.points, points])
-    near = points[np.linalg.norm(points - sensor, axis=1) < self._radius_m]
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    self.points = np.asarray(cloud.voxel_down_sample(spacing_m).points) if len(near) else near
-    self._search = None
 
 
 @contextmanager
-def variant(published_edges: bool, averaged: bool) -> Iterator[None]:
-    """The published choices for a while."""
-    with ExitStack() as stack:
-        if published_edges:
-            stack.enter_context(patch.object(features, "_ABOVE_NOISE", 0.0))
-        if averaged:
-            stack.enter_context(patch.object(FeatureMap, "insert", insert_averaged))
+def published_edges() -> Iterator[None]:
+    """Edges by the published threshold for a while."""
+    with patch.object(features, "_ABOVE_NOISE", 0.0):
         yield
+
+
+@contextmanager
+def published_planes() -> Iterator[None]:
+    """One point a voxel, the mean of all, for a while."""
+
+    def add_mean(points: FloatArray, rows: Rows, sums: FloatArray) -> None:
+        add_moments(points, rows, sums)
+        means = sums[:, 1:4] / sums[:, :1]
+        products = [means[:, i] * means[:, j] for i, j in SYMMETRIC]
+        sums[:, 4:] = sums[:, :1] * np.stack(products, axis=1)
+
+    with patch.object(feature_map, "add_moments", add_mean):
+        yield
+
+
+_LOAM = MappingConfig(method="loam")
+_VARIANTS: dict[str, tuple[Callable[[], AbstractContextManager[None]], MappingConfig]] = {
+    "ours": (nullcontext, _LOAM),
+    "published edges": (published_edges, _LOAM),
+    "published planes": (published_planes, _LOAM),
+    "discrete": (nullcontext, MappingConfig(method="loam", continuous_time=False)),
+}
 
 
 def main() -> None:
@@ -63,14 +67,14 @@ def main() -> None:
     parser.add_argument("--odometry", choices=("learned", "constant-velocity"), default="learned")
     add_simulation_arguments(parser, (), ("tracked",))
     arguments = parser.parse_args()
-    config = Config(odometry=OdometryConfig(method=arguments.odometry), mapping=MappingConfig(method="loam"))
+    odometry = OdometryConfig(method=arguments.odometry)
     print_row(["recording", "scans", *_VARIANTS])
     print_row(["---"] * (2 + len(_VARIANTS)))
     for recorded in recordings(arguments):
         cells = []
-        for choices in _VARIANTS.values():
-            with variant(*choices):
-                cells.append(localise(recorded, config).text())
+        for variant, mapping in _VARIANTS.values():
+            with variant():
+                cells.append(localise(recorded, Config(odometry=odometry, mapping=mapping)).text())
         print_row([recorded.name, str(len(recorded.scans)), *cells])
 
 

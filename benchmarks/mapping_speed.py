@@ -14,8 +14,7 @@ passes next to each other, its median, smallest and largest.
 Ours runs with BLAS on one thread, as `lidarslam run` has it; KISS-ICP uses as many threads as it likes. A stage's time
 is without the stages inside it:
 
-- thin: choosing the points of the scan; features: LOAM's;
-- search: neighbours in LOAM's map, and their principal axes;
+- thin: choosing the points of the scan; LOAM's features;
 - registration: finding the surfaces and solving for the pose;
 - fit: holding the result against the map;
 - map update: compensating the scan, adding it, forgetting what is far;
@@ -42,33 +41,21 @@ from threadpoolctl import threadpool_limits
 from lidarslam.core.scan import Scan
 from lidarslam.core.tracking import Status
 from lidarslam.datasets.registry import open_recording
-from lidarslam.mapping.config import MappingConfig
-from lidarslam.mapping.loam import mapper as loam_mapper
-from lidarslam.mapping.loam.feature_map import FeatureMap
-from lidarslam.mapping.loam.mapper import LoamMapper
+from lidarslam.mapping.config import MappingConfig, MappingName
 from lidarslam.mapping.motion.prediction import Prior
-from lidarslam.mapping.surfels import sampling
+from lidarslam.mapping.registration.sampled_scan import Sampler
 from lidarslam.mapping.tracking import attempts
 from lidarslam.mapping.tracking.mapper import Mapper
 from lidarslam.pipeline.scan_stream import in_order
 
-# Method -> its mapper, and stage -> what is timed for it: the object that holds the function, and its name there.
-_MAPPERS: dict[str, type[Mapper | LoamMapper]] = {"surfels": Mapper, "loam": LoamMapper}
-_STAGES: dict[str, dict[str, tuple[Any, str]]] = {
-    "surfels": {
-        "thin": (sampling.Sampler, "sample"),
-        "registration": (attempts, "register"),
-        "fit": (attempts, "measure_fit"),
-        "map update": (Mapper, "_insert"),
-        "rest": (Mapper, "process"),
-    },
-    "loam": {
-        "features": (loam_mapper, "extract_features"),
-        "search": (FeatureMap, "neighbourhoods"),
-        "registration": (loam_mapper, "register"),
-        "map update": (LoamMapper, "_insert"),
-        "rest": (LoamMapper, "process"),
-    },
+_METHODS: tuple[MappingName, ...] = ("surfels", "loam")
+# Stage -> what is timed for it: the object that holds the function, and its name there.
+_STAGES: dict[str, tuple[Any, str]] = {
+    "thin": (Sampler, "sample"),
+    "registration": (attempts, "register"),
+    "fit": (attempts, "measure_fit"),
+    "map update": (Mapper, "_insert"),
+    "rest": (Mapper, "process"),
 }
 
 
@@ -120,21 +107,21 @@ class _Pass:
     bad: int = 0
 
 
-def run_ours(scans: Sequence[Scan], method: str, warm_up: int) -> _Pass:
+def run_ours(scans: Sequence[Scan], method: MappingName, warm_up: int) -> _Pass:
     """Scan-to-map refinement without odometry."""
-    ours, stages = _MAPPERS[method](MappingConfig()), _STAGES[method]
+    ours = Mapper(MappingConfig(method=method))
     watches, bad = [], 0
     with threadpool_limits(1, "blas"):
         for scan in scans:
             watch = _Stopwatch()
             with ExitStack() as stack:
-                for stage, (owner, name) in stages.items():
+                for stage, (owner, name) in _STAGES.items():
                     stack.enter_context(patch.object(owner, name, watch.replacement(stage, owner, name)))
                 mapped = ours.process(scan, Prior())
             watches.append(watch.seconds)
             bad += mapped.status is not Status.OK
     stage_ms = {
-        stage: 1e3 * np.array([seconds.get(stage, (0.0, 0.0)) for seconds in watches[warm_up:]]) for stage in stages
+        stage: 1e3 * np.array([seconds.get(stage, (0.0, 0.0)) for seconds in watches[warm_up:]]) for stage in _STAGES
     }
     return _Pass(np.sum(list(stage_ms.values()), axis=0), stage_ms, bad)
 
@@ -154,12 +141,12 @@ def run_kiss(scans: Sequence[Scan], warm_up: int) -> _Pass:
     return _Pass(1e3 * np.array(seconds[warm_up:]))
 
 
-def compare(name: str, scans: Sequence[Scan], methods: Sequence[str], rounds: int, warm_up: int) -> None:
+def compare(name: str, scans: Sequence[Scan], methods: Sequence[MappingName], rounds: int, warm_up: int) -> None:
     """Run all in turn, and print what they took."""
     for method in methods:  # loops are compiled when they are first called on a machine
         run_ours(scans[:8], method, 0)
-    ours: dict[str, list[_Pass]] = {method: [] for method in methods}
-    kiss: dict[str, list[_Pass]] = {method: [] for method in methods}
+    ours: dict[MappingName, list[_Pass]] = {method: [] for method in methods}
+    kiss: dict[MappingName, list[_Pass]] = {method: [] for method in methods}
     for _, label in itertools.product(range(rounds), methods):
         ours[label].append(run_ours(scans, label, warm_up))
         kiss[label].append(run_kiss(scans, warm_up))
@@ -180,7 +167,7 @@ def _print_stages(label: str, passes: Sequence[_Pass]) -> None:
     print(f"\nStages, {label} ({passes[-1].bad} scans degraded or lost):\n")
     print_row(["stage", "wall median", "wall p95", "CPU median", "CPU p95"])
     print_row(["---"] * 5)
-    for stage in _STAGES[label]:
+    for stage in _STAGES:
         print_row([stage, *_times([one.stage_ms[stage] for one in passes])[:4]])
 
 
@@ -202,7 +189,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*", type=Path, help="recordings")
     parser.add_argument("--simulate", nargs="+", default=[], metavar="SENSOR:WORLD:MOTION")
-    parser.add_argument("--methods", nargs="+", choices=_MAPPERS, default=["surfels"])
+    parser.add_argument("--methods", nargs="+", choices=_METHODS, default=["surfels"])
     parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--warm-up", type=int, default=5)

@@ -1,0 +1,90 @@
+"""Search of five neighbours in LOAM's map: Open3D's nearest-neighbour search beside our hash of voxels.
+
+    python benchmarks/loam_search.py KITTI/sequences/04 office_spin --scans 60
+
+Prints a Markdown table, a row for each recording: median milliseconds a scan (ours on one
+thread, Open3D on all) of
+
+- Open3D, index: its index of the map's voxels, which every scan changes;
+- Open3D, search: five neighbours of the scan's planar keypoints, once;
+- ours, insert: the scan's planar points into the finest of the map's grids;
+- ours, search: five neighbours and their plane, once.
+
+Ours are looked for in the 27 voxels around a point only: those farther than an edge may be missed.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from mapping_accuracy import print_row
+
+from lidarslam.core.geometry import FloatArray, transform_points
+from lidarslam.core.scan import Scan
+from lidarslam.datasets.registry import open_recording
+from lidarslam.mapping.config import MappingConfig
+from lidarslam.mapping.loam.feature_kernels import PLANE
+from lidarslam.mapping.loam.feature_map import VoxelGrid
+from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, match_features
+from lidarslam.mapping.motion.prediction import Prior
+from lidarslam.mapping.registration.surfaces import Surfaces
+from lidarslam.mapping.tracking.mapper import Mapper
+from lidarslam.pipeline.scan_stream import in_order
+
+
+def main() -> None:
+    """Parse the command line, and time both on every recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="+", type=Path, help="recordings")
+    parser.add_argument("--scans", type=int, default=60, help="of each recording, at most")
+    arguments = parser.parse_args()
+    print_row(["recording", "voxels", "Open3D, index", "Open3D, search", "ours, insert", "ours, search"])
+    print_row(["---"] * 6)
+    for source in arguments.sources:
+        recording = open_recording(source)
+        print_row([recording.name, *_cells(list(in_order(recording.scans(0, arguments.scans))))])
+
+
+def _cells(scans: list[Scan]) -> list[str]:
+    mapper, grid, rows = Mapper(MappingConfig(method="loam")), None, []
+    for scan in scans:
+        sampled = mapper.sample(scan)
+        state = mapper.process_sampled(sampled, Prior()).state
+        assert sampled.sweep.kinds is not None
+        assert sampled.keypoints.kinds is not None
+        planes, keypoints = (
+            transform_points(state.T_world_lidar, sweep.compensated(state.velocity)[sweep.kinds == PLANE])
+            for sweep in (sampled.sweep, sampled.keypoints)
+        )
+        if grid is not None and grid.cell_m == sampled.cell_m:
+            rows.append(_times(grid, planes, keypoints))
+        else:
+            grid = VoxelGrid(sampled.cell_m)
+            grid.insert(planes)
+    assert grid is not None
+    return [f"{len(grid):,}", *(f"{value:.1f}" for value in np.median(rows[1:], axis=0))]
+
+
+def _times(grid: VoxelGrid, planes: FloatArray, keypoints: FloatArray) -> list[float]:
+    means, found = grid.means, Surfaces.none(len(keypoints))
+    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(means), o3d.core.int32)
+    index_ms = _timed(search.knn_index)
+    theirs_ms = _timed(lambda: search.knn_search(o3d.core.Tensor.from_numpy(keypoints), NEIGHBOURS))
+    ours_ms = _timed(
+        lambda: match_features(keypoints, np.arange(len(keypoints)), False, NEIGHBOURS, grid.voxels, np.zeros(3), found)
+    )
+    insert_ms = _timed(lambda: grid.insert(planes))
+    return [index_ms, theirs_ms, insert_ms, ours_ms]
+
+
+def _timed(work: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    work()
+    return 1e3 * (time.perf_counter() - started)
+
+
+if __name__ == "__main__":
+    main()
