@@ -58,7 +58,7 @@ class MappingConfig(BaseModel):
         3000, ge=100, le=10**6, description="points of a scan that are registered, at most (LOAM: planar ones)"
     )
     continuous_time: bool = Field(
-        True, description="surfels only: estimate the velocity during the sweep together with its pose"
+        True, description="estimate the velocity during the sweep together with its pose"
     )
     prior_rotation_deg: float = Field(
         3.0,
@@ -80,7 +80,7 @@ class MappingConfig(BaseModel):
     )
     budget_ms: BudgetMs = Field(
         None,
-        description="surfels only: time of a scan after which no further attempt begins, and searches go on with the"
+        description="time of a scan after which no further attempt begins, and searches go on with the"
         " next scan; auto: half of the time between scans; null: no limit (live: auto)",
     )
     tracking: TrackingConfig = TrackingConfig()
