@@ -57,9 +57,7 @@ class MappingConfig(BaseModel):
     keypoints: int = Field(
         3000, ge=100, le=10**6, description="points of a scan that are registered, at most (LOAM: planar ones)"
     )
-    continuous_time: bool = Field(
-        True, description="estimate the velocity during the sweep together with its pose"
-    )
+    continuous_time: bool = Field(True, description="estimate the velocity during the sweep together with its pose")
     prior_rotation_deg: float = Field(
         3.0,
         ge=0.01,

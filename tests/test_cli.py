@@ -362,7 +362,7 @@ def test_verbose_says_what_is_chosen_before_the_command_or_after(
         "time of a point: none is known",
         "3 scans of 5, to ",
         "odometry: constant-velocity; mapping: surfels; pose graph: off",
-        "new surfel map at ",
+        "new local map at ",
         "voxels of the map: ",
         "writing the results of 3 scans",
     ):

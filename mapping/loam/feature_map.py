@@ -1,4 +1,4 @@
-"""Map of edge and planar features: a centroid a voxel, in several sizes, and the lines and planes through them."""
+"""Map of edges and planar points: their moments in voxels of several sizes, and the lines and planes through these."""
 
 from typing import Annotated
 
@@ -24,10 +24,10 @@ _FORGET_AFTER = 0.2
 
 
 class VoxelGrid(Stateful):
-    """The mean of the points in each voxel.
+    """Number, mean and covariance of the points in each voxel.
 
-    As the voxel grids of PCL and Open3D form it, of a mean and the new scan's, it would halve the weight of earlier
-    scans each time: the map would follow the sensor.
+    A mean of the last mean and the new scan's, as of PCL's voxel grid, would halve the weight of earlier scans each
+    time: the map would follow the sensor.
     """
 
     cell_m: float
@@ -85,18 +85,18 @@ class VoxelGrid(Stateful):
 
 
 class FeatureMatcher(Matcher):
-    """Lines of edges and planes of other points, through their five nearest neighbours.
+    """Lines of edges and planes of other points, through their nearest voxels.
 
     A point that has moved by a small part of a cell since it was matched keeps its line or plane.
 
     Args:
         edges, planes: grids of voxels, the finest first.
-        sweep: edges are told by their kind; without kinds, all points are planar.
+        sweep: with the kinds of its points; without, all points are planar.
     """
 
     def __init__(self, edges: list[VoxelGrid], planes: list[VoxelGrid], sweep: Sweep) -> None:
         self._edges, self._planes = edges, planes
-        self._is_edge = np.zeros(len(sweep), dtype=np.bool_) if sweep.kinds is None else sweep.kinds == EDGE
+        self._is_edge = _edges_of(sweep)
         self._matched = np.full((len(sweep), 3), np.inf)  # where the points were matched
         self.surfaces = Surfaces.none(len(sweep))
 
@@ -139,8 +139,7 @@ class FeatureMap(LocalMap):
 
     def add(self, scan: SampledScan, points: FloatArray, sensor: FloatArray) -> None:
         """See `LocalMap`."""
-        assert scan.sweep.kinds is not None
-        is_edge = scan.sweep.kinds == EDGE
+        is_edge = _edges_of(scan.sweep)
         for grids, chosen in ((self._edges, points[is_edge]), (self._planes, points[~is_edge])):
             for grid in grids:
                 grid.insert(chosen)
@@ -189,3 +188,8 @@ class FeatureMap(LocalMap):
         sizes = [grid.cell_m / level for grid, level in zip(self._grids, 2 * LEVELS, strict=True)]
         if not (self._radius_m > 0.0 and np.allclose(sizes, self.cell_m, rtol=1e-9, atol=0.0)):
             raise ValueError(f"grids of cells of {sizes} m in a map of {self.cell_m:g} m")
+
+
+def _edges_of(sweep: Sweep) -> NDArray[np.bool_]:
+    """Which points (N,) of a sweep are edges."""
+    return np.zeros(len(sweep), dtype=np.bool_) if sweep.kinds is None else sweep.kinds == EDGE

@@ -1,7 +1,7 @@
-"""Lines and planes through the five nearest neighbours of features in a map of voxels, compiled.
+"""Lines and planes through the nearest voxels of features, compiled.
 
-The map has one centroid a voxel, hashed as in `mapping.surfels.hash_kernels`: its five nearest neighbours are looked
-for in the voxel of a point and the 26 around it.
+The map has the moments of the points in each voxel, hashed as in `mapping.surfels.hash_kernels`: the five nearest to a
+point, by their means, are looked for in its voxel and the 26 around it.
 """
 
 import math

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import find_peaks
 
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.scan import Scan
@@ -70,6 +69,8 @@ def _stored_rings(points: FloatArray) -> NDArray[np.intp] | None:
 
 def _rings_of(elevations: FloatArray) -> NDArray[np.intp]:
     """Rings (N,) by the nearest peak of the histogram of elevations; even rows where there are no peaks."""
+    from scipy.signal import find_peaks  # loads much of SciPy, and few recordings lack rings
+
     bins = np.arange(-0.5 * np.pi, 0.5 * np.pi + _BIN_RAD, _BIN_RAD)
     counts = np.histogram(elevations, bins)[0]
     smooth = np.convolve(counts, [0.25, 0.5, 0.25], "same")

@@ -1,6 +1,6 @@
 """Scan-to-map registration: pose at the stamp, and velocity during the sweep, by point-to-plane Gauss-Newton.
 
-Correspondences with the map's surfels are found anew at every iteration, as in LOAM (Zhang and Singh, RSS 2014), with
+Correspondences with the map's surfaces are found anew at every iteration, as in LOAM (Zhang and Singh, RSS 2014), with
 robust weights. The sensor moves during a sweep, so that its velocity is estimated together with its pose, as begin and
 end of a scan are in CT-ICP (Dellenbach et al., ICRA 2022).
 """

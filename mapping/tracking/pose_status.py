@@ -40,18 +40,12 @@ def judge(
     elif unexpected:
         message = "registered, but neither odometry nor last motion predicted this pose"
     else:
-        message = reservation(attempt.registration.degeneracy.names, attempt.unconstrained, adrift)
+        message = _reservation(attempt.registration.degeneracy.names, attempt.unconstrained, adrift)
     return (Status.DEGRADED if message else Status.OK), message
 
 
-def reservation(degenerate: tuple[str, ...], unconstrained: tuple[str, ...], adrift: bool) -> str:
-    """Why a scan that fits the map near its prediction is degraded nevertheless; empty where it is not.
-
-    Args:
-        degenerate: names of the directions along which the prediction was kept.
-        unconstrained: these, and those that hardly anything constrains.
-        adrift: whether the map is a new one, at an unknown pose in the one before.
-    """
+def _reservation(degenerate: tuple[str, ...], unconstrained: tuple[str, ...], adrift: bool) -> str:
+    """Why a scan that fits the map near its prediction is degraded nevertheless; empty where it is not."""
     if adrift:
         return "in a new map; its pose in the map before is unknown"
     if degenerate:
