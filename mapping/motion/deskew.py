@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lidarslam.core.compiled import compiled, compiled_part
 from lidarslam.core.geometry import FloatArray, log
-from lidarslam.core.state.stateful import Shape
+from lidarslam.core.state.stateful import Shape, Within
 
 # Below this squared angle the series are exact to double precision.
 _SERIES_ANGLE2 = 0.25
@@ -25,7 +25,9 @@ class Sweep:
     points: Annotated[FloatArray, Shape(None, 3)]  # (N, 3)
     # (N,) seconds from the stamp; None when the points are motion compensated already
     times: Annotated[FloatArray, Shape(None)] | None = None
-    kinds: Annotated[NDArray[np.int8], Shape(None)] | None = None  # (N,) of features; None where points are of one kind
+    kinds: Annotated[NDArray[np.int8], Shape(None), Within(1, 2)] | None = (
+        None  # (N,) of features; None where points are of one kind
+    )
 
     def __post_init__(self) -> None:
         for what, values in (("times", self.times), ("kinds", self.kinds)):
