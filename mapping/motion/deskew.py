@@ -25,9 +25,8 @@ class Sweep:
     points: Annotated[FloatArray, Shape(None, 3)]  # (N, 3)
     # (N,) seconds from the stamp; None when the points are motion compensated already
     times: Annotated[FloatArray, Shape(None)] | None = None
-    kinds: Annotated[NDArray[np.int8], Shape(None), Within(1, 2)] | None = (
-        None  # (N,) of features; None where points are of one kind
-    )
+    # (N,) of features; None where points are of one kind
+    kinds: Annotated[NDArray[np.int8], Shape(None), Within(1, 2)] | None = None
 
     def __post_init__(self) -> None:
         for what, values in (("times", self.times), ("kinds", self.kinds)):
