@@ -57,10 +57,8 @@ def classify(
         edge_above: threshold of the curvature, square metres; the others are planar where they are reliable.
         kinds: (N,) written.
     """
-    free = np.ones(len(points), dtype=np.bool_)
-    _exclude_unreliable(points, ranges, rings, free)
-    for i in range(len(points)):
-        kinds[i] = PLANE if free[i] and curvature[i] < np.inf else 0
+    free = np.empty(len(points), dtype=np.bool_)
+    _write_reliable(points, ranges, rings, curvature, kinds, free)
     begin = 0
     for end in range(1, len(points) + 1):
         if end == len(points) or rings[end] != rings[begin]:
@@ -72,11 +70,16 @@ def classify(
 
 
 @compiled_part
-def _exclude_unreliable(
-    points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], free: NDArray[np.bool_]
-) -> None:
-    """Clear `free` (N,) where a nearer surface may hide a part of the point's own, and at grazing incidence."""
+def _write_reliable(
+    points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], curvature: FloatArray, kinds: NDArray[np.int8],
+    free: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Write which points are planar, and which of these may be edges, `free` (N,).
+
+    Neither are points on surfaces nearly parallel to the beam, or alone; edges none that a nearer surface may bound.
+    """
     before = np.inf  # squared distance of the last point
+    kinds[:], free[:] = 0, True
     for i in range(len(points)):
         after, beside = np.inf, np.inf
         if i + 1 < len(points) and rings[i + 1] == rings[i]:
@@ -88,9 +91,11 @@ def _exclude_unreliable(
             first = i - _REACH if ranges[i] > ranges[i + 1] else i + 1
             for j in range(max(first, 0), min(first + _REACH + 1, len(points))):
                 free[j] = False
-        if min(before, after) > _PARALLEL * ranges[i] ** 2:
-            free[i] = False
+        if min(before, after) <= _PARALLEL * ranges[i] ** 2 and curvature[i] < np.inf:
+            kinds[i] = PLANE
         before = after
+    for i in range(len(points)):
+        free[i] = free[i] and kinds[i] == PLANE
 
 
 @compiled_part

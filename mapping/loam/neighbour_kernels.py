@@ -31,6 +31,8 @@ _SHARED = 120.0
 # Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
 # ring, five points make planes of any direction, and these move with the rings.
 _MOST_TILT = 0.05
+# Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
+_LEAST_COSINE = 0.1
 # A voxel of so many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
@@ -77,11 +79,12 @@ def match_features(
     near, squared = np.empty(most, dtype=np.int64), np.empty(most)
     scatter = np.empty(6)
     mean, variances, axis = np.empty(3), np.empty(3), np.empty(3)
+    least = _RANGE_NOISE_M * _RANGE_NOISE_M
     most_off = min(_PLANE_M, _PLANE_CELLS * voxels.cell_m)
     for w in range(len(unmatched)):
         n = unmatched[w]
         count = _nearest(points[n], key_at(points[n], scale), voxels, near, squared)
-        if count >= (_LINE_VOXELS if is_line else NEIGHBOURS):
+        if count >= (_LINE_VOXELS if is_line else min(NEIGHBOURS, most)):
             number = _moments(points[n], near[:count], voxels.sums, mean, scatter)
             write_eigenvalues(scatter, variances)
             if is_line and variances[2] > _LINE_RATIO * variances[1]:
@@ -90,10 +93,14 @@ def match_features(
                     write_eigenvector(scatter, variances[2], axis)
                     _write_line(found, n, points[n], mean, axis, thickness_m, tilt)
                     continue
-            if not is_line and variances[1] > max(_PLANE_RATIO * variances[2], _FLAT_RATIO * variances[0]):
+            if not is_line and variances[1] > max(_PLANE_RATIO * variances[2], _FLAT_RATIO * max(variances[0], least)):
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
-                if tilt < _MOST_TILT and _farthest(near[:count], voxels.sums, mean, axis) < most_off:
+                if (
+                    tilt < _MOST_TILT
+                    and _cosine(mean, axis, sensor) > _LEAST_COSINE
+                    and _farthest(near[:count], voxels.sums, mean, axis) < most_off
+                ):
                     _write_plane(found, n, mean, axis, thickness_m, tilt, sensor)
                     continue
         unmatched[left] = n
@@ -162,6 +169,16 @@ def _farthest(near: NDArray[np.int64], sums: FloatArray, mean: FloatArray, axis:
             distance += (sums[row, 1 + i] / sums[row, 0] - mean[i]) * axis[i]
         farthest = max(farthest, abs(distance))
     return farthest
+
+
+@compiled_part
+def _cosine(point: FloatArray, normal: FloatArray, sensor: FloatArray) -> float:
+    """Cosine of the angle between a normal (3,) and the beam from the sensor (3,) to a point (3,)."""
+    along, squared = 0.0, 0.0
+    for i in range(3):
+        beam = point[i] - sensor[i]
+        along, squared = along + beam * normal[i], squared + beam * beam
+    return abs(along) / math.sqrt(max(squared, 1e-12))
 
 
 @compiled_part
