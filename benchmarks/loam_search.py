@@ -74,7 +74,7 @@ def _times(grid: VoxelGrid, planes: FloatArray, keypoints: FloatArray) -> list[f
     index_ms = _timed(search.knn_index)
     theirs_ms = _timed(lambda: search.knn_search(o3d.core.Tensor.from_numpy(keypoints), NEIGHBOURS))
     ours_ms = _timed(
-        lambda: match_features(keypoints, np.arange(len(keypoints)), False, NEIGHBOURS, grid.voxels, np.zeros(3), found)
+        lambda: match_features(keypoints, np.arange(len(keypoints)), False, grid.voxels, np.zeros(3), found)
     )
     insert_ms = _timed(lambda: grid.insert(planes))
     return [index_ms, theirs_ms, insert_ms, ours_ms]

@@ -74,9 +74,9 @@ def _write_reliable(
     points: FloatArray, ranges: FloatArray, rings: NDArray[np.intp], curvature: FloatArray, kinds: NDArray[np.int8],
     free: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Write which points are planar, and which of these may be edges, `free` (N,).
+    """Write which points are planar, those neither alone nor on a surface nearly parallel to the beam.
 
-    Neither are points on surfaces nearly parallel to the beam, or alone; edges none that a nearer surface may bound.
+    Of these, `free` (N,) may be edges, as no nearer surface may hide a part of their own.
     """
     before = np.inf  # squared distance of the last point
     kinds[:], free[:] = 0, True

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from lidarslam.core.geometry import FloatArray
 from lidarslam.core.state.stateful import ANY_NUMBER, Shape, Stateful
 from lidarslam.mapping.loam.feature_kernels import EDGE
-from lidarslam.mapping.loam.neighbour_kernels import NEIGHBOURS, Voxels, add_moments, match_features
+from lidarslam.mapping.loam.neighbour_kernels import Voxels, add_moments, match_features
 from lidarslam.mapping.motion.deskew import Sweep
 from lidarslam.mapping.registration.local_map import LEVELS, LocalMap
 from lidarslam.mapping.registration.sampled_scan import SampledScan
@@ -17,8 +17,6 @@ from lidarslam.mapping.surfels.voxel_hash import VoxelHash, point_keys
 
 # Correspondences are kept over a displacement of this share of a cell.
 _SAME_CELLS = 0.1
-# Neighbours of a plane over the coarsest cells: all around.
-_ALL = 27
 # Voxels beyond the radius are dropped each time the sensor has moved by this share of it.
 _FORGET_AFTER = 0.2
 
@@ -111,7 +109,7 @@ class FeatureMatcher(Matcher):
             for grid in grids:
                 if not len(unmatched):
                     break
-                left = match_features(points, unmatched, is_line, NEIGHBOURS, grid.voxels, sensor, self.surfaces)
+                left = match_features(points, unmatched, is_line, grid.voxels, sensor, self.surfaces)
                 unmatched = unmatched[:left]
 
 
@@ -177,9 +175,8 @@ class FeatureMap(LocalMap):
     def coarse_planes(self, points: FloatArray, sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `LocalMap`."""
         found, unmatched = Surfaces.none(len(points)), np.arange(len(points))
-        match_features(
-            np.ascontiguousarray(points), unmatched, False, _ALL, self._planes[-1].voxels, np.array(sensor), found
-        )
+        voxels = self._planes[-1].voxels
+        match_features(np.ascontiguousarray(points), unmatched, False, voxels, np.array(sensor), found)
         return found.normals[:, 0], np.where(found.counts > 0, found.thickness_m[:, 0], np.inf)
 
     def _after_restore(self) -> None:

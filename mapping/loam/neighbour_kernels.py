@@ -64,8 +64,7 @@ def add_moments(points: FloatArray, rows: Rows, sums: FloatArray) -> None:
 
 @compiled
 def match_features(
-    points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, most: int, voxels: Voxels,
-    sensor: FloatArray, found: Surfaces,
+    points: FloatArray, unmatched: NDArray[np.intp], is_line: bool, voxels: Voxels, sensor: FloatArray, found: Surfaces
 ) -> int:  # fmt: skip
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
@@ -76,15 +75,14 @@ def match_features(
         Number of points that are still unmatched.
     """
     left, scale = 0, 1.0 / voxels.cell_m
-    near, squared = np.empty(most, dtype=np.int64), np.empty(most)
+    near, squared = np.empty(NEIGHBOURS, dtype=np.int64), np.empty(NEIGHBOURS)
     scatter = np.empty(6)
     mean, variances, axis = np.empty(3), np.empty(3), np.empty(3)
-    least = _RANGE_NOISE_M * _RANGE_NOISE_M
     most_off = min(_PLANE_M, _PLANE_CELLS * voxels.cell_m)
     for w in range(len(unmatched)):
         n = unmatched[w]
         count = _nearest(points[n], key_at(points[n], scale), voxels, near, squared)
-        if count >= (_LINE_VOXELS if is_line else min(NEIGHBOURS, most)):
+        if count >= (_LINE_VOXELS if is_line else NEIGHBOURS):
             number = _moments(points[n], near[:count], voxels.sums, mean, scatter)
             write_eigenvalues(scatter, variances)
             if is_line and variances[2] > _LINE_RATIO * variances[1]:
@@ -93,7 +91,7 @@ def match_features(
                     write_eigenvector(scatter, variances[2], axis)
                     _write_line(found, n, points[n], mean, axis, thickness_m, tilt)
                     continue
-            if not is_line and variances[1] > max(_PLANE_RATIO * variances[2], _FLAT_RATIO * max(variances[0], least)):
+            if not is_line and variances[1] > max(_PLANE_RATIO * variances[2], _FLAT_RATIO * variances[0]):
                 thickness_m, tilt = _uncertainty(variances[0], variances[1], number, 3.0)
                 write_eigenvector(scatter, variances[0], axis)
                 if (

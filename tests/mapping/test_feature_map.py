@@ -179,11 +179,25 @@ def test_points_of_one_ring_make_no_plane(rng: np.random.Generator) -> None:
     assert len(map_of(NONE, ring).match(np.array([[0.01, 0.01, 0.01]]), np.eye(4))) == 0
 
 
+@pytest.mark.parametrize("heights_m", [[0.0], [0.0, 0.35]], ids=["one ring", "two rings"])
+def test_the_plane_of_a_ring_s_beams_is_no_surface(rng: np.random.Generator, heights_m: list[float]) -> None:
+    """Of a wall seen by one ring, ranges scatter more than elevations."""
+    count = 400 * len(heights_m)
+    wall = np.column_stack([np.full(count, 10.0), rng.uniform(-2.0, 2.0, count), np.resize(heights_m, count)])
+    beams = wall * (1.0 + 0.003 * rng.standard_normal((count, 1)))
+    found = map_of(NONE, beams).match(wall[::20], np.eye(4))
+    if len(heights_m) == 1:
+        assert len(found) == 0
+    else:
+        assert len(found) > 30
+        assert np.abs(found.normals[:, 0]).min() > 0.95
+
+
 def test_across_a_corner_a_plane_is_uncertain(rng: np.random.Generator) -> None:
     sides = rng.uniform(0.0, 1.0, (2, 4000, 3)) * [1.0, 1.0, 2.0]
     sides[0, :, 0], sides[1, :, 1] = 0.0, 0.0
     feature_map = map_of(NONE, sides.reshape(-1, 3))
-    found = feature_map.match(np.array([[0.01, 0.01, 1.0], [0.0, 0.7, 1.0]]), np.eye(4))
+    found = feature_map.match(np.array([[0.01, 0.01, 1.0], [0.0, 0.7, 1.0]]), exp([0, 0, 0, 0.8, 0.6, 1.0]))
     thickness_m = np.full(2, np.inf)
     thickness_m[found.index] = found.thickness_m
     assert thickness_m[0] > 3.0 * thickness_m[1]
