@@ -2,12 +2,13 @@
 
 import fcntl
 import hashlib
+import json
 import logging
 import os
 import re
 import shutil
-import tempfile
 from pathlib import Path
+from typing import Any
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.text.names import safe_name, stays_below
@@ -16,8 +17,14 @@ logger = logging.getLogger(__name__)
 
 # A path has lost one slash of two.
 _URL = re.compile(r"([a-z][a-z0-9+.-]*):/+(.+)", re.DOTALL)
-# Beside a fetched source.
-_ABOUT = "url.txt"
+# Kinds of storage. Others of fsspec's lead to further URLs, or render templates from their content.
+_STORAGE = ("file", "http", "https", "s3", "gs")
+# Beside a fetched source; and what has been fetched of one so far, with the version of each file.
+_ABOUT, _PARTIAL, _VERSION = "url.txt", ".partial", ".fetched-version"
+# What a storage says of a file that changes with its content.
+_CHANGING = ("size", "ETag", "etag", "Last-Modified", "LastModified", "md5Hash", "generation", "mtime")
+# Bytes of a source at most, and of what is read at once; seconds without a byte after which a server has failed.
+_MOST_BYTES, _BLOCK_BYTES, _SILENCE_S = 2**40, 2**23, 60.0
 
 
 def is_url(source: str | Path) -> bool:
@@ -37,13 +44,15 @@ def fetched(source: str | os.PathLike[str]) -> Path:
     Over http a folder is known by the slash at the end of its URL.
 
     Raises:
-        InputError: it cannot be fetched.
+        InputError: its kind of storage is not one of these, or it cannot be fetched.
     """
     parts = _URL.fullmatch(os.fspath(source))
     if parts is None:
         return Path(source)
     scheme, rest = parts[1], parts[2]
     url = f"{scheme}://{'/' if scheme == 'file' else ''}{rest}"
+    if scheme not in _STORAGE or "::" in url:
+        raise InputError(f"{url}: sources are fetched from {', '.join(_STORAGE)} alone, and from no chain of URLs (::)")
     name = rest.partition("?")[0].rstrip("/").rpartition("/")[2]
     path = cache_folder() / hashlib.sha256(url.encode()).hexdigest()[:16] / safe_name(name)
     fetch(url, path)
@@ -61,11 +70,14 @@ def url_of(path: Path) -> str | None:
 def fetch(url: str, path: Path) -> None:
     """Fetch a file or a folder, unless it is there; of several processes that want it, one does so.
 
+    What an interrupted download left is continued, where the storage reads from the middle of a file.
+
     Raises:
         InputError: fsspec or the library for this kind of URL is not installed, or it cannot be fetched.
     """
     if path.exists():
         return
+    partial = path.parent / _PARTIAL
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with (path.parent / "lock").open("w") as lock:
@@ -73,14 +85,16 @@ def fetch(url: str, path: Path) -> None:
             if not path.exists():
                 logger.warning("fetching %s to %s", url, path.parent)
                 (path.parent / _ABOUT).write_text(url, encoding="utf-8")
-                with tempfile.TemporaryDirectory(prefix=".partial-", dir=path.parent) as folder:
-                    _download(url, Path(folder) / path.name)
-                    (Path(folder) / path.name).rename(path)
-    except InputError:
-        shutil.rmtree(path.parent, ignore_errors=True)
-        raise
+                _download(url, partial / path.name)
+                for note in partial.rglob(f"*{_VERSION}"):
+                    note.unlink()
+                (partial / path.name).rename(path)
+                shutil.rmtree(partial)
     except Exception as error:  # each kind of storage has its own
-        shutil.rmtree(path.parent, ignore_errors=True)
+        if not any(file.stat().st_size for file in partial.rglob("*") if file.suffix != _VERSION and file.is_file()):
+            shutil.rmtree(path.parent, ignore_errors=True)
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{url}: cannot be fetched ({' '.join(str(error).split()) or repr(error)})") from error
 
 
@@ -88,20 +102,55 @@ def _download(url: str, place: Path) -> None:
     try:
         from fsspec import url_to_fs
 
-        storage, remote = url_to_fs(url)
+        storage, remote = url_to_fs(url, **_patience(url))
     except ImportError as error:
         raise InputError(f"{url}: {error}; pip install 'lidarslam[remote]'") from error
     except ValueError as error:
         raise InputError(f"{url}: {error}") from error
     if not url.endswith("/") and storage.isfile(remote):
-        storage.get_file(remote, str(place))
+        _download_file(storage, remote, place, 0)
         return
     root = f"{remote.rstrip('/')}/"
     names = [name.removeprefix(root) for name in storage.find(root)] if storage.isdir(remote) else []
     if not names:
         raise InputError(f"{url}: is not there")
+    fetched_bytes = 0
     for name in names:  # not get(recursive=True), which takes a folder of a web page for a file, too
         if not stays_below(name):
             raise InputError(f"{url}: lists a file elsewhere, {name}")
-        (place / name).parent.mkdir(parents=True, exist_ok=True)
-        storage.get_file(f"{root}{name}", str(place / name))
+        fetched_bytes += _download_file(storage, f"{root}{name}", place / name, fetched_bytes)
+
+
+def _patience(url: str) -> dict[str, Any]:
+    """Options by which a server may take any time, as long as bytes arrive: the default is five minutes in all."""
+    if not url.startswith("http"):
+        return {}
+    from aiohttp import ClientTimeout
+
+    return {"client_kwargs": {"timeout": ClientTimeout(total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}}
+
+
+def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
+    """Fetch what is missing of a file; return its bytes. `before` is those of the source's files before."""
+    about = storage.info(remote)
+    size = about.get("size")
+    version = json.dumps({key: str(about[key]) for key in _CHANGING if about.get(key) is not None})
+    noted = place.with_name(place.name + _VERSION)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if size is None or not noted.is_file() or noted.read_text(encoding="utf-8") != version:
+        place.unlink(missing_ok=True)
+        noted.write_text(version, encoding="utf-8")
+    with place.open("ab") as file:
+        if file.tell() and file.tell() != size:
+            logger.warning("%s: continued after %.0f MB", remote, file.tell() / 1e6)
+        # Over http, several requests want a server that reads from the middle of a file.
+        streamed = {"block_size": 0} if not file.tell() and hasattr(storage, "client_kwargs") else {}
+        with storage.open(remote, "rb", **streamed) as source:
+            source.seek(file.tell()) if file.tell() else None
+            while file.tell() != size and (block := source.read(_BLOCK_BYTES)):
+                if before + file.tell() + len(block) > _MOST_BYTES:
+                    raise InputError(f"{remote}: more than {_MOST_BYTES / 1e12:.1f} TB are fetched from no source")
+                file.write(block)
+        if size is not None and file.tell() != size:
+            raise InputError(f"{remote}: {file.tell():,} of {size:,} bytes arrived; the next attempt continues")
+        return file.tell()

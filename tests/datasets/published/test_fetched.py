@@ -1,5 +1,6 @@
 """Sources named by URL: fetched once, whole or not at all."""
 
+import contextlib
 import sys
 import threading
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from lidarslam.core.errors import InputError
 from lidarslam.datasets.published.fetched import cache_folder, fetch, fetched, is_url, url_of
 from lidarslam.datasets.registry import open_recording
 
-fsspec = pytest.importorskip("fsspec")
+pytest.importorskip("fsspec")
 
 
 @pytest.fixture(autouse=True)
@@ -83,11 +84,8 @@ def test_a_folder_is_fetched_once_from_a_server(server: str, recording: Path) ->
     assert len(Quiet.asked) == asked
 
 
-@pytest.mark.parametrize("scheme", ["file", "memory"])
-def test_a_folder_is_fetched_from_other_storage(scheme: str, recording: Path) -> None:
-    if scheme == "memory":
-        fsspec.filesystem("memory").put(f"{recording}/", "/data/walk/", recursive=True)
-    url = f"file://{recording}" if scheme == "file" else "memory://data/walk"
+def test_a_folder_is_fetched_from_this_machine(recording: Path) -> None:
+    url = f"file://{recording}"
     assert _same_files(fetched(url), recording)
     assert fetched(Path(url)) == fetched(url)
 
@@ -107,15 +105,82 @@ def test_a_file_goes_to_the_same_path_on_another_machine(server: str, recording:
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("memory://data/nothing", "memory://data/nothing: is not there"),
+        ("file:///data/nothing", "file:///data/nothing: is not there"),
         ("http://127.0.0.1:9/office.mcap", "http://127.0.0.1:9/office.mcap: "),
-        ("nothing://data/office", "Protocol not known: nothing"),
+        ("memory://data/office", "sources are fetched from file, http, https, s3, gs alone"),
+        ("reference://::http://127.0.0.1:9/office.json", "sources are fetched from"),
+        ("https://example.org/simplecache::memory://office", "no chain of URLs"),
     ],
 )
 def test_what_cannot_be_fetched_leaves_nothing(url: str, message: str, cache: Path) -> None:
     with pytest.raises(InputError, match=message):
         fetched(url)
     assert not any(cache.rglob("*"))
+
+
+class Ranged(SimpleHTTPRequestHandler):
+    """Serves `content` from any byte on; the second answer, after one whether it is there, breaks off."""
+
+    content: ClassVar[bytes] = np.random.default_rng(0).bytes(300_000)
+    etag: ClassVar[str] = '"1"'
+    sent: ClassVar[list[int]] = []  # bytes of each answer
+
+    def log_request(self, *_: object) -> None:
+        pass
+
+    def do_HEAD(self) -> None:
+        self._head(200, 0, len(self.content))
+
+    def do_GET(self) -> None:
+        first, _, last = self.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")
+        part = self.content[int(first) : int(last or len(self.content)) + 1]
+        self._head(206 if "Range" in self.headers else 200, int(first), len(part))
+        part = part[:100_000] if len(self.sent) == 1 else part
+        self.sent.append(len(part))
+        with contextlib.suppress(OSError):
+            self.wfile.write(part)
+        self.close_connection = True
+
+    def _head(self, code: int, first: int, length: int) -> None:
+        self.send_response(code)
+        self.send_header("ETag", self.etag)
+        self.send_header("Accept-Ranges", "bytes")
+        self.send_header("Content-Length", str(length))
+        if code == 206:
+            self.send_header("Content-Range", f"bytes {first}-{first + length - 1}/{len(self.content)}")
+        self.end_headers()
+
+
+@pytest.fixture
+def breaking_server() -> Iterator[str]:
+    Ranged.sent.clear()
+    with ThreadingHTTPServer(("127.0.0.1", 0), Ranged) as http:
+        threading.Thread(target=http.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{http.server_port}/office.bin"
+        http.shutdown()
+
+
+@pytest.mark.parametrize("changes", [False, True], ids=["the same file", "another meanwhile"])
+def test_a_download_that_broke_off_is_continued(
+    breaking_server: str, changes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lidarslam.datasets.published.fetched._BLOCK_BYTES", 10_000)
+    with pytest.raises(InputError, match="cannot be fetched"):
+        fetched(breaking_server)
+    if changes:
+        monkeypatch.setattr(Ranged, "content", Ranged.content[::-1])
+        monkeypatch.setattr(Ranged, "etag", '"2"')
+    path = fetched(breaking_server)
+    assert path.read_bytes() == Ranged.content
+    assert (Ranged.sent[-1] == 300_000) == changes, "a part"
+    assert Ranged.sent[-1] >= 200_000
+    assert {file.name for file in path.parent.rglob("*")} == {"lock", "office.bin", "url.txt"}
+
+
+def test_a_source_without_an_end_is_given_up(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lidarslam.datasets.published.fetched._MOST_BYTES", 10_000)
+    with pytest.raises(InputError, match="are fetched from no source"):
+        fetched(f"{server}/walk/")
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
