@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -139,6 +140,8 @@ class Ranged(SimpleHTTPRequestHandler):
         self.sent.append(len(part))
         with contextlib.suppress(OSError):
             self.wfile.write(part)
+        if len(self.sent) == 2:
+            time.sleep(0.5)  # what has arrived by then is read
         self.close_connection = True
 
     def _head(self, code: int, first: int, length: int) -> None:
