@@ -10,8 +10,10 @@ from lidarslam.config.settings import Config, ViewerConfig
 from lidarslam.core.errors import ConfigError, OutputError
 from lidarslam.core.text.trajectory_io import read_tum
 from lidarslam.datasets.intake import choose_scans
+from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
 from lidarslam.odometry.interface import Odometry
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.odometry.registry import make_odometry
 from lidarslam.pipeline.compile_ahead import CompileAhead, parts_of
 from lidarslam.run.elevation import with_elevations
@@ -69,7 +71,7 @@ def execute(
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(config)))
             phase("loading the odometry")
-            odometry = open_odometry(config, request.prior)
+            odometry = require_overlap(open_odometry(config, request.prior), recording)
             stack.callback(odometry.close)
             directory = stack.enter_context(RunDirectory.create(request.out, request.overwrite, request.resume))
             unfinished = None
@@ -179,6 +181,18 @@ def open_odometry(config: Config, prior: Path | None) -> Odometry:
     if method == "external" and prior is None:
         raise ConfigError("odometry.method is external: give its trajectory with --prior FILE")
     return make_odometry(config.odometry, None if prior is None else read_tum(prior))
+
+
+def require_overlap(odometry: Odometry, recording: Recording) -> Odometry:
+    """The odometry, unless it is a prior of another time.
+
+    Raises:
+        InputError: it has no pose while the recording lasts.
+    """
+    if isinstance(odometry, ExternalOdometry):
+        described = recording.describe()
+        odometry.require_overlap(described.first_stamp, described.last_stamp)
+    return odometry
 
 
 def require_no_trajectory(config: Config) -> None:

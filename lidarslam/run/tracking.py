@@ -26,6 +26,7 @@ from lidarslam.mapping.pose_graph.keyframe_graph import KeyframeGraph
 from lidarslam.mapping.slides.slides import PairTests
 from lidarslam.mapping.smoothed_start import SHOWING, SmoothedMotion, smoothed_start
 from lidarslam.odometry.interface import Odometry
+from lidarslam.odometry.methods.external import ExternalOdometry
 from lidarslam.pipeline.estimates import ScanResult
 from lidarslam.pipeline.localisation import Localiser, ScanMapper, ScanToMap, make_localiser
 from lidarslam.pipeline.pipeline import Pipeline
@@ -127,6 +128,8 @@ def track(
     error = _process(pipeline, scans, log, viewer, truth, lambda number, result: progress(number, len(chosen), result))
     for warning in inertial.warnings if inertial is not None else ():
         log.warn(warning)
+    if isinstance(odometry, ExternalOdometry) and odometry.warning is not None:
+        log.warn(odometry.warning)
     if not log.points_read:
         if isinstance(error, KeyboardInterrupt):
             raise NoScanError(f"{request.source}: interrupted before a scan was done; nothing was kept", True)

@@ -32,6 +32,8 @@ class ExternalOdometry(Stateful):
     """
 
     _T_odom_prev: Annotated[FloatArray, TRANSFORM] | None  # of the last scan that was covered
+    _scans: int
+    _uncovered: int  # scans without a pose
 
     def __init__(
         self, trajectory: Trajectory, tolerance_s: float = 0.1, largest_interval_s: float | None = None
@@ -43,13 +45,34 @@ class ExternalOdometry(Stateful):
         median_step_s = float(np.median(np.diff(trajectory.stamps)))
         self._largest_interval_s = largest_interval_s or max(_LEAST_GAP_S, _LEAST_GAP_STEPS * median_step_s)
         self._T_odom_prev = None
+        self._scans = self._uncovered = 0
+
+    def require_overlap(self, first_stamp: float, last_stamp: float) -> None:
+        """Refuse scans of another time altogether.
+
+        Raises:
+            InputError: the trajectory begins after the last scan, or ends before the first.
+        """
+        first, last = float(self._trajectory.stamps[0]), float(self._trajectory.stamps[-1])
+        if first - self._tolerance_s > last_stamp or last + self._tolerance_s < first_stamp:
+            raise InputError(
+                f"the prior has poses from {first:.3f} to {last:.3f} s, the recording scans from {first_stamp:.3f} to"
+                f" {last_stamp:.3f} s, so that none has a pose; is it of this recording, in seconds of the same clock?"
+            )
+
+    @property
+    def warning(self) -> str | None:
+        """How many scans had no pose; None where all had."""
+        return f"the prior does not cover {self._uncovered} of {self._scans} scans" if self._uncovered else None
 
     def estimate(self, scan: Scan) -> Motion:
         """The motion since the last scan that the trajectory covered."""
+        self._scans += 1
         try:
             T_odom_curr = self._trajectory.at(np.array([scan.stamp]), self._tolerance_s)[0]
             self._require_no_gap(scan.stamp)
         except ValueError as error:
+            self._uncovered += 1
             return Motion(np.eye(4), 0, f"the prior does not cover this scan: {error}")
         T_odom_prev, self._T_odom_prev = self._T_odom_prev, T_odom_curr
         return Motion(np.eye(4) if T_odom_prev is None else inverse(T_odom_prev) @ T_odom_curr, len(scan))

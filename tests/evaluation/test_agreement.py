@@ -37,6 +37,15 @@ def test_of_two_drives(bend: FloatArray, rng: np.random.Generator, kind: str) ->
     assert "does not follow its reference" in said
 
 
+def test_of_two_cars_on_straight_roads(rng: np.random.Generator) -> None:
+    """One at a constant speed, one that brakes to a stand: aligned, they are nowhere far apart."""
+    steady, braking = np.zeros((80, 3)), np.zeros((80, 3))
+    steady[:, 0], braking[:, 0] = np.arange(80), np.cumsum(np.linspace(2.0, 0.0, 80))
+    said = disagreement(evaluate_trajectory(along(steady + rng.normal(0.0, 0.02, (80, 3))), along(braking)))
+    assert said is not None
+    assert "does not follow its reference" in said
+
+
 def test_millimetres(bend: FloatArray) -> None:
     said = disagreement(evaluate_trajectory(along(bend), along(1_000.0 * bend)))
     assert said is not None

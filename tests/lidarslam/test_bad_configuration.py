@@ -262,16 +262,31 @@ def test_a_prior_in_kittis_format_is_told_from_tum(tmp_path: Path, small_recordi
     assert "poses.txt:1: expected 8 numbers, got 12" in said
 
 
-@pytest.mark.parametrize(("offset_s", "covered"), [(1_000.0, 0), (0.25, 4)])
-def test_a_prior_of_another_time_is_a_run_that_lost_its_way(
-    tmp_path: Path, small_recording: Path, offset_s: float, covered: int
-) -> None:
-    table = np.loadtxt(small_recording / "ground_truth.tum")
+def shifted_prior(folder: Path, recording: Path, offset_s: float) -> Path:
+    """The true trajectory, so many seconds later."""
+    table = np.loadtxt(recording / "ground_truth.tum")
     table[:, 0] += offset_s
-    np.savetxt(tmp_path / "prior.tum", table, fmt="%.9f")
-    command = ("run", small_recording, "--out", tmp_path / "run", "--prior", tmp_path / "prior.tum", "--no-mapping")
-    result = lidarslam(*command)
-    assert result.exit_code == 3
-    assert "the prior does not cover this scan" in result.stdout
+    np.savetxt(folder / "prior.tum", table, fmt="%.9f")
+    return folder / "prior.tum"
+
+
+@pytest.mark.parametrize("offset_s", [1_000.0, -1_000.0])
+def test_a_prior_of_another_time_is_refused(tmp_path: Path, small_recording: Path, offset_s: float) -> None:
+    prior = shifted_prior(tmp_path, small_recording, offset_s)
+    said = one_line_of(lidarslam("run", small_recording, "--out", tmp_path / "new", "--prior", prior))
+    assert "is it of this recording" in said
+
+
+@pytest.mark.parametrize("mapping", ["off", "surfels"])
+def test_scans_without_a_prior_are_counted(tmp_path: Path, small_recording: Path, mapping: str) -> None:
+    """Without a mapping they are lost."""
+    prior = shifted_prior(tmp_path, small_recording, 0.25)
+    result = lidarslam(
+        "run", small_recording, "--out", tmp_path / "run", "--prior", prior, "--mapping", mapping, "--no-report"
+    )
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["lost_scans"] == 6 - covered
+    assert "the prior does not cover 2 of 6 scans" in summary["warnings"]
+    if mapping == "off":
+        assert result.exit_code == 3
+        assert "the prior does not cover this scan" in result.stdout
+        assert summary["lost_scans"] == 2

@@ -21,7 +21,7 @@ from lidarslam.run.modes.localise.placed_viewer import PlacedViewer
 from lidarslam.run.modes.localise.request import LocaliseRequest, read_map
 from lidarslam.run.request import log_choices
 from lidarslam.run.results import RunOutcome, write_results
-from lidarslam.run.run import open_odometry, require_apart, viewing
+from lidarslam.run.run import open_odometry, require_apart, require_overlap, viewing
 from lidarslam.run.scan_log import ScanLog
 from lidarslam.run.summary.summary import summarise
 from lidarslam.run.summary.written_map import WrittenMap
@@ -104,7 +104,7 @@ def execute(
         with ExitStack() as stack:
             compiling = stack.enter_context(CompileAhead(parts_of(run.config)))
             phase("loading the odometry")
-            odometry = open_odometry(run.config, run.prior)
+            odometry = require_overlap(open_odometry(run.config, run.prior), recording)
             stack.callback(odometry.close)
             directory = stack.enter_context(RunDirectory.create(run.out, run.overwrite))
             log, localiser = ScanLog(), MapLocaliser(run.config.mapping, fixed_map, guess)
