@@ -1,6 +1,6 @@
 """A benchmark file: recordings, methods, tables and published rows, so that a table of a paper is one command."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,8 @@ from typing_extensions import Self
 from lidarslam.compare.methods.names import Method, parse_method
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.yaml_text import read_yaml
-from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.errors import ConfigError, InputError
+from lidarslam.core.files import require_no_link
 from lidarslam.core.tasks.start import open_tasks
 from lidarslam.datasets.published.evalio_names import located
 from lidarslam.datasets.published.fetched import fetched, is_url
@@ -175,7 +176,8 @@ def make_recordings(
         for entry in request.recordings
         if entry.simulate is not None and entry.source is not None and not (entry.source / README).is_file()
     ]
-    _require_no_link([one.out for one in wanted if one.out.parent == request.out / RECORDINGS])
+    made = [one.out for one in wanted if one.out.parent == request.out / RECORDINGS]
+    require_no_link([request.out / RECORDINGS, *made])
     if request.where.jobs == 1 or len(wanted) < 2:  # a cluster may have other disks
         for one in wanted:
             with counting(f"recording {one.out.name}") as counter:
@@ -185,13 +187,6 @@ def make_recordings(
         scans = [one.scans or 0 for one in wanted]
         for number, _ in enumerate(tasks.run(_record, wanted), start=1):
             counter(sum(scans[:number]), sum(scans))
-
-
-def _require_no_link(folders: Sequence[Path]) -> None:
-    """Refuse to make recordings of a comparison elsewhere, where a link in its folder leads."""
-    link = next((place for folder in folders for place in (folder.parent, folder) if place.is_symlink()), None)
-    if link is not None:
-        raise OutputError(f"{link}: is a link to another place; remove it, or name that place with --data")
 
 
 def _record(request: RecordRequest) -> None:

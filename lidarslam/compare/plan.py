@@ -8,6 +8,7 @@ from lidarslam.compare.methods.run import PROCESS
 from lidarslam.compare.request import CompareRequest, RecordingEntry
 from lidarslam.config.settings import load_config
 from lidarslam.core.errors import ConfigError, InputError, OutputError
+from lidarslam.core.files import require_no_link
 from lidarslam.core.text.names import safe_name
 from lidarslam.datasets.recording import Recording
 from lidarslam.datasets.registry import open_recording
@@ -88,9 +89,10 @@ def _check_folder(request: CompareRequest, planned: list[PlannedRecording]) -> N
         raise OutputError(f"{out}: is the recording itself; name another directory for the comparison")
     if (out / files.TRAJECTORY_TUM).is_file() and (out / files.CONFIG).is_file():
         raise OutputError(f"{out}: holds a run; name another directory for the comparison")
+    folders = [run.request.out for recording in planned for run in recording.runs]
+    require_no_link([place for folder in folders for place in (folder.parent, folder)])
     if request.overwrite or request.reuse:
         return
-    folders = [run.request.out for recording in planned for run in recording.runs]
     marks = [out / COMPARISON, *(folder / name for folder in folders for name in (PROCESS, files.CONFIG))]
     found = next((mark for mark in marks if mark.exists()), None)
     if found is not None:

@@ -7,7 +7,7 @@ import os
 import stat
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -108,6 +108,17 @@ def make_own_folder(path: Path) -> None:
     if path.is_symlink():
         path.unlink()
     path.mkdir(exist_ok=True)
+
+
+def require_no_link(places: Iterable[Path]) -> None:
+    """Refuse to write where a link in a directory of results leads.
+
+    Raises:
+        OutputError: one of the places is a link.
+    """
+    link = next((place for place in places if place.is_symlink()), None)
+    if link is not None:
+        raise OutputError(f"{link}: is a link to another place, where nothing is written; remove it")
 
 
 def _linked(path: Path) -> OutputError:

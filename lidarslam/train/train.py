@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from lidarslam.core.errors import ConfigError
-from lidarslam.core.files import make_directory, only_writer, remove_partial_files
+from lidarslam.core.files import make_directory, only_writer, remove_partial_files, require_no_link
 from lidarslam.core.tasks.tasks import SERIAL, Where
 from lidarslam.odometry.network.checkpoint import Checkpoint, load_checkpoint, network_of
 from lidarslam.odometry.network.networks import make_network
@@ -103,6 +103,8 @@ def _recordings(
 ) -> Recordings:  # fmt: skip
     """All recordings, prepared; the first process does that, and the others find them in the cache."""
     cache = request.prepared or request.out / files.PREPARED
+    if request.prepared is None:
+        require_no_link([cache])
     learned, held_out = hold_out(stretches, config.hold_out, config.seed)
     done, total = 0, sum(len(stretch) for stretch in stretches)
     if not devices.is_first:

@@ -169,5 +169,24 @@ def test_a_benchmark_makes_no_recording_behind_a_link(tmp_path: Path, link: str)
     (tmp_path / "made.yaml").write_text(f"title: t\nmethods: [kiss-icp]\nrecordings: {recordings}\n")
     result = lidarslam("compare", "--benchmark", tmp_path / "made.yaml", "--out", tmp_path / "out")
     assert result.exit_code == 1
-    assert f"{tmp_path / 'out' / link}: is a link to another place; remove it, or name that place" in result.stderr
+    assert f"{tmp_path / 'out' / link}: is a link to another place" in result.stderr
+    assert not any((tmp_path / "outside").iterdir())
+
+
+@pytest.mark.parametrize("method", ["kiss-slam", "constant-velocity+map"], ids=["not installed", "run"])
+@pytest.mark.parametrize("link", ["walk", "walk/METHOD"])
+@pytest.mark.parametrize("option", ["--reuse", "--overwrite"])
+def test_a_comparison_writes_nothing_behind_a_link(
+    tmp_path: Path, small_recording: Path, method: str, link: str, option: str
+) -> None:
+    place = tmp_path / "out" / link.replace("METHOD", method)
+    place.parent.mkdir(parents=True)
+    (tmp_path / "outside").mkdir()
+    place.symlink_to(tmp_path / "outside")
+    (tmp_path / "two.yaml").write_text(
+        f"title: t\nmethods: [{method}]\nrecordings: [{{name: walk, source: {small_recording}}}]\n"
+    )
+    result = lidarslam("compare", "--benchmark", tmp_path / "two.yaml", "--out", tmp_path / "out", option)
+    assert result.exit_code == 1
+    assert f"{place}: is a link to another place" in result.stderr
     assert not any((tmp_path / "outside").iterdir())

@@ -228,6 +228,16 @@ FORGED: dict[str, Callable[[dict[str, torch.Tensor]], object]] = {
 }
 
 
+def test_nothing_is_prepared_behind_a_link(room_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "prepared").symlink_to(tmp_path / "outside")
+    linked = replace(request(room_folder, tmp_path / "out", tmp_path), prepared=None)
+    with pytest.raises(OutputError, match="is a link to another place"):
+        execute(linked, Console())
+    assert not any((tmp_path / "outside").iterdir())
+
+
 @pytest.mark.parametrize("name", FORGED)
 def test_prepared_recordings_that_do_not_fit_are_made_anew(room_folder: Path, tmp_path: Path, name: str) -> None:
     config = load_train_config(None, TINY)
