@@ -11,7 +11,7 @@ from lidarslam.evaluation.trajectory.alignment import AlignmentMethod, align, al
 from lidarslam.evaluation.trajectory.association import DEFAULT_MAX_GAP_S, DEFAULT_TOLERANCE_S, Association, associate
 from lidarslam.evaluation.trajectory.drift import Drift, KittiDrift, kitti_drift, short_drift
 
-# Of the reference's spread: between straight drives of two cars it is 0.18 and more, of real recordings' own 0.05 at most.
+# Of the reference's spread: straight drives of two cars differ by 0.18 and more, a drive and its truth by 0.05 at most.
 _UNRELATED_SHARE = 0.15
 # Sensors that stay on one spot have no spread to compare with.
 _NEGLIGIBLE_M = 0.05

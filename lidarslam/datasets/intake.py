@@ -42,6 +42,7 @@ _AT_ONCE = (
     " the sensor turns, the times are wrong or in another unit (reader.time_unit, reader.time_reference=azimuth)"
 )
 _UNTIMED = "scans have points without a time, which were given one between those of their neighbours"
+_REPEATED = "scans were left out: they have the points of the scan before, as from a driver that hangs"
 _ONE_PLACE = "scans have all their points at one place and carry no geometry"
 
 
@@ -65,7 +66,18 @@ def take_in(recording: Recording, chosen: range, faults: Faults) -> Iterator[Sca
     """
     scans = recording.scans(chosen.start, chosen.stop, chosen.step, faults)
     ordered = in_stamp_order((look_at(scan, faults) for scan in scans), lambda scan: scan.stamp, faults)
-    return _with_paces_checked(ordered, faults)
+    return _with_paces_checked(_without_repeats(ordered, faults), faults)
+
+
+def _without_repeats(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
+    """The scans that have been measured anew: the noise of two measurements is never the same."""
+    last: Scan | None = None
+    for scan in scans:
+        if last is not None and len(scan) > _FEW_POINTS and np.array_equal(scan.points, last.points):
+            faults.leave_out(_REPEATED, f"at {scan.stamp:.9f}")
+            continue
+        last = scan
+        yield scan
 
 
 def _with_paces_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:

@@ -107,3 +107,21 @@ def test_stamps_that_no_lidar_has_are_told_once(period_s, told):
     assert len(faults.warnings()) == told
     if told:
         assert faults.warnings()[0].startswith("7 scans are stamped within a millisecond of the one before")
+
+
+def test_a_driver_that_hangs_repeats_a_scan_which_counts_once(rng):
+    """The same points with new stamps would be a sensor at rest."""
+    first, second = rng.uniform(-8.0, 8.0, (2, 1000, 3))
+
+    class Hanging:
+        def scans(self, *_):
+            clouds = (first, second, second, second, first)
+            return (Scan(points.copy(), 0.1 * number) for number, points in enumerate(clouds))
+
+    faults = Faults()
+    assert [scan.stamp for scan in take_in(Hanging(), range(5), faults)] == [0.0, 0.1, 0.4]
+    assert faults.left_out == 2
+    assert faults.warnings() == (
+        "2 scans were left out: they have the points of the scan before, as from a driver that hangs;"
+        " the first: at 0.200000000",
+    )
