@@ -32,8 +32,22 @@ class YamlError(ConfigError):
         self.is_syntax = is_syntax
 
 
+# Numbers as YAML 1.2 has them; in 1.1, which PyYAML reads, 010 is eight and 1:30 is ninety.
+_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+_FLOAT = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan")
+_NUMBERS = {"tag:yaml.org,2002:int": _INT, "tag:yaml.org,2002:float": _FLOAT}
+
+
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one, and texts with NUL."""
+    """Refuses a key that occurs twice in a section, where PyYAML silently takes the later one, and texts with NUL.
+
+    What is no decimal number is a text.
+    """
+
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+        tag = super().resolve(kind, value, implicit)  # type: ignore[no-untyped-call]
+        is_plain = kind is yaml.ScalarNode and implicit[0] and tag in _NUMBERS
+        return self.DEFAULT_SCALAR_TAG if is_plain and not _NUMBERS[tag].fullmatch(value) else tag
 
     def construct_scalar(self, node: Any) -> Any:
         if "\0" in node.value:

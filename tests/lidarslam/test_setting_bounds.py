@@ -52,6 +52,15 @@ VECTORS = ("odometry.imu_rotation_deg", "odometry.imu_position_m", "reader.mount
 MAY_EMPTY = ("global_map.max_range_m", "global_map.min_hits")
 
 
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", ["true", "off"])
+def test_a_number_is_neither_true_nor_false(name: str, value: str) -> None:
+    if value in map(str, get_args(NUMBERS[name].annotation)):
+        pytest.skip("off is one of its values")
+    with pytest.raises(ConfigError, match=f"{name}.*: (expected|input should be)"):
+        load_config(None, [f"{name}={value}"])
+
+
 def text_of(name: str, value: float) -> str:
     return f"[{value!r}, 0, 0]" if name in VECTORS else f"{value!r}"
 

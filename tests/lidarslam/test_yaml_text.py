@@ -14,6 +14,16 @@ def test_plain_values() -> None:
 
 
 @pytest.mark.parametrize(
+    "text", ["010", "04", "0x10", "0o10", "0b11", "1:30", "1:30.5", "1_000", "1.", "7e3", "-0"]
+)
+def test_a_number_is_decimal_or_a_text(text: str) -> None:
+    """In YAML 1.1, 010 is eight and 1:30 ninety."""
+    numbers = {"1.": 1.0, "-0": 0}
+    assert parse_yaml(text) == numbers.get(text, text)
+    assert parse_yaml(f"'{text}'") == text
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("a: [1", "not YAML"),
