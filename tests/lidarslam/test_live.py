@@ -234,6 +234,21 @@ def test_late_scans_those_of_others_and_damaged_ones_are_left_out_and_counted() 
     assert "another sensor" in faults.warnings()[1]
 
 
+def test_a_stray_stamp_costs_one_scan_and_a_clock_that_was_set_a_few() -> None:
+    """Clouds are published every tenth of a second, and after a pause of ten seconds."""
+    faults = Faults()
+    decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", faults)
+    published = [*np.arange(0.0, 0.5, 0.1), *np.arange(10.5, 12.0, 0.1)]
+    stamps = [100.0 + time_s for time_s in published]
+    stamps[2] = 2e9
+    stamps[10:] = [stamp + 3600.0 for stamp in stamps[10:]]
+    scans = [
+        decoder.scan(message_at(stamp), round(1e9 * time_s)) for stamp, time_s in zip(stamps, published, strict=True)
+    ]
+    assert [scan is not None for scan in scans] == [number not in (2, *range(10, 15)) for number in range(20)]
+    assert "ahead of the time that has passed" in faults.warnings()[0]
+
+
 def test_headers_without_stamps_have_the_time_of_publication() -> None:
     decoder = CloudDecoder(ReaderConfig(), "sensor_msgs/msg/PointCloud2", Faults())
     scans = [decoder.scan(message_at(0.0), published_ns) for published_ns in (10**18, 10**18 + 10**8)]
@@ -301,6 +316,11 @@ def test_the_only_topic_of_clouds_is_taken_once_discovery_has_settled(monkeypatc
         find_topic(lambda: [Topic("/a"), Topic("/b")], None, 0)
     with pytest.raises(InputError, match="/scan: holds sensor_msgs/msg/LaserScan"):
         find_topic(lambda: [Topic("/scan", "sensor_msgs/msg/LaserScan")], "/scan", 0)
+
+
+def test_it_waits_no_longer_than_it_is_told() -> None:
+    with pytest.raises(InputError, match=r"within 0.3 s there was no /points in domain 3; no ROS 2 topic"):
+        find_topic(lambda: [], "/points", 3, 0.3)
 
 
 def test_while_it_waits_it_says_what_it_sees(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

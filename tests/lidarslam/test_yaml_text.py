@@ -13,9 +13,7 @@ def test_plain_values() -> None:
     assert parse_yaml(text) == {"a": {"b": [1, 2.5, None, True]}, "base": {"x": 1}, "c": {"x": 2}}
 
 
-@pytest.mark.parametrize(
-    "text", ["010", "04", "0x10", "0o10", "0b11", "1:30", "1:30.5", "1_000", "1.", "7e3", "-0"]
-)
+@pytest.mark.parametrize("text", ["010", "04", "0x10", "0o10", "0b11", "1:30", "1:30.5", "1_000", "1.", "7e3", "-0"])
 def test_a_number_is_decimal_or_a_text(text: str) -> None:
     """In YAML 1.1, 010 is eight and 1:30 ninety."""
     numbers = {"1.": 1.0, "-0": 0}

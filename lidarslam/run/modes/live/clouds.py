@@ -17,7 +17,11 @@ from lidarslam.datasets.times.point_time_inference import TimedCloud, learn_poin
 # Clouds that the meaning of the time field is inferred from: the first that is unambiguous settles it.
 _MOST_LOOKED_AT = 10
 
+# A stamp that is ahead of the time since the scan before by so much is a stray one, unless so many in a row are.
+_AHEAD_NS, _CLOCK_WAS_SET = 10**9, 6
+
 _NOT_AFTER = "scans were left out: their stamps are not after those of the scans before"
+_AHEAD = "scans were left out: their stamps are ahead of the time that has passed since the scans before"
 _OTHER_SENSOR = "scans were left out: they come from another sensor; name one with --set reader.frame_id=NAME"
 
 _TIME_FIELD = "time field of the points has a fault"
@@ -45,6 +49,7 @@ class CloudDecoder:
         self._faults = faults
         self._frame_id = config.frame_id
         self._last_ns: int | None = None
+        self._last_published_ns = self._ahead = 0  # and how many stamps in a row were ahead of it
         self._has_header_stamps = True
         self._clouds: list[TimedCloud] = []
         self._point_time: PointTimeModel | None = None
@@ -56,7 +61,7 @@ class CloudDecoder:
         try:
             header_ns, frame_id = read_header(raw, ros2=True)
             stamp_ns = self._stamp_ns(header_ns, published_ns)
-            if not self._is_wanted(stamp_ns, frame_id):
+            if not self._is_wanted(stamp_ns, published_ns, frame_id):
                 return None
             cloud = self._decode(BagMessage(published_ns, header_ns, frame_id, self._type, raw))
         except (InputError, ValueError) as error:
@@ -64,7 +69,8 @@ class CloudDecoder:
             return None
         stamp = stamp_ns / 10**9
         self._learn(cloud, stamp)
-        self._last_ns, self._frame_id = stamp_ns, frame_id
+        self._last_ns, self._last_published_ns, self._frame_id = stamp_ns, published_ns, frame_id
+        self._ahead = 0
         model = self._point_time
         offsets = None if model is None else field_offsets(cloud, model, stamp)
         scan = timed_scan(cloud, offsets, stamp, model is not None, self._faults)
@@ -76,14 +82,22 @@ class CloudDecoder:
             self._has_header_stamps = header_ns != 0
         return header_ns if self._has_header_stamps else published_ns
 
-    def _is_wanted(self, stamp_ns: int, frame_id: str) -> bool:
+    def _is_wanted(self, stamp_ns: int, published_ns: int, frame_id: str) -> bool:
         if self._frame_id is not None and frame_id != self._frame_id:
             self._faults.leave_out(_OTHER_SENSOR, f"{frame_id!r} instead of {self._frame_id!r}")
-        elif self._last_ns is not None and stamp_ns <= self._last_ns:
-            self._faults.leave_out(_NOT_AFTER, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
-        else:
+            return False
+        if self._last_ns is None:
             return True
-        return False
+        step_ns = stamp_ns - self._last_ns
+        if step_ns <= 0:
+            self._faults.leave_out(_NOT_AFTER, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+            return False
+        is_ahead = step_ns > max(0, published_ns - self._last_published_ns) + _AHEAD_NS
+        self._ahead = self._ahead + 1 if is_ahead else 0
+        if 0 < self._ahead < _CLOCK_WAS_SET:
+            self._faults.leave_out(_AHEAD, f"{stamp_ns / 10**9:.9f}, after {self._last_ns / 10**9:.9f}")
+            return False
+        return True
 
     def _decode(self, message: BagMessage) -> DecodedCloud:
         """Decode the points.

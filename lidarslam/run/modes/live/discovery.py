@@ -29,11 +29,13 @@ class Published(Protocol):
 P = TypeVar("P", bound=Published)
 
 
-def find_topic(published: Callable[[], Iterable[P]], wanted: str | None, domain: int) -> P:
-    """Wait for the publisher of a topic of clouds; without a name, for the only one.
+def find_topic(
+    published: Callable[[], Iterable[P]], wanted: str | None, domain: int, within_s: float | None = None
+) -> P:
+    """Wait for the publisher of a topic of clouds, so long at most; without a name, for the only one.
 
     Raises:
-        InputError: there are several and none is named, or the named one holds no clouds.
+        InputError: there are several and none is named, the named one holds no clouds, or none came in time.
     """
     begin = time.monotonic()
     is_told = False
@@ -46,8 +48,10 @@ def find_topic(published: Callable[[], Iterable[P]], wanted: str | None, domain:
         if wanted is None and clouds and waited_s > _SETTLED_S:
             return _only(clouds)
         if waited_s > _PATIENCE_S and not is_told:
-            logger.warning(_what_is_seen(wanted, clouds, len(topics), domain))
+            logger.warning("waiting for %s", _what_is_seen(wanted, clouds, len(topics), domain))
             is_told = True
+        if within_s is not None and waited_s > within_s:
+            raise InputError(f"within {within_s:g} s there was no {_what_is_seen(wanted, clouds, len(topics), domain)}")
         time.sleep(_POLL_S)
 
 
@@ -72,4 +76,4 @@ def _what_is_seen(wanted: str | None, clouds: Iterable[Published], topics: int, 
         seen = f"{topics} topics are published, none of them with clouds"
     else:
         seen = "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
-    return f"waiting for {wanted or 'clouds'} in domain {domain}; {seen}"
+    return f"{wanted or 'clouds'} in domain {domain}; {seen}"

@@ -78,7 +78,7 @@ def execute(request: LiveRequest, show: Callable[[str], None], page: WebPage | N
             with closing(open_odometry(config, None)) as rehearsing:
                 warm_up(config, rehearsing)
             show("waiting for clouds")
-            topic = find_topic(node.published, request.topic, request.domain)
+            topic = find_topic(node.published, request.topic, request.domain, request.duration_s)
             imu = _receive_imu(config, node, log)
             show(f"{topic.name}: waiting for the first scan")
             with viewing(request.rerun, config.viewer, topic.name, directory, log, page) as viewer:

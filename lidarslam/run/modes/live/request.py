@@ -16,7 +16,7 @@ class LiveRequest:
     config: Config  # of the computation
     topic: str | None = None  # of the clouds; None: the only one there is
     domain: int = 0  # of DDS
-    # duration_s, scans: when it ends by itself, counted from the first scan
+    # duration_s, scans: when it ends by itself, counted from the first scan; while none comes, from the beginning
     duration_s: float | None = None
     scans: int | None = None
     queue: int = 20  # scans that may wait for registration
