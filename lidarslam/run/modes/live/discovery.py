@@ -48,10 +48,10 @@ def find_topic(
         if wanted is None and clouds and waited_s > _SETTLED_S:
             return _only(clouds)
         if waited_s > _PATIENCE_S and not is_told:
-            logger.warning("waiting for %s", _what_is_seen(wanted, clouds, len(topics), domain))
+            logger.warning(_what_is_seen(wanted, clouds, len(topics), domain))
             is_told = True
         if within_s is not None and waited_s > within_s:
-            raise InputError(f"within {within_s:g} s there was no {_what_is_seen(wanted, clouds, len(topics), domain)}")
+            raise InputError(f"{within_s:g} s are over, {_what_is_seen(wanted, clouds, len(topics), domain)}")
         time.sleep(_POLL_S)
 
 
@@ -76,4 +76,4 @@ def _what_is_seen(wanted: str | None, clouds: Iterable[Published], topics: int, 
         seen = f"{topics} topics are published, none of them with clouds"
     else:
         seen = "no ROS 2 topic is published at all: check ROS_DOMAIN_ID, and the network interface (CYCLONEDDS_URI)"
-    return f"{wanted or 'clouds'} in domain {domain}; {seen}"
+    return f"waiting for {wanted or 'clouds'} in domain {domain}; {seen}"
