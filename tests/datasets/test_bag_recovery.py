@@ -1,12 +1,16 @@
 """Bags without an index, cut short or damaged in the middle: what there is is read, and the rest is told."""
 
+import bz2
 import shutil
 import sqlite3
 import zlib
+from bz2 import BZ2Decompressor
 from contextlib import closing
 
+import lz4.frame
 import numpy as np
 import pytest
+from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
@@ -19,6 +23,7 @@ from lidarslam.datasets.faults import Faults
 from lidarslam.datasets.registry import open_recording
 from lidarslam.datasets.ros.bag_file import BagFile
 from lidarslam.datasets.ros.bag_recovery import recover
+from lidarslam.datasets.ros.decompression import unpacked
 
 STAMP_NS = 1_700_000_000_250_000_000
 PERIOD_NS = 100_000_000
@@ -422,3 +427,33 @@ def test_a_damaged_page_of_a_database_costs_its_rows(write_drive):
             np.testing.assert_array_equal(scan.points, points[round((scan.stamp * 10**9 - STAMP_NS) / PERIOD_NS)])
         assert scans[-1].stamp == (STAMP_NS + 59 * PERIOD_NS) / 10**9
         assert any(f"{60 - len(scans)} rows of it cannot be read, the first after row" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("pack", [zstd.compress, lz4.frame.compress, bz2.compress], ids=["zstd", "lz4", "bz2"])
+def test_frames_are_unpacked_one_after_the_other(pack, rng):
+    make = {zstd.compress: zstd.ZstdDecompressor, lz4.frame.compress: LZ4FrameDecompressor}.get(pack, BZ2Decompressor)
+    parts = rng.bytes(100_000), bytes(50_000)
+    packed = b"".join(map(pack, parts))
+    assert unpacked(packed, make) == b"".join(parts)
+    assert unpacked(b"", make) == b""
+    with pytest.raises(ValueError, match="cut short"):
+        unpacked(packed[:-10], make)
+
+
+@pytest.mark.parametrize("kind", ["bag lz4", "bag bz2", "mcap", "db3"])
+@pytest.mark.parametrize("is_indexed", [True, False])
+def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, monkeypatch, kind, is_indexed):
+    """A scan has some kilobytes here."""
+    monkeypatch.setattr("lidarslam.datasets.ros.decompression.MOST_BYTES", 1_000)
+    storage, _, form = kind.partition(" ")
+    compression = {"mcap": (CompressionMode.STORAGE, CompressionFormat.ZSTD)}.get(
+        storage, (CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    )
+    if storage == "bag":
+        compression = (Rosbag1Writer.CompressionFormat[form.upper()],)
+    file, folder, _ = write_drive(storage, compression=compression)
+    if not is_indexed:
+        file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(InputError) as caught:
+        list(open_recording(file if storage == "bag" else folder).scans())
+    assert "\n" not in str(caught.value)

@@ -9,12 +9,12 @@ from typing import Any
 
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.bag_recovery import Connections, recover
+from lidarslam.datasets.ros.decompression import unpacked_message
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
 _STORAGE_SUFFIXES = (".db3", ".mcap")
@@ -152,7 +152,7 @@ class BagFile:
         try:
             if self._messages_are_compressed:
                 with self._damage("a compressed message is damaged"):
-                    raw = DECOMPRESSORS["zstd"](raw, 0)
+                    raw = unpacked_message(raw)
             header_ns, frame_id = read_header(raw, self.ros2)
         except (InputError, ValueError) as error:
             damage = str(error) if isinstance(error, InputError) else f"{self.path}: {error}"
