@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarslam.core.compiled import compiled, compiled_part
+from lidarslam.core.compiled import compiled, compiled_part, prefetch
 from lidarslam.core.geometry import FloatArray
 from lidarslam.mapping.registration.surfaces import Surfaces
-from lidarslam.mapping.surfels.hash_kernels import ABSENT, Keys, Rows, find_one, key_at, neighbour_key
+from lidarslam.mapping.surfels.hash_kernels import ABSENT, Keys, Rows, find_one, key_at, neighbour_key, prefetch_around
 from lidarslam.mapping.surfels.symmetric import SYMMETRIC, write_eigenvalues, write_eigenvector
 
 # Voxels whose points a plane or line is fitted to, and the least number for a line, which passes through few.
@@ -33,6 +33,8 @@ _SHARED = 120.0
 _MOST_TILT = 0.05
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
+# Points whose slots are prefetched.
+_PREFETCHED = 4
 # A voxel of so many points is frozen, so that drift does not smear it.
 _MOST_POINTS = 60.0
 
@@ -75,13 +77,16 @@ def match_features(
         Number of points that are still unmatched.
     """
     left, scale = 0, 1.0 / voxels.cell_m
-    near, squared = np.empty(NEIGHBOURS, dtype=np.int64), np.empty(NEIGHBOURS)
+    around, near = np.empty(27, dtype=np.int64), np.empty(NEIGHBOURS, dtype=np.int64)
+    squared = np.empty(NEIGHBOURS)
     scatter = np.empty(6)
     mean, variances, axis = np.empty(3), np.empty(3), np.empty(3)
     most_off = min(_PLANE_M, _PLANE_CELLS * voxels.cell_m)
     for w in range(len(unmatched)):
+        ahead = points[unmatched[min(w + _PREFETCHED, len(unmatched) - 1)]]
+        prefetch_around(key_at(ahead, scale), voxels.bits, voxels.table_keys, voxels.table_rows)
         n = unmatched[w]
-        count = _nearest(points[n], key_at(points[n], scale), voxels, near, squared)
+        count = _nearest(points[n], key_at(points[n], scale), voxels, around, near, squared)
         if count >= (_LINE_VOXELS if is_line else NEIGHBOURS):
             number = _moments(points[n], near[:count], voxels.sums, mean, scatter)
             write_eigenvalues(scatter, variances)
@@ -107,26 +112,35 @@ def match_features(
 
 
 @compiled_part
-def _nearest(point: FloatArray, key: int, voxels: Voxels, near: NDArray[np.int64], squared: FloatArray) -> int:
-    """Write the rows of the nearest voxels to a point (3,), and their squared distances; return how many."""
-    count, most = 0, len(near)
+def _nearest(
+    point: FloatArray, key: int, voxels: Voxels, around: NDArray[np.int64], near: NDArray[np.int64], squared: FloatArray
+) -> int:  # fmt: skip
+    """Write the rows of the nearest voxels to a point (3,), and their squared distances; return how many.
+
+    `around` (27,) holds the rows of all while their sums are prefetched.
+    """
+    found = 0
     for i in range(-1, 2):
         for j in range(-1, 2):
             for k in range(-1, 2):
                 row = find_one(neighbour_key(key, i, j, k), voxels.bits, voxels.table_keys, voxels.table_rows)
-                if row == ABSENT:
-                    continue
-                cell = voxels.sums[row]
-                x, y, z = cell[1] / cell[0] - point[0], cell[2] / cell[0] - point[1], cell[3] / cell[0] - point[2]
-                distance = x * x + y * y + z * z
-                if count == most and distance >= squared[most - 1]:
-                    continue
-                place = min(count, most - 1)
-                while place > 0 and squared[place - 1] > distance:
-                    squared[place], near[place] = squared[place - 1], near[place - 1]
-                    place -= 1
-                squared[place], near[place] = distance, row
-                count = min(count + 1, most)
+                if row != ABSENT:
+                    prefetch(voxels.sums, row)
+                    around[found] = row
+                    found += 1
+    count, most = 0, len(near)
+    for row in around[:found]:
+        cell = voxels.sums[row]
+        x, y, z = cell[1] / cell[0] - point[0], cell[2] / cell[0] - point[1], cell[3] / cell[0] - point[2]
+        distance = x * x + y * y + z * z
+        if count == most and distance >= squared[most - 1]:
+            continue
+        place = min(count, most - 1)
+        while place > 0 and squared[place - 1] > distance:
+            squared[place], near[place] = squared[place - 1], near[place - 1]
+            place -= 1
+        squared[place], near[place] = distance, row
+        count = min(count + 1, most)
     return count
 
 
