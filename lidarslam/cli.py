@@ -4,6 +4,7 @@ import errno
 import io
 import logging
 import os
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ from lidarslam.viewer.rerun_environment import keep_rerun_to_itself, leave_if_ab
 
 logger = logging.getLogger(__name__)
 
+_LEAST_ADDRESSES = 1 << 30
+
 
 class _Group(click.Group):
     """Turns errors that the user can mend into one line on standard error and exit status 1."""
@@ -45,6 +48,7 @@ class _Group(click.Group):
         try:
             if not _has_current_folder():
                 raise InputError("the current folder was removed; change to another")
+            _require_address_space()
             with ended_like_interrupted():
                 return super().invoke(ctx)
         except LidarSlamError as error:
@@ -86,6 +90,20 @@ def _drop_unwritable_output() -> None:
         sys.stdout.flush()
     except OSError:
         sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
+
+
+def _require_address_space() -> None:
+    """Refuse to begin where libraries cannot be loaded: OpenBLAS waits for memory then, and for ever.
+
+    Raises:
+        InputError: the address space is limited to less than they take.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESSES:
+        raise InputError(
+            f"the address space is limited to {limit >> 20} MB (ulimit -v), which loaded libraries fill;"
+            f" allow {_LEAST_ADDRESSES >> 20} MB at least, and twice as much for a run"
+        )
 
 
 def _has_current_folder() -> bool:

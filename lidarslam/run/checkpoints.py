@@ -21,6 +21,8 @@ logger = logging.getLogger(__name__)
 
 # Saving takes at most this share of the time.
 _SHARE = 0.02
+# The first is saved soon, so that a run that is interrupted early can go on, too.
+_FIRST_S = 1.0
 # How the sentence in the summary begins.
 _RESUMED = "the run was resumed "
 
@@ -49,7 +51,7 @@ class Checkpoints:
         self._graph = graph
         self._scans = 0  # since the last checkpoint
         self._done = self._asked = time.monotonic()
-        self._cost_s = 0.0
+        self._cost_s: float | None = None  # of the last one
 
     def is_due(self) -> bool:
         """Whether it is time."""
@@ -57,7 +59,9 @@ class Checkpoints:
         if self._config.every_scans is not None:
             return self._scans >= self._config.every_scans
         self._asked = time.monotonic()
-        return self._asked - self._done >= max(self._config.interval_s, self._cost_s / _SHARE)
+        interval_s = self._config.interval_s
+        wait_s = min(interval_s, _FIRST_S) if self._cost_s is None else max(interval_s, self._cost_s / _SHARE)
+        return self._asked - self._done >= wait_s
 
     def save(self, pipeline: Pipeline) -> None:
         """Save the state of the pipeline, which is at rest, log and graph; a failure is a warning."""

@@ -408,3 +408,13 @@ def test_a_folder_that_is_gone(tmp_path: Path, small_recording: Path) -> None:
     ended = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stderr == "lidarslam: the current folder was removed; change to another\n"
+
+
+@pytest.mark.parametrize("limit_kb", [400_000, 1_000_000])
+def test_an_address_space_that_libraries_fill_is_refused(limit_kb: int) -> None:
+    """OpenBLAS would wait for memory without an end, deaf to SIGTERM."""
+    command = f"ulimit -v {limit_kb}; exec '{sys.executable}' -m lidarslam info nothing"
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert "the address space is limited to" in ended.stderr
+    assert ended.stderr.count("\n") == 1
