@@ -457,3 +457,31 @@ def test_chunks_and_messages_that_unpack_to_too_much_are_refused(write_drive, mo
     with pytest.raises(InputError) as caught:
         list(open_recording(file if storage == "bag" else folder).scans())
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("table", ["messages", "topics"])
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_database_with_a_view_for_a_table_is_refused(write_drive, table, is_whole):
+    """Its query, which is part of the file, has no end."""
+    file, folder, _ = write_drive("db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        (columns,) = database.execute(f"SELECT group_concat(name) FROM pragma_table_info('{table}')").fetchone()
+        zeros = ",".join("0" for _ in columns.split(","))
+        database.execute(f"DROP TABLE {table}")
+        database.execute(
+            f"CREATE VIEW {table} AS WITH RECURSIVE endless({columns}) AS"
+            f" (SELECT {zeros} UNION ALL SELECT {zeros} FROM endless) SELECT * FROM endless"
+        )
+    with pytest.raises(InputError, match="cannot be opened"):
+        open_recording(folder if is_whole else file)
+
+
+def test_metadata_that_names_a_file_over_and_over_is_left_aside(write_drive):
+    file, folder, points = write_drive("mcap")
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(
+        metadata.read_text().replace(f"- {file.name}", "\n".join([f"  - {file.name}"] * 10_000).lstrip())
+    )
+    recording = open_recording(folder)
+    assert_first_scans(recording, points, 6)
+    assert "its metadata.yaml is missing or damaged" in recording.warnings[0]

@@ -1,5 +1,6 @@
 """Messages of rosbag1 and rosbag2 files, by rosbags; a file whose index cannot be read is read without it."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -13,7 +14,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from lidarslam.core.errors import InputError
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
-from lidarslam.datasets.ros.bag_recovery import Connections, recover
+from lidarslam.datasets.ros.bag_recovery import Connections, recover, require_tables
 from lidarslam.datasets.ros.decompression import unpacked_message
 from lidarslam.datasets.ros.point_cloud2 import DecodedCloud
 
@@ -24,6 +25,9 @@ _REPAIR = {
     ".mcap": "mcap recover {} -o recovered.mcap",
     ".db3": "sqlite3 {} .recover | sqlite3 recovered.db3",
 }
+_METADATA = "metadata.yaml"
+# A file in the list of a rosbag2's.
+_LISTED = re.compile(r"^\s*-\s+(\S+\.(?:db3|mcap)(?:\.zstd)?)\s*$", re.MULTILINE)
 
 
 class BagFile:
@@ -193,6 +197,8 @@ class BagFile:
     @contextmanager
     def _opened(self) -> Iterator[Rosbag1Reader | Rosbag2Reader]:
         with self._damage("it cannot be opened"):
+            if self.ros2:
+                _require_bounded(self.path)
             reader = Rosbag2Reader(self.path) if self.ros2 else Rosbag1Reader(self.path)
             reader.open()
         try:
@@ -233,6 +239,20 @@ def _last(messages: Iterator[BagMessage]) -> BagMessage | None:
     for message in messages:
         last = message if message.damage is None else last
     return last
+
+
+def _require_bounded(path: Path) -> None:
+    """Refuse a rosbag2 that would be read without an end, or over and over.
+
+    Raises:
+        ValueError: a database has views for tables, or the metadata name a file twice.
+    """
+    for database in path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []:
+        require_tables(database)
+    if path.is_dir() and (path / _METADATA).is_file():
+        names = Counter(_LISTED.findall((path / _METADATA).read_text(encoding="utf-8", errors="replace")))
+        if repeated := [name for name, times in names.items() if times > 1]:
+            raise ValueError(f"{_METADATA} names {repeated[0]} {names[repeated[0]]:,} times")
 
 
 def _chunk_starts(storage: Any) -> list[int]:

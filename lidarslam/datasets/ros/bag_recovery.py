@@ -7,7 +7,7 @@ because rosbags needs an index, and `StreamReader` of mcap 1.6 loses a chunk tha
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from io import BytesIO
 from itertools import chain, pairwise
 from pathlib import Path
@@ -161,11 +161,27 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+def require_tables(path: Path) -> None:
+    """Refuse a database whose messages or topics are a view: its query may run without an end.
+
+    Raises:
+        ValueError: it has such a view.
+    """
+    with closing(_connected(path)) as database, suppress(sqlite3.Error):  # damaged, which is found when it is read
+        for name, kind in database.execute("SELECT name, type FROM sqlite_master"):
+            if name.lower() in ("messages", "topics") and kind != "table":
+                raise ValueError(f"its {name} are a {kind}, not a table")
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
+
+
 def _database(path: Path, report: Report) -> Iterator[RecoveredMessage]:
-    uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+    require_tables(path)
     with path.open("rb") as file:
         header = file.read(32)
-    with closing(sqlite3.connect(uri, uri=True)) as database:
+    with closing(_connected(path)) as database:
         # Without it SQLite refuses a file that is shorter than its header says; nothing can be written here.
         database.execute("PRAGMA writable_schema=ON")
         topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
