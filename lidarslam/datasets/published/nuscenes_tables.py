@@ -24,6 +24,7 @@ _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 _LIDAR_FILE = re.compile(rb"/LIDAR_TOP/")
 _MICROSECOND = 1e-6
 _TAIL = 100  # bytes
+_LONGEST_RECORD = 1 << 13  # bytes; those of the data set have some hundred
 
 T = TypeVar("T")
 
@@ -126,7 +127,10 @@ def _select(
                 raise ValueError("its end is missing")
             for match in pattern.finditer(text):
                 if wanted(match):
-                    start, end = text.rfind(b"{", 0, match.start()), text.find(b"}", match.end()) + 1
+                    start = text.rfind(b"{", max(0, match.start() - _LONGEST_RECORD), match.start())
+                    end = text.find(b"}", match.end(), match.end() + _LONGEST_RECORD) + 1
+                    if start < 0 or end == 0:
+                        raise ValueError(f"a record has no end within {_LONGEST_RECORD:,} bytes")
                     yield parse_json(text[start:end], shape)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); download the tables again") from error

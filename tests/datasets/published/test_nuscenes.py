@@ -148,3 +148,12 @@ def test_a_missing_or_damaged_table_is_named(nuscenes: SimpleNamespace, table: s
     path.write_bytes(b"")
     with pytest.raises(InputError, match=r"v1\.0-mini"):
         open_recording(nuscenes.root, config)
+
+
+@pytest.mark.parametrize("text", [b"/LIDAR_TOP/", b"{/LIDAR_TOP/"], ids=["no record", "one record"])
+def test_a_table_without_records_is_refused_at_once(nuscenes: SimpleNamespace, text: bytes) -> None:
+    """Looked for from every one of a million places, the ends of a record would take hours."""
+    table = nuscenes.root / "v1.0-mini" / "sample_data.json"
+    table.write_bytes(b"[" + text + b"/LIDAR_TOP/" * 1_000_000 + b"]")
+    with pytest.raises(InputError, match="a record has no end within"):
+        open_recording(nuscenes.root, ReaderConfig(sequence="0061"))
