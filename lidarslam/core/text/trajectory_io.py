@@ -4,6 +4,7 @@ TUM: `stamp tx ty tz qx qy qz qw`, a pose a line, `#` comments. KITTI: twelve nu
 of the pose matrix, no stamps.
 """
 
+from array import array
 from io import StringIO
 from pathlib import Path
 
@@ -11,10 +12,9 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
+from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.core.trajectory import Trajectory
 
-# Ten million poses and more.
-_LONGEST_BYTES = 1 << 30
 # Survey coordinates are far below; squares of much larger numbers overflow.
 _FARTHEST_M = 1e9
 
@@ -38,16 +38,8 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
     Raises:
         InputError: the file is missing, is not text, or a line does not hold that many numbers.
     """
-    try:
-        with path.open("rb") as file:
-            content = file.read(_LONGEST_BYTES + 1)
-        if len(content) > _LONGEST_BYTES:
-            raise InputError(f"{path}: is longer than a gigabyte; expected {columns} numbers a line")
-        text = content.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from error
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    numbers = array("d")
+    for number, line in enumerate(bounded_lines(path), start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -60,8 +52,8 @@ def parse_numbers(path: Path, columns: int) -> FloatArray:
         if len(row) != columns:
             hint = _OTHER_FORMAT.get((columns, len(row)), _FORMATS.get(columns, ""))
             raise InputError(f"{path}:{number}: expected {columns} numbers, got {len(row)}{hint}")
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+        numbers.extend(row)
+    return np.array(numbers, dtype=np.float64).reshape(-1, columns)
 
 
 def read_tum(path: Path) -> Trajectory:

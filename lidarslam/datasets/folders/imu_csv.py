@@ -12,6 +12,7 @@ import numpy as np
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, is_rigid, orthonormalize
 from lidarslam.core.imu import ImuSamples
+from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.datasets.imu_samples import usable_samples
 
 IMU_FILE = "imu.csv"
@@ -32,10 +33,7 @@ def read_imu_csv(path: Path) -> ImuSamples | None:
     Raises:
         InputError: the file cannot be read, or a line is no sample.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from error
+    lines = list(bounded_lines(path))
     comments = [line for line in lines if line.startswith("#")]
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
     if rows and any(character.isalpha() and character not in "eEnainf" for character in rows[0]):

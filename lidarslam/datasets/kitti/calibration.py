@@ -6,6 +6,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray, make_transform, orthonormalize
+from lidarslam.core.text.bounded_lines import bounded_lines
 
 
 def read_calibration(path: Path) -> dict[str, FloatArray]:
@@ -14,12 +15,8 @@ def read_calibration(path: Path) -> dict[str, FloatArray]:
     Raises:
         InputError: the file cannot be read.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from error
     arrays = {}
-    for line in text.splitlines():
+    for line in bounded_lines(path):
         name, _, values = line.partition(":")
         try:
             arrays[name.strip()] = np.array([float(word) for word in values.split()])

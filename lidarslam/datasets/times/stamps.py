@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarslam.core.errors import InputError
 from lidarslam.core.geometry import FloatArray
+from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.datasets.config import ReaderConfig
 
 # Clock readings count from 1970; a number outside these years is none.
@@ -30,11 +31,7 @@ def read_stamps(path: Path) -> FloatArray:
     Raises:
         InputError: the file cannot be read or a line is no stamp.
     """
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from error
-    lines = [line for line in lines if not line.startswith("#")]
+    lines = [line for line in map(str.strip, bounded_lines(path)) if not line.startswith("#")]
     stamps = np.full(len(lines), np.nan)
     for row, line in enumerate(lines):
         if line:
