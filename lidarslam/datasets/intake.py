@@ -73,11 +73,15 @@ def _without_repeats(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:
     """The scans that have been measured anew: the noise of two measurements is never the same."""
     last: Scan | None = None
     for scan in scans:
-        if last is not None and len(scan) > _FEW_POINTS and np.array_equal(scan.points, last.points):
+        if last is not None and len(scan) > _FEW_POINTS and _is_repeated(scan.points, last.points):
             faults.leave_out(_REPEATED, f"at {scan.stamp:.9f}")
             continue
         last = scan
         yield scan
+
+
+def _is_repeated(points: FloatArray, before: FloatArray) -> bool:
+    return np.array_equal(points, before) and bool(np.ptp(points, axis=0).any())
 
 
 def _with_paces_checked(scans: Iterator[Scan], faults: Faults) -> Iterator[Scan]:

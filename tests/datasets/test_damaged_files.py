@@ -159,7 +159,8 @@ def test_folder_of_damaged_scans(tmp_path, table, name, damage, place):
     header = len(data) - len(FORMATS[name](table[:0])) if name == "plain.bin" else len(FORMATS[name](table[:0]))
     for index in range(SCANS):
         damaged = damage(data, min(header, len(data)))
-        (tmp_path / f"{index}{Path(name).suffix}").write_bytes(damaged if index == place else data)
+        whole = FORMATS[name](np.roll(table, index))
+        (tmp_path / f"{index}{Path(name).suffix}").write_bytes(damaged if index == place else whole)
     (tmp_path / "times.txt").write_text("".join(f"{100 + index / 10}\n" for index in range(SCANS)))
     # A change may well make another valid scan; the other three are never lost.
     assert check(tmp_path) >= SCANS - 1
@@ -172,7 +173,7 @@ def test_damaged_kitti_sequence(tmp_path, table, name, damage):
     velodyne = tmp_path / "velodyne"
     velodyne.mkdir(exist_ok=True)
     for index in range(SCANS):
-        (velodyne / f"{index:06d}.bin").write_bytes(_as_bin(table))
+        (velodyne / f"{index:06d}.bin").write_bytes(_as_bin(np.roll(table, index)))
     (tmp_path / "times.txt").write_text("".join(f"{index / 10:e}\n" for index in range(SCANS)))
     rows = " ".join(f"{value:e}" for value in np.eye(4)[:3].ravel())
     (tmp_path / "calib.txt").write_text(f"P0: {rows}\nTr: {rows}\n")
