@@ -36,6 +36,7 @@ from lidarslam.viewer.rerun_environment import keep_rerun_to_itself, leave_if_ab
 
 logger = logging.getLogger(__name__)
 
+# Bytes of addresses that libraries alone take.
 _LEAST_ADDRESSES = 1 << 30
 
 

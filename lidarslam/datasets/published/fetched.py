@@ -21,8 +21,8 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]*):/+(.+)", re.DOTALL)
 _STORAGE = ("file", "http", "https", "s3", "gs")
 # Beside a fetched source; and what has been fetched of one so far, with the version of each file.
 _ABOUT, _PARTIAL, _VERSION = "url.txt", ".partial", ".fetched-version"
-# What a storage says of a file that changes with its content.
-_CHANGING = ("size", "ETag", "etag", "Last-Modified", "LastModified", "md5Hash", "generation", "mtime")
+# What a storage says of a file that changes with its content, beside its size.
+_CHANGING = ("ETag", "etag", "Last-Modified", "LastModified", "md5Hash", "generation", "mtime")
 # Bytes of a source at most, and of what is read at once; seconds without a byte after which a server has failed.
 _MOST_BYTES, _BLOCK_BYTES, _SILENCE_S = 2**40, 2**23, 60.0
 
@@ -134,10 +134,12 @@ def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
     """Fetch what is missing of a file; return its bytes. `before` is those of the source's files before."""
     about = storage.info(remote)
     size = about.get("size")
-    version = json.dumps({key: str(about[key]) for key in _CHANGING if about.get(key) is not None})
+    marks = [str(about[key]) for key in _CHANGING if about.get(key) is not None]
+    version = json.dumps([size, *marks])
     noted = place.with_name(place.name + _VERSION)
     place.parent.mkdir(parents=True, exist_ok=True)
-    if size is None or not noted.is_file() or noted.read_text(encoding="utf-8") != version:
+    is_known = size is not None and bool(marks) and noted.is_file()
+    if not is_known or noted.read_text(encoding="utf-8") != version:
         place.unlink(missing_ok=True)
         noted.write_text(version, encoding="utf-8")
     with place.open("ab") as file:
@@ -146,7 +148,8 @@ def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
         # Over http, several requests want a server that reads from the middle of a file.
         streamed = {"block_size": 0} if not file.tell() and hasattr(storage, "client_kwargs") else {}
         with storage.open(remote, "rb", **streamed) as source:
-            source.seek(file.tell()) if file.tell() else None
+            if file.tell():
+                source.seek(file.tell())
             while file.tell() != size and (block := source.read(_BLOCK_BYTES)):
                 if before + file.tell() + len(block) > _MOST_BYTES:
                     raise InputError(f"{remote}: more than {_MOST_BYTES / 1e12:.1f} TB are fetched from no source")

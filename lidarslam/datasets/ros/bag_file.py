@@ -12,6 +12,7 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
 from lidarslam.core.errors import InputError
+from lidarslam.core.text.bounded_lines import bounded_lines
 from lidarslam.datasets.recording import Topic
 from lidarslam.datasets.ros.bag_message import BagMessage, decode, read_header
 from lidarslam.datasets.ros.bag_recovery import Connections, recover, require_tables
@@ -27,7 +28,7 @@ _REPAIR = {
 }
 _METADATA = "metadata.yaml"
 # A file in the list of a rosbag2's.
-_LISTED = re.compile(r"^\s*-\s+(\S+\.(?:db3|mcap)(?:\.zstd)?)\s*$", re.MULTILINE)
+_LISTED = re.compile(r"\s*-\s+(\S+\.(?:db3|mcap)(?:\.zstd)?)\s*")
 
 
 class BagFile:
@@ -249,10 +250,11 @@ def _require_bounded(path: Path) -> None:
     """
     for database in path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []:
         require_tables(database)
-    if path.is_dir() and (path / _METADATA).is_file():
-        names = Counter(_LISTED.findall((path / _METADATA).read_text(encoding="utf-8", errors="replace")))
-        if repeated := [name for name, times in names.items() if times > 1]:
-            raise ValueError(f"{_METADATA} names {repeated[0]} {names[repeated[0]]:,} times")
+    with suppress(InputError):  # there are no metadata, or no text, which is said when they are read
+        names = Counter(found[1] for found in map(_LISTED.fullmatch, bounded_lines(path / _METADATA)) if found)
+        for name, times in names.most_common(1):
+            if times > 1:
+                raise ValueError(f"{_METADATA} names {name} {times:,} times")
 
 
 def _chunk_starts(storage: Any) -> list[int]:

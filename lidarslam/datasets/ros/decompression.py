@@ -25,26 +25,27 @@ def unpacked(data: bytes, make: Callable[[], Any]) -> bytes:
     Raises:
         ValueError: they are cut short, or there is too much.
     """
-    content = bytearray()
+    frames, size = [], 0
     while data:
         decompressor = make()
-        content += decompressor.decompress(data, MOST_BYTES + 1 - len(content))
-        if len(content) > MOST_BYTES:
+        frames.append(decompressor.decompress(data, MOST_BYTES + 1 - size))
+        size += len(frames[-1])
+        if size > MOST_BYTES:
             raise ValueError(
                 f"{len(data):,} bytes unpack to more than {MOST_BYTES >> 20} MB, which no chunk or message has"
             )
         if not decompressor.eof:
             raise ValueError("the compressed data are cut short")
         data = decompressor.unused_data or b""
-    return bytes(content)
+    return b"".join(frames)
 
 
 def unpacked_message(data: bytes) -> bytes:
-    """A message of a rosbag2 with compression per message."""
+    """A message of a rosbag2 with compression per message, or a chunk: frames of Zstandard."""
     return unpacked(data, zstd.ZstdDecompressor)
 
 
 DECOMPRESSORS["lz4"] = lambda data, _: unpacked(data, LZ4FrameDecompressor)
-DECOMPRESSORS["zstd"] = lambda data, _: unpacked(data, zstd.ZstdDecompressor)
+DECOMPRESSORS["zstd"] = lambda data, _: unpacked_message(data)
 decompressors[Compression.LZ4.value] = lambda data: unpacked(data, LZ4FrameDecompressor)
 decompressors[Compression.BZ2.value] = lambda data: unpacked(data, BZ2Decompressor)

@@ -103,14 +103,14 @@ class Follower:
             self._statistics.arrived((stamp_ns or message.published_ns) / 10**9, message.arrived_s)
 
     def _register_all(self, incoming: IncomingQueue) -> None:
-        begin, registered, is_first = time.time(), 0, True
+        started, begin, registered = time.time(), None, 0
         while True:
             message = incoming.take(_POLL_S)
             if message is None:
-                if incoming.is_ended or _is_over(self._request.duration_s, time.time() - begin):
+                if incoming.is_ended or _is_over(self._request.duration_s, time.time() - (begin or started)):
                     return
                 continue
-            begin, is_first = message.arrived_s if is_first else begin, False
+            begin = begin or message.arrived_s
             registered += self._register(message)
             if registered == self._request.scans or _is_over(self._request.duration_s, message.arrived_s - begin):
                 return
