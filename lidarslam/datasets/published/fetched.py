@@ -118,7 +118,7 @@ def _download(url: str, place: Path) -> None:
     for name in names:  # not get(recursive=True), which takes a folder of a web page for a file, too
         if not stays_below(name):
             raise InputError(f"{url}: lists a file elsewhere, {name}")
-        fetched_bytes += _download_file(storage, f"{root}{name}", place / name, fetched_bytes)
+        fetched_bytes = _download_file(storage, f"{root}{name}", place / name, fetched_bytes)
 
 
 def _patience(url: str) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def _patience(url: str) -> dict[str, Any]:
 
 
 def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
-    """Fetch what is missing of a file; return its bytes. `before` is those of the source's files before."""
+    """Fetch what is missing of a file; return the bytes of the source so far, which were `before` without it."""
     about = storage.info(remote)
     size = about.get("size")
     marks = [str(about[key]) for key in _CHANGING if about.get(key) is not None]
@@ -142,6 +142,16 @@ def _download_file(storage: Any, remote: str, place: Path, before: int) -> int:
     if not is_known or noted.read_text(encoding="utf-8") != version:
         place.unlink(missing_ok=True)
         noted.write_text(version, encoding="utf-8")
+    try:
+        return before + _append(storage, remote, place, size, before)
+    except ValueError:  # the storage does not read from the middle of a file
+        if not place.stat().st_size:
+            raise
+        place.unlink()
+        return before + _append(storage, remote, place, size, before)
+
+
+def _append(storage: Any, remote: str, place: Path, size: int | None, before: int) -> int:
     with place.open("ab") as file:
         if file.tell() and file.tell() != size:
             logger.warning("%s: continued after %.0f MB", remote, file.tell() / 1e6)

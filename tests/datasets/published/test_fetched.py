@@ -124,6 +124,7 @@ class Ranged(SimpleHTTPRequestHandler):
 
     content: ClassVar[bytes] = np.random.default_rng(0).bytes(300_000)
     etag: ClassVar[str] = '"1"'
+    has_ranges: ClassVar[bool] = True
     sent: ClassVar[list[int]] = []  # bytes of each answer
 
     def log_request(self, *_: object) -> None:
@@ -133,9 +134,9 @@ class Ranged(SimpleHTTPRequestHandler):
         self._head(200, 0, len(self.content))
 
     def do_GET(self) -> None:
-        first, _, last = self.headers.get("Range", "bytes=0-").removeprefix("bytes=").partition("-")
+        first, _, last = self._range().removeprefix("bytes=").partition("-")
         part = self.content[int(first) : int(last or len(self.content)) + 1]
-        self._head(206 if "Range" in self.headers else 200, int(first), len(part))
+        self._head(206 if self._range() != "bytes=0-" else 200, int(first), len(part))
         part = part[:100_000] if len(self.sent) == 1 else part
         self.sent.append(len(part))
         with contextlib.suppress(OSError):
@@ -144,10 +145,14 @@ class Ranged(SimpleHTTPRequestHandler):
             time.sleep(0.5)  # what has arrived by then is read
         self.close_connection = True
 
+    def _range(self) -> str:
+        return self.headers.get("Range", "bytes=0-") if self.has_ranges else "bytes=0-"
+
     def _head(self, code: int, first: int, length: int) -> None:
         self.send_response(code)
         self.send_header("ETag", self.etag)
-        self.send_header("Accept-Ranges", "bytes")
+        if self.has_ranges:
+            self.send_header("Accept-Ranges", "bytes")
         self.send_header("Content-Length", str(length))
         if code == 206:
             self.send_header("Content-Range", f"bytes {first}-{first + length - 1}/{len(self.content)}")
@@ -164,9 +169,11 @@ def breaking_server() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("changes", [False, True], ids=["the same file", "another meanwhile"])
+@pytest.mark.parametrize("has_ranges", [True, False], ids=["from the middle", "from the start alone"])
 def test_a_download_that_broke_off_is_continued(
-    breaking_server: str, changes: bool, monkeypatch: pytest.MonkeyPatch
+    breaking_server: str, changes: bool, has_ranges: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Ranged, "has_ranges", has_ranges)
     monkeypatch.setattr("lidarslam.datasets.published.fetched._BLOCK_BYTES", 10_000)
     with pytest.raises(InputError, match="cannot be fetched"):
         fetched(breaking_server)
@@ -175,7 +182,7 @@ def test_a_download_that_broke_off_is_continued(
         monkeypatch.setattr(Ranged, "etag", '"2"')
     path = fetched(breaking_server)
     assert path.read_bytes() == Ranged.content
-    assert (Ranged.sent[-1] == 300_000) == changes, "a part"
+    assert (Ranged.sent[-1] == 300_000) == (changes or not has_ranges), "a part"
     assert Ranged.sent[-1] >= 200_000
     assert {file.name for file in path.parent.rglob("*")} == {"lock", "office.bin", "url.txt"}
 
