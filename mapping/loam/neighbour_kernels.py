@@ -31,6 +31,8 @@ _SHARED = 120.0
 # Largest standard deviation of the direction of a line or plane: across the corner of a floor and a wall, and along a
 # ring, five points make planes of any direction, and these move with the rings.
 _MOST_TILT = 0.05
+# Below this, no plane of coarser voxels is asked.
+_CERTAIN_TILT = 0.02
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
 # Points whose slots are prefetched.
@@ -70,11 +72,12 @@ def match_features(
 ) -> int:  # fmt: skip
     """Write the line or plane of every unmatched point (N, 3) whose nearest neighbours are on one.
 
-    `unmatched` (W,) has the indices of the points; those that are still unmatched are moved to its beginning. The
-    normal of a plane faces the sensor (3,), the first of a line points from that to the point.
+    `unmatched` (W,) has the indices of the points; those without a line or plane, or with a plane of an uncertain
+    normal, are moved to its beginning, and a thinner plane replaces that. The normal of a plane faces the sensor (3,),
+    the first of a line points from that to the point.
 
     Returns:
-        Number of points that are still unmatched.
+        Number of these points.
     """
     left, scale = 0, 1.0 / voxels.cell_m
     around, near = np.empty(27, dtype=np.int64), np.empty(NEIGHBOURS, dtype=np.int64)
@@ -104,8 +107,10 @@ def match_features(
                     and _cosine(mean, axis, sensor) > _LEAST_COSINE
                     and _farthest(near[:count], voxels.sums, mean, axis) < most_off
                 ):
-                    _write_plane(found, n, mean, axis, thickness_m, tilt, sensor)
-                    continue
+                    if found.counts[n] == 0 or thickness_m < found.thickness_m[n, 0]:
+                        _write_plane(found, n, mean, axis, thickness_m, tilt, sensor)
+                    if tilt < _CERTAIN_TILT:
+                        continue
         unmatched[left] = n
         left += 1
     return left

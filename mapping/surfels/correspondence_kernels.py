@@ -20,6 +20,9 @@ _LEAST_HEIGHT_M = 0.05
 _FEWEST_POINTS = 6
 # The plane of a surfel is as uncertain as if so many of its points counted as one: neighbours share their errors.
 _SHARED = 120.0
+# Largest standard deviation of a normal with which no coarser plane is asked: of grass, the finest cells have normals
+# of any direction.
+_CERTAIN_TILT = 0.02
 # Largest cosine between the axis of a compact object and the direction from ring to ring.
 _MOST_ACROSS = 0.5
 
@@ -29,13 +32,13 @@ def match_planes(
     points: FloatArray, unmatched: NDArray[np.intp], rows: NDArray[np.int32], surfels: FloatArray, sensor: FloatArray,
     found: Surfaces,
 ) -> int:  # fmt: skip
-    """Write the surface of every unmatched point (N, 3) whose cell has a plane.
+    """Write the surface of every unmatched point (N, 3) whose cell has a plane, unless it has a thinner one already.
 
     `unmatched` (W,) has the indices of the points, `rows` (W,) those of their cells in `surfels` (M, 15), or -1. Points
-    without a plane are moved to the beginning of `unmatched`.
+    without a plane, or with one of an uncertain normal, are moved to the beginning of `unmatched`.
 
     Returns:
-        Number of points that are still unmatched.
+        Number of these points.
     """
     left = 0
     for w in range(len(unmatched)):
@@ -48,8 +51,11 @@ def match_planes(
             faced, behind = is_steep(-along, distance), is_steep(along, distance)
             if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
-                _write(found, n, p, p[3], p[4], p[5], p[9], tilt)
-                continue
+                if found.counts[n] == 0 or _thickness_m(p, 0) < found.thickness_m[n, 0]:
+                    found.counts[n] = 0
+                    _write(found, n, p, 0, p[3], p[4], p[5], tilt)
+                if tilt < _CERTAIN_TILT:
+                    continue
         unmatched[left] = n
         left += 1
     return left
@@ -71,7 +77,7 @@ def match_compact(
     sensor = T_world_lidar[:3, 3]
     ax, ay, az = T_world_lidar[0, 2], T_world_lidar[1, 2], T_world_lidar[2, 2]
     for n in unmatched:
-        if rows[n] < 0:
+        if rows[n] < 0 or found.counts[n]:
             continue
         p = surfels[rows[n]]
         x, y, z = points[n, 0] - sensor[0], points[n, 1] - sensor[1], points[n, 2] - sensor[2]
@@ -88,7 +94,7 @@ def match_compact(
             u, v, w = _axis(p, axis)
             across_rings = abs(u * rx + v * ry + w * rz) / length
             if p[9 + axis] < largest_m and across_rings < _MOST_ACROSS:
-                _write(found, n, p, u, v, w, p[9 + axis], 0.0)
+                _write(found, n, p, axis, u, v, w, 0.0)
 
 
 @compiled_part
@@ -102,13 +108,17 @@ def _axis(p: FloatArray, axis: int) -> tuple[float, float, float]:
 
 
 @compiled_part
-def _write(
-    found: Surfaces, n: int, surfel: FloatArray, u: float, v: float, w: float, thickness_m: float, tilt: float
-) -> None:
+def _thickness_m(surfel: FloatArray, axis: int) -> float:
+    """Standard deviation of a surfel (15,) along a principal axis, with that of its position."""
+    return float(surfel[9 + axis] * math.sqrt(1.0 + _SHARED / surfel[13]))
+
+
+@compiled_part
+def _write(found: Surfaces, n: int, surfel: FloatArray, axis: int, u: float, v: float, w: float, tilt: float) -> None:
     residual = found.counts[n]
-    for axis in range(3):
-        found.points[n, axis] = surfel[axis]
+    for i in range(3):
+        found.points[n, i] = surfel[i]
     normal = found.normals[n, residual]
     normal[0], normal[1], normal[2] = u, v, w
-    found.thickness_m[n, residual], found.tilt[n, residual] = thickness_m * math.sqrt(1.0 + _SHARED / surfel[13]), tilt
+    found.thickness_m[n, residual], found.tilt[n, residual] = _thickness_m(surfel, axis), tilt
     found.counts[n] += 1

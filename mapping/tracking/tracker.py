@@ -20,8 +20,8 @@ from lidarslam.mapping.motion.prediction import (
     ProcessNoise,
     predict,
 )
+from lidarslam.mapping.motion.velocity_bias import VelocityBias
 from lidarslam.mapping.registration.local_map import LocalMap
-from lidarslam.mapping.registration.registration import Registration
 from lidarslam.mapping.registration.sampled_scan import SampledScan
 from lidarslam.mapping.tracking.archived_maps import ArchivedMaps
 from lidarslam.mapping.tracking.attempt import Attempt, best_of
@@ -46,6 +46,7 @@ class Tracker(Stateful):
     _archive: ArchivedMaps
     _process_noise: ProcessNoise
     _odometry_noise: OdometryNoise
+    _velocity_bias: VelocityBias
     _prediction_error_m: float
 
     def __init__(self, config: MappingConfig, budget: Budget | None = None) -> None:
@@ -58,6 +59,7 @@ class Tracker(Stateful):
         self._archive = ArchivedMaps()
         self._process_noise = ProcessNoise()
         self._odometry_noise = OdometryNoise()
+        self._velocity_bias = VelocityBias()
         self._prediction_error_m = _UNKNOWN_ERROR_M
 
     @property
@@ -115,21 +117,26 @@ class Tracker(Stateful):
         self, attempt: Attempt, scan: SampledScan, prior: Prior, prediction: Prediction, last: MotionState
     ) -> MappedScan:
         """Judge a registration, and update noise and tracking state with it."""
-        registration, interval_s, jumped = attempt.registration, scan.stamp - last.stamp, attempt.has_jumped
+        registration, jumped = attempt.registration, attempt.has_jumped
         assert registration is not None
+        T_world_lidar, velocity, covariance = registration.T_world_lidar, registration.velocity, registration.covariance
+        state = MotionState(scan.stamp, T_world_lidar, velocity, covariance, scan.seen_until_s)
         self._state.registered(attempt.status, attempt.relocalised, attempt.quality, scan.stamp)
         if attempt.status is Status.OK or attempt.relocalised:
             self._end_search()
+        if attempt.relocalised or jumped or not self._state.velocity_known or prior.inertial is not None:
+            self._velocity_bias = VelocityBias()
+        elif scan.sweep.times is not None and self._config.continuous_time:
+            self._velocity_bias = self._velocity_bias.updated(last, state, scan.seen_from_s)
+            state = self._velocity_bias.corrected(state)
         if not attempt.relocalised:
-            self._update_noise(registration, prior, last, interval_s)
+            self._update_noise(state, prior, last)
         error_m = displacement_m(attempt.correction, scan.range_m)
         self._prediction_error_m = max(_ERROR_DECAY * self._prediction_error_m, error_m)
         self._state.velocity_known = not (jumped or attempt.relocalised)
-        velocity, covariance, seen_until_s = registration.velocity, registration.covariance, scan.seen_until_s
         if not self._state.velocity_known:
             velocity = attempt.uncertain_velocity(scan, last, self._config.continuous_time)
-            covariance, seen_until_s = LOST_MOTION, 0.0
-        state = MotionState(scan.stamp, registration.T_world_lidar, velocity, covariance, seen_until_s)
+            state = MotionState(scan.stamp, T_world_lidar, velocity, LOST_MOTION)
         unexpected = not attempt.relocalised and replace(attempt, prediction=prediction).has_jumped
         # A young map that is not added to would stay one.
         fits = attempt.status is Status.OK or attempt.local_map.is_young
@@ -173,6 +180,7 @@ class Tracker(Stateful):
         """Take the last registration back, but for the observed error of the predictions."""
         self._state = copy(earlier._state)
         self._process_noise, self._odometry_noise = earlier._process_noise, earlier._odometry_noise
+        self._velocity_bias = earlier._velocity_bias
         self._end_search()
 
     def _begins_coarse(self, scan: SampledScan, prediction: Prediction) -> bool:
@@ -244,10 +252,10 @@ class Tracker(Stateful):
         self._search.drop()
         self._map_is_due = self._in_vain = False
 
-    def _update_noise(self, registration: Registration, prior: Prior, last: MotionState, interval_s: float) -> None:
+    def _update_noise(self, state: MotionState, prior: Prior, last: MotionState) -> None:
+        interval_s = state.stamp - last.stamp
         if interval_s > 0.0 and self._state.velocity_known:
-            variance = np.diag(registration.covariance + last.covariance)[6:]
-            change = registration.velocity - last.velocity
-            self._process_noise = self._process_noise.updated(change, interval_s, variance)
-        motion = inverse(last.T_world_lidar) @ registration.T_world_lidar
+            variance = np.diag(state.covariance + last.covariance)[6:]
+            self._process_noise = self._process_noise.updated(state.velocity - last.velocity, interval_s, variance)
+        motion = inverse(last.T_world_lidar) @ state.T_world_lidar
         self._odometry_noise = self._odometry_noise.updated(prior, motion, self._config)

@@ -1,0 +1,51 @@
+"""The bias that the velocities during successive sweeps have in common, observed by the motion between their poses.
+
+Sweeps that are bent alike fit one another and the map that they make, so that their registration hardly observes a
+bias in common. The motion between the poses of successive sweeps does: on average, it is their velocity.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+
+from lidarslam.core.geometry import FloatArray, exp, inverse
+from lidarslam.core.state.stateful import Shape
+from lidarslam.mapping.motion.deskew import body_velocity
+from lidarslam.mapping.motion.prediction import MotionState
+
+# Share of a difference by which the correction changes with a sweep.
+_GAIN = 0.3
+_MOST_CHANGE = np.array([np.deg2rad(3.0)] * 3 + [0.2] * 3)
+# Sweeps follow one another where they cover this share of the interval between their stamps.
+_COVERED = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class VelocityBias:
+    """The correction of estimated velocities: the integral of their difference from the motion between poses."""
+
+    correction: Annotated[FloatArray, Shape(6)] = field(default_factory=lambda: np.zeros(6))  # rotation first
+
+    def updated(self, last: MotionState, state: MotionState, seen_from_s: float) -> "VelocityBias":
+        """The bias after another sweep; none where a gap lies between the sweeps.
+
+        Args:
+            last: state of the sweep before, corrected.
+            state: as it was estimated.
+            seen_from_s: time from the first point of the sweep to its stamp.
+        """
+        interval_s, covered_s = state.stamp - last.stamp, last.seen_until_s + seen_from_s
+        if not covered_s > _COVERED * interval_s > 0.0:
+            return VelocityBias()
+        now = state.velocity + self.correction
+        mean = (last.seen_until_s * last.velocity + seen_from_s * now) / covered_s
+        motion = body_velocity(inverse(last.T_world_lidar) @ state.T_world_lidar, interval_s)
+        return VelocityBias(self.correction + _GAIN * np.clip(motion - mean, -_MOST_CHANGE, _MOST_CHANGE))
+
+    def corrected(self, state: MotionState) -> MotionState:
+        """The state with the corrected velocity, and the pose that is most likely given that."""
+        P = state.covariance
+        step = P[:6, 6:] @ np.linalg.solve(P[6:, 6:], self.correction)
+        T_world_lidar = state.T_world_lidar @ exp(step)
+        return replace(state, T_world_lidar=T_world_lidar, velocity=state.velocity + self.correction)
