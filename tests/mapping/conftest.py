@@ -23,6 +23,7 @@ STAND = (0.7, -0.4, 1.3)
 
 Scanner = Callable[..., Scan]
 RoomPoints = Callable[[np.random.Generator, int], FloatArray]
+Grass = Callable[[np.random.Generator, float], tuple[FloatArray, FloatArray]]
 
 
 def _room() -> World:
@@ -67,6 +68,18 @@ def _l_shaped_room(rng: np.random.Generator, count: int) -> FloatArray:
     flat = flat[(flat[:, 0] < 1) | (flat[:, 1] < 1)]
     parts += [np.column_stack([flat, np.full(len(flat), z)]) for z in (-1.5, 1.5)]
     return np.concatenate(parts)
+
+
+@pytest.fixture(scope="session")
+def grass_on_a_slope() -> Grass:
+    """Points of blades up to a height, and the unit normal of the slope below, which is the same everywhere."""
+
+    def points(rng: np.random.Generator, blade_m: float) -> tuple[FloatArray, FloatArray]:
+        plane, normal = rng.uniform(-6.0, 6.0, (6000, 2)), np.array([-0.1, 0.05, 1.0])
+        heights = -2.0 - plane @ normal[:2] + rng.uniform(0.0, blade_m, len(plane))
+        return np.column_stack([plane, heights]), normal / np.linalg.norm(normal)
+
+    return points
 
 
 @pytest.fixture(scope="session")
