@@ -30,6 +30,7 @@ class SurfelMatcher(Matcher):
     def __init__(self, grids: Sequence[SurfelGrid], count: int) -> None:
         self._grids = grids
         self._cells = np.full(count, _NOWHERE, dtype=np.int64)
+        self._spread_m = np.empty(count)  # standard deviation of the points of each plane from it
         self.surfaces = Surfaces.none(count)
 
     def match(self, points: FloatArray, T_world_lidar: FloatArray) -> None:
@@ -48,6 +49,8 @@ class SurfelMatcher(Matcher):
             if finest is None:
                 finest = np.empty(len(points), dtype=np.int32), surfels
                 finest[0][unmatched] = rows
-            unmatched = unmatched[: match_planes(points, unmatched, rows, surfels, sensor, self.surfaces)]
+            unmatched = unmatched[
+                : match_planes(points, unmatched, rows, surfels, sensor, self._spread_m, self.surfaces)
+            ]
         assert finest is not None
         match_compact(points, unmatched, *finest, T, _COMPACT * self._grids[0].cell_m, self.surfaces)

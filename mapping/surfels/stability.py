@@ -37,7 +37,7 @@ def constraining_points(points: FloatArray, elevations: FloatArray, cell_m: floa
     grid = SurfelGrid(_CELLS * cell_m)
     grid.insert(points, elevations, views)
     rows, surfaces = grid.find(points), Surfaces.none(len(points))
-    match_planes(points, np.arange(len(points)), rows, grid.refreshed(rows), origin, surfaces)
+    match_planes(points, np.arange(len(points)), rows, grid.refreshed(rows), origin, np.empty(len(points)), surfaces)
     planar = np.flatnonzero(surfaces.counts)
     if not len(planar):
         return planar
