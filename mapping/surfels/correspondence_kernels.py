@@ -54,9 +54,10 @@ def match_planes(
             faced, behind = is_steep(-along, distance), is_steep(along, distance)
             if p[14] > 0.0 and not behind and (p[12] * distance > _LEAST_HEIGHT_M or faced):
                 tilt = p[9] / (max(p[10], 1e-9) * math.sqrt(p[13]))
-                is_known_better = p[9] < _SAME_SPREAD * spread_m[n] and _thickness_m(p, 0) < found.thickness_m[n, 0]
+                spread = p[9] * math.sqrt(p[13] / (p[13] - 3.0))  # three residuals make the plane
+                is_known_better = spread < _SAME_SPREAD * spread_m[n] and _thickness_m(p, 0) < found.thickness_m[n, 0]
                 if found.counts[n] == 0 or is_known_better:
-                    found.counts[n], spread_m[n] = 0, p[9]
+                    found.counts[n], spread_m[n] = 0, spread
                     _write(found, n, p, 0, p[3], p[4], p[5], tilt)
                 if tilt < _CERTAIN_TILT:
                     continue

@@ -255,5 +255,5 @@ def test_in_grass_a_wider_plane_is_taken(rng: np.random.Generator, grass_on_a_sl
     errors_deg = np.degrees(np.arccos(np.abs(matches.normals @ normal)))
     assert len(matches) == len(asked)
     assert np.median(errors_deg) < 0.6
-    assert errors_deg.max() < 1.5
-    assert matches.tilt.max() < 0.02
+    assert errors_deg.max() < 2.5
+    assert np.median(matches.tilt) < 0.01
