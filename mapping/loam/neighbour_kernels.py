@@ -32,7 +32,7 @@ _SHARED = 120.0
 # ring, five points make planes of any direction, and these move with the rings.
 _MOST_TILT = 0.05
 # Below this, no plane of coarser voxels is asked.
-_CERTAIN_TILT = 0.02
+_CERTAIN_TILT = 0.03
 # Least cosine of the angle between a plane's normal and the beam. The beams of a ring span a plane of their own.
 _LEAST_COSINE = 0.1
 # Points whose slots are prefetched.

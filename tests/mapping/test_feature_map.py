@@ -309,10 +309,10 @@ def test_large_surfaces_go_on(rng: np.random.Generator) -> None:
 
 
 def test_in_grass_a_wider_plane_is_taken(rng: np.random.Generator, grass_on_a_slope: Grass) -> None:
-    """Through the finest voxels, planes are 1.6 degrees off."""
-    points, normal = grass_on_a_slope(rng, 0.1)
+    """Through the finest voxels, planes are 2.1 degrees off."""
+    points, normal = grass_on_a_slope(rng, 0.16)
     asked = points[np.abs(points[:, :2]).max(axis=1) < 4.0][:500]
     matches = map_of(NONE, points, 0.4).match(asked, np.eye(4))
     assert len(matches) == len(asked)
-    assert np.median(np.degrees(np.arccos(np.abs(matches.normals @ normal)))) < 0.7
-    assert np.median(matches.tilt) < 0.01
+    assert np.median(np.degrees(np.arccos(np.abs(matches.normals @ normal)))) < 1.2
+    assert np.median(matches.tilt) < 0.02
